@@ -1,1 +1,1 @@
-"""Stages of the pipeline as functions of arrays. Imports `model` and below, neither ROS nor Rerun."""
+"""Stages of the pipeline as functions of arrays. They import `model` and below, neither ROS nor Rerun."""

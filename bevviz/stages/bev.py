@@ -20,7 +20,7 @@ from bevviz.support.kernel import kernel
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of the occupancy channel, as in nav_msgs/OccupancyGrid
 
-# BGR
+# Colours are BGR.
 _POINT = (200, 200, 200)
 _RED, _GREEN = (0, 0, 255), (0, 255, 0)
 _BACKGROUND, _RING, _CAPTION = (26, 20, 18), (58, 48, 44), (130, 118, 110)
@@ -38,18 +38,20 @@ def bev(
 ) -> Bev:
     """Raster the points from above: row 0 is ``range_x`` ahead, column 0 is ``range_y`` to the left.
 
-    Column ``floor((range_y - y) / resolution)`` and row ``floor((range_x - x) / resolution)``, computed in
-    float32 as the points are; what falls on no pixel is left out.
+    A point falls into column ``floor((range_y - y) / resolution)`` and row
+    ``floor((range_x - x) / resolution)``, computed in float32 like the points. Points outside the raster are
+    dropped.
 
-    Styles: ``reference`` paints the points grey on black, each object's axis-aligned box red and its label
-    green. ``rich`` shades ground by density and obstacles by height above it, with range rings, the oriented
-    boxes of the clusters in grey and those of the objects in the colour of their class, heading and label.
+    Styles: ``reference`` paints the points grey on black, the axis-aligned box of each object red and its
+    label green. ``rich`` shades ground by density and obstacles by height above it. It adds range rings, the
+    oriented boxes of the clusters in grey and those of the objects in the colour of their class, with heading
+    and label.
 
-    Channels, only those that are asked for and whose input is there:
+    Only channels that are configured and whose input is given are made:
 
     - density: int32, points in the cell;
-    - height: float32, metres, highest z in the cell, NaN where it is empty;
-    - intensity: float32, mean in the cell, NaN where it is empty;
+    - height: float32, metres, highest z in the cell, NaN if it is empty;
+    - intensity: float32, mean in the cell, NaN if it is empty;
     - occupancy: int8, 100 with an obstacle point, 0 with ground points only, -1 unknown.
 
     Args:
@@ -57,11 +59,11 @@ def bev(
         intensity: (N,) of any number type, or None.
         ground: (N,) True where the point is ground, or None.
         objects: named boxes.
-        clusters: boxes to show in the rich style.
+        clusters: boxes to draw in the rich style.
         config: ranges, resolution, style and channels.
 
     Raises:
-        ValueError: intensity or ground are not as long as points.
+        ValueError: intensity or ground do not have the length of points.
     """
     for name, array in (("intensity", intensity), ("ground", ground)):
         if array is not None and len(array) != len(points):
@@ -112,7 +114,7 @@ def bev(
 
 @kernel
 def _cells(points: F32, scale: F32, rows: int, columns: int) -> I32:
-    """(N,) row * columns + column of each point, -1 off the raster."""
+    """Return the (N,) row * columns + column of each point, -1 outside the raster."""
     cell = np.empty(len(points), np.int32)
     for i in range(len(points)):
         row = np.floor((scale[0] - points[i, 0]) / scale[2])
@@ -134,9 +136,9 @@ def _paint(cell: I32, image: U8, color: U8) -> None:
 def _raster(
     cell: I32, points: F32, ground: Bool, rows: int, columns: int, count: bool, top: bool, state: bool
 ) -> tuple[I32, F32, NDArray[np.int8], I32]:
-    """Density, height and occupancy, each where it is wanted, and, counted, the cells that hold a point.
+    """Compute density, height and occupancy as requested. With ``count``, also list the occupied cells.
 
-    Without ``ground`` all is obstacle.
+    Without ``ground`` every point is an obstacle.
     """
     cells = rows * columns
     density, seen = np.zeros(cells if count else 0, np.int32), np.empty(len(cell), np.int32)
@@ -153,10 +155,11 @@ def _raster(
 
 @kernel
 def _count(cell: I32, density: I32, seen: I32) -> int:
+    """Count the points of each cell. Write the occupied cells to ``seen`` and return their number."""
     found = 0
     for i in range(len(cell)):
         if cell[i] >= 0:
-            # Written always: there is no branch to mispredict.
+            # The cell is always written. There is no branch to mispredict.
             seen[found] = cell[i]
             found += density[cell[i]] == 0
             density[cell[i]] += 1
@@ -165,6 +168,7 @@ def _count(cell: I32, density: I32, seen: I32) -> int:
 
 @kernel
 def _highest(cell: I32, points: F32, height: F32) -> None:
+    """Write the highest z of each cell."""
     for i in range(len(cell)):
         if cell[i] >= 0:
             z, highest = points[i, 2], height[cell[i]]
@@ -173,6 +177,7 @@ def _highest(cell: I32, points: F32, height: F32) -> None:
 
 @kernel
 def _occupy(cell: I32, ground: Bool, occupancy: NDArray[np.int8]) -> None:
+    """Write the occupancy of each cell."""
     for i in range(len(cell)):
         if cell[i] >= 0:
             occupancy[cell[i]] = max(occupancy[cell[i]], FREE if ground[i] else OCCUPIED)
@@ -180,6 +185,7 @@ def _occupy(cell: I32, ground: Bool, occupancy: NDArray[np.int8]) -> None:
 
 @kernel
 def _mean(cell: I32, intensity: F32, density: I32) -> F32:
+    """Return the mean intensity of each cell."""
     total, count = np.zeros(density.size, np.float32), density.ravel()
     for i in range(len(cell)):
         if cell[i] >= 0:
@@ -201,7 +207,7 @@ def _shade(
     span: float,
     image: U8,
 ) -> None:
-    """Ground by density, obstacles by their height above ``bottom``."""
+    """Colour ground cells by density and obstacle cells by their height above ``bottom``."""
     points, top, state = density.ravel(), height.ravel(), occupancy.ravel()
     pixels = image.reshape(-1, 3)
     for cell in seen:
@@ -213,8 +219,8 @@ def _shade(
 
 
 def _ground_level(points: F32, ground: Bool) -> float:
-    """Median z of the ground, else the height that a sensor on a car stands at."""
-    # Not compiled: a median takes longer to compile than all of the raster.
+    """Return the median z of the ground. Without ground points return -1.7 m, for a sensor on a car roof."""
+    # This is not compiled, because a median takes longer to compile than the whole raster.
     sample = slice(None, len(ground), 1 + len(points) // 2_000)
     below = points[sample, 2][ground[sample]]
     return float(np.median(below)) if len(below) else -1.7
@@ -224,6 +230,7 @@ def _ground_level(points: F32, ground: Bool) -> float:
 
 
 def _draw_reference(image: U8, objects: Objects, scale: F32) -> None:
+    """Draw axis-aligned boxes and labels of the reference style."""
     center = np.floor((scale[:2] - objects.boxes.center[:, :2]) / scale[2]).astype(int)
     half = (objects.boxes.size[:, :2] / scale[2]).astype(int) // 2
     for name, (v, u), (h, w) in zip(objects.names, center.tolist(), half.tolist(), strict=True):
@@ -232,6 +239,7 @@ def _draw_reference(image: U8, objects: Objects, scale: F32) -> None:
 
 
 def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, config: BevConfig) -> None:
+    """Draw oriented boxes, headings and labels of the rich style."""
     named = set() if objects is None else set(objects.cluster.tolist())
     if clusters is not None:
         rows = [k for k in np.flatnonzero(clusters.kept).tolist() if k not in named]
@@ -250,7 +258,7 @@ def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, co
 
 
 def _write_names(image: U8, objects: Objects, outlines: I32, colors: Sequence[Sequence[int]]) -> None:
-    """At a corner of each box, the nearest first; where no place is in the image and free, none."""
+    """Write each name at a corner of its box, nearest box first. Omit names without free space."""
     rows, columns = image.shape[:2]
     taken = np.zeros((0, 4), np.int64)
     for k in np.argsort(np.hypot(*objects.boxes.center[:, :2].T), kind="stable").tolist():
@@ -267,31 +275,32 @@ def _write_names(image: U8, objects: Objects, outlines: I32, colors: Sequence[Se
 
 
 def _headings(boxes: Boxes3D) -> F32:
-    """(K, 2, 2) from each centre to the middle of the front side."""
+    """Return (K, 2, 2) lines from each centre to the middle of the front side."""
     ahead = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], 1) * (boxes.size[:, :1] / 2)
     center = boxes.center[:, :2]
     return np.asarray(np.stack([center, center + ahead], 1), np.float32)
 
 
-_SIZE = 0.45  # of names, as a scale of OpenCV's font
-_SHIFT = 3  # fractional bits of the pixel coordinates that are given to OpenCV
+_SIZE = 0.45  # font scale of OpenCV for the names
+_SHIFT = 3  # fractional bits of the pixel coordinates passed to OpenCV
 
 
 def _pixels(xy: F32, config: BevConfig) -> I32:
-    """(..., 2) metres -> (..., 2) u, v in fixed point, for OpenCV's ``shift``."""
+    """Convert (..., 2) metres to (..., 2) u, v in fixed point, for OpenCV's ``shift``."""
     uv = (np.array([config.range_y, config.range_x]) - xy[..., ::-1]) / config.resolution - 0.5
     fixed: I32 = np.round(np.clip(uv, -4e4, 4e4) * (1 << _SHIFT)).astype(np.int32)
     return fixed
 
 
 def _caption(image: U8, text: str, at: tuple[int, int], color: Sequence[int]) -> None:
+    """Write text with a dark outline."""
     for width, shade in ((3, _BACKGROUND), (1, color)):
         cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, shade, width, cv2.LINE_AA)
 
 
 @lru_cache(maxsize=2)
 def _background(rows: int, columns: int, range_x: float, range_y: float, resolution: float) -> U8:
-    """Range rings with their metres, axes, and the robot as an arrow head."""
+    """Draw range rings with their metres, the axes, and the robot as an arrow head."""
     image = np.full((rows, columns, 3), _BACKGROUND, np.uint8)
     u, v = range_y / resolution, range_x / resolution
     center = (int(u), int(v))
@@ -320,7 +329,7 @@ def _background(rows: int, columns: int, range_x: float, range_y: float, resolut
 
 @lru_cache(maxsize=1)
 def _ground_shades(steps: int = 16) -> U8:
-    """(steps, 3) BGR by number of points in the cell, logarithmic."""
+    """Return (steps, 3) BGR colours by the number of points in a cell, on a logarithmic scale."""
     share = np.log1p(np.arange(1, steps + 1)) / np.log1p(steps)
     shades: U8 = np.round(np.array(_GROUND) * (0.45 + 0.55 * share[:, None])).astype(np.uint8)
     return shades
@@ -328,5 +337,5 @@ def _ground_shades(steps: int = 16) -> U8:
 
 @lru_cache(maxsize=1)
 def _obstacle_shades() -> U8:
-    """(256, 3) BGR by height, without the near-black end of the map."""
+    """Return (256, 3) BGR colours by height, without the near-black end of the map."""
     return np.ascontiguousarray(turbo(300)[44:, ::-1])

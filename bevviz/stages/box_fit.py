@@ -1,4 +1,4 @@
-"""Boxes of the size that a thing of its class can have, around the part of it that was seen."""
+"""Fit boxes with plausible class sizes around the visible part of an object."""
 
 from __future__ import annotations
 
@@ -9,47 +9,48 @@ import numpy as np
 from bevviz.model.frame import F64, I64
 from bevviz.support.kernel import kernel
 
-HEADINGS = 36  # that are tried in a half turn, then every degree about the best
-TRIM = 0.02  # share of the points on each side that may lie outside
-NEAR_SIDE = 0.1  # metres from a side that are as good as on it, for a point
-STRAY = 3.0  # as many NEAR_SIDE is a point off at most
-WEIGHT = 10.0  # points of a surface are not independent: all of them count as this many
-OUTSIDE = 2.0  # a point outside counts as this many that are as far off as can be
-HIDDEN_SIDE = 0.3  # metres, one sigma, that a side towards the sensor may reach farther than was seen
-EDGE_TAIL = 3.0  # sigmas from which an edge of the image box is rather one of what hides the object
-MAX_SPREAD = 2.5  # sigmas of a size that a thing may have more than its class on average
-FEW = 128  # points that are looked at, spread evenly
+HEADINGS = 36  # headings tried in a half turn; then every degree near the best
+TRIM = 0.02  # share of the points that may lie outside on each side
+NEAR_SIDE = 0.1  # metres: unit of a point's distance from a side, and tolerance of the box for points outside
+STRAY = 3.0  # largest distance of a point from a side, in NEAR_SIDE
+WEIGHT = 10.0  # all points together count as this many, because points of one surface are not independent
+OUTSIDE = 2.0  # a point outside the box costs this many times the largest distance
+HIDDEN_SIDE = 0.3  # metres, one sigma: gap between a side that faces the sensor and the nearest point
+EDGE_TAIL = 3.0  # sigmas: beyond them an edge of the image box more likely belongs to an occluder
+MAX_SPREAD = 2.5  # sigmas by which an object may exceed the mean size of its class
+FEW = 128  # points used for a fit, evenly spread
 
-NO_EDGE = np.inf  # sigma of an edge that says nothing: that of the image
+NO_EDGE = np.inf  # sigma of an edge without information, such as the border of the image
 
 
 @kernel
 def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float) -> tuple[F64, I64]:
-    """The box, seen from above, that explains best what was seen of an object.
+    """Fit the box, seen from above, that best explains the points of an object.
 
-    Every heading is tried. Along both of its axes the box holds what was seen; where that is shorter than the
-    class is on average, the box goes on behind it, as seen from the sensor, by what the class's spread
-    allows. What is minimised is the sum, in squared sigmas, of
+    Every heading is tried. Along both of its axes the box contains the points. Where they are shorter than
+    the mean of the class, the box extends behind them, as seen from the sensor, within the spread of the
+    class. The minimised cost is the sum, in squared sigmas, of
 
-    - the distances of the points from the nearer of the sides that face the sensor, which is where surfaces
-      are (the L-shape of Zhang et al. 2017, with distances that are cut off instead of their reciprocals, so
-      that what is seen through a window counts little);
-    - how far its length and width are from those of the class;
-    - how far its silhouette is from the left and right edges of the image box, with the tails of Cauchy's
-      distribution, since an edge may be that of something in front;
-    - how far a side that faces the sensor lies nearer than any point.
+    - the distances of the points from the nearer of the sides that face the sensor, where surfaces are. This
+      is the L-shape of Zhang et al. 2017, with truncated distances instead of their reciprocals, so that
+      points seen through a window count little;
+    - the deviations of length and width from those of the class;
+    - the distances of the silhouette from the left and right edges of the image box, with Cauchy tails,
+      because an edge may belong to an occluder;
+    - how much nearer than any point a side that faces the sensor lies.
 
     Args:
         points: (N, 2) metres from the sensor.
-        normals: (2, 2) outward normals of the planes through the sensor and the image box's left, right edge.
-        edge: (2,) one sigma in metres of those edges there, ``NO_EDGE`` for none.
-        prior: (4,) mean and spread of the class's length, and of its width; NaN for none.
-        longest: no side is longer, in metres; with a prior its own limits hold.
-        about: a heading that is right to a few degrees; NaN: none is known.
+        normals: (2, 2) outward normals of the planes through the sensor and the left and right edge of the
+            image box.
+        edge: (2,) one sigma of these edges in metres at the object, ``NO_EDGE`` for none.
+        prior: (4,) mean and spread of the class's length, then of its width; NaN for none.
+        longest: metres, longest side of the box without a prior. With a prior its own limits apply.
+        about: approximate heading, right to a few degrees; NaN if none is known.
 
     Returns:
-        (5,) x and y of the centre, length, width and heading; and (2,) the sides that face the sensor, along
-        the heading and across: -1 the lower, 1 the upper, 0 none.
+        (5,) x and y of the centre, length, width and heading.
+        (2,) sides that face the sensor, along the heading and across it: -1 lower, 1 upper, 0 none.
     """
     known = not np.isnan(prior[0])
     most = np.full(2, longest)
@@ -108,7 +109,10 @@ def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about:
 
 @kernel
 def _extent(values: F64, most: float, out: F64) -> None:
-    """Where values begin and end, strays left out; where they reach too far, the densest ``most`` of them."""
+    """Write the lowest and the highest value to ``out``, without strays.
+
+    If they are more than ``most`` apart, write the densest interval of that length.
+    """
     n = len(values)
     strays = int(TRIM * n)
     low, high = np.full(strays + 1, np.inf), np.full(strays + 1, -np.inf)
@@ -140,13 +144,16 @@ def _extent(values: F64, most: float, out: F64) -> None:
 
 @kernel
 def _facing(low: float, high: float) -> int:
-    """Which of two opposite sides faces the sensor, which is at 0: -1 the lower, 1 the upper, 0 none."""
+    """Return which of two opposite sides faces the sensor at 0: -1 the lower, 1 the upper, 0 none."""
     return -1 if low > 0 else (1 if high < 0 else 0)
 
 
 @kernel
 def _closeness(u: F64, v: F64, seen: F64, sides: I64) -> float:
-    """Mean distance of the points from the sides that face the sensor, in NEAR_SIDE, at most STRAY."""
+    """Return the mean distance of the points from the sides that face the sensor, in NEAR_SIDE.
+
+    The distance of a point is at most STRAY.
+    """
     total = 0.0
     for i in range(len(u)):
         if (
@@ -168,7 +175,10 @@ def _closeness(u: F64, v: F64, seen: F64, sides: I64) -> float:
 
 @kernel
 def _sizes(low: float, high: float, side: int, mean: float, spread: float, out: F64) -> int:
-    """Beginnings, ends and costs of what may be the whole of what was seen from ``low`` to ``high``."""
+    """Write candidates for the full extent of an object seen from ``low`` to ``high``. Return their number.
+
+    A candidate is a row of beginning, end and cost.
+    """
     found = 0
     size = high - low
     for k in range(-2, 3):
@@ -179,7 +189,7 @@ def _sizes(low: float, high: float, side: int, mean: float, spread: float, out: 
             whole = size
         z = (whole - mean) / spread
         hidden = whole - size
-        for way in range(3 if hidden > 0 else 1):  # behind it; towards the sensor; half and half
+        for way in range(3 if hidden > 0 else 1):  # behind; towards the sensor; half of each
             behind = hidden if way == 0 else (0.0 if way == 1 else hidden / 2)
             below = behind if side > 0 else hidden - behind
             towards = 0.0 if side == 0 else min((hidden - behind) / HIDDEN_SIDE, 3.0)

@@ -1,4 +1,4 @@
-"""Points binned in cells: packed keys, their numbering, and sorts by them."""
+"""Grid cells of points: packed keys, their numbering, and sorting by key."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.support.kernel import kernel
 
-DIGIT = 11  # bits that one pass of a radix sort looks at: its counters stay in the first cache
+DIGIT = 11  # bits per pass of the radix sort; the counters of one pass fit into the first cache
 
 
 def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> tuple[I64, I64]:
-    """Pack the integer cell of each point into one int64, the longest axis slowest, the shortest fastest.
+    """Pack the integer cell of each point into one int64.
 
-    So a row of neighbouring cells holds few others.
+    The longest axis varies slowest and the shortest fastest, so that a row of neighbouring cells is short.
 
     Args:
         points: (N, 3) float32 finite points, N > 0.
@@ -22,14 +22,14 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
         reach: largest offset in cells that the caller will add to a key.
 
     Returns:
-        keys: (N,) the packed cells, not negative; unequal cells have unequal keys.
-        strides: (3,) for x, y, z: ``keys + offset @ strides`` are the keys at an offset of up to ``reach``
+        keys: (N,) the packed cells, not negative. Different cells have different keys.
+        strides: (3,) for x, y, z. ``keys + offset @ strides`` are the keys at an offset of up to ``reach``
             cells.
     """
     keys, strides = _pack(points, size, shift, reach)
     if strides.any():
         return keys, strides
-    # Scattered too widely for 64 bits: shorten the gaps along each axis that nothing reaches over.
+    # The points are too scattered for 64 bits. Shorten the gaps along each axis to just beyond the reach.
     low, _ = bounds(points)
     columns = []
     for axis in range(3):
@@ -43,7 +43,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
 
 @kernel
 def _pack(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]:
-    """The keys, and strides that are zero where 64 bits are too few for them."""
+    """Return the keys and the strides. The strides are zero if the keys do not fit into 64 bits."""
     low, high = bounds(points)
     origin = low - shift * size
     counts = np.floor((high - origin) / size) + 1 + 2 * reach
@@ -52,7 +52,7 @@ def _pack(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]
         return keys, np.zeros(3, np.int64)
     strides = _strides(counts)
     for i in range(len(points)):
-        # The coordinates are not negative, so that truncation is the floor.
+        # The coordinates are not negative, so truncation equals the floor.
         x = np.int64((points[i, 0] - origin[0]) / size)
         y = np.int64((points[i, 1] - origin[1]) / size)
         z = np.int64((points[i, 2] - origin[2]) / size)
@@ -62,6 +62,7 @@ def _pack(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]
 
 @kernel
 def _strides(counts: F64) -> I64:
+    """Return the strides of x, y, z for a grid with these numbers of cells."""
     slow, fast = 0, 2
     for axis in range(1, 3):
         if counts[axis] > counts[slow]:
@@ -69,7 +70,7 @@ def _strides(counts: F64) -> I64:
     for axis in range(1, -1, -1):
         if counts[axis] < counts[fast]:
             fast = axis
-    if slow == fast:  # all alike
+    if slow == fast:  # all three counts are equal
         slow, fast = 0, 2
     middle = 3 - slow - fast
     strides = np.ones(3, np.int64)
@@ -80,7 +81,7 @@ def _strides(counts: F64) -> I64:
 
 @kernel
 def bounds(points: F32) -> tuple[F64, F64]:
-    """(3,) lowest and (3,) highest coordinates of one point or more."""
+    """Return the (3,) lowest and (3,) highest coordinates of at least one point."""
     x0, y0, z0 = points[0]
     x1, y1, z1 = points[0]
     for i in range(len(points)):
@@ -92,7 +93,7 @@ def bounds(points: F32) -> tuple[F64, F64]:
 
 @kernel
 def group(keys: I64) -> tuple[I32, I32]:
-    """Number equal keys in the order of their first appearance, by hashing.
+    """Return consecutive numbers for distinct keys, in the order of their first appearance, by hashing.
 
     Returns:
         number: (N,) int32 number of each key.
@@ -126,11 +127,11 @@ def group(keys: I64) -> tuple[I32, I32]:
 
 @kernel
 def sort_by_key(keys: I64) -> tuple[I32, I32]:
-    """Sort indices by keys that are not negative, by radix; stable.
+    """Sort indices by keys that are not negative, with a stable radix sort.
 
     Returns:
         order: (N,) int32 indices, equal keys side by side.
-        start: (M + 1,) int32, ``order[start[k]:start[k + 1]]`` are the indices with the k-th unequal key.
+        start: (M + 1,) int32. ``order[start[k]:start[k + 1]]`` are the indices with the k-th distinct key.
     """
     n = len(keys)
     order, other = np.arange(n).astype(np.int32), np.empty(n, np.int32)
@@ -161,10 +162,10 @@ def sort_by_key(keys: I64) -> tuple[I32, I32]:
 
 @kernel
 def sort_by(number: I32, count: int) -> tuple[I32, I32]:
-    """Sort indices by the number of each, numbers in [0, count), by counting; stable.
+    """Sort indices by the number of each, with a stable counting sort. Numbers are in [0, count).
 
     Returns:
-        order: (N,) int32, ``order[start[k]:start[k + 1]]`` are the indices with number k.
+        order: (N,) int32. ``order[start[k]:start[k + 1]]`` are the indices with number k.
         start: (count + 1,) int32.
     """
     start = np.zeros(count + 1, np.int32)

@@ -1,4 +1,4 @@
-"""Clusters, after detections took points of them."""
+"""Relabel clusters after detections claimed some of their points."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bevviz.stages.clustering import redescribe
 
 @dataclass(slots=True)
 class Part:
-    """What one detection took.
+    """Points that one detection claimed.
 
     Attributes:
-        camera: its row.
-        detection: its row among the detections of the camera.
-        rows: of the points.
+        camera: row of the camera.
+        detection: row of the detection among the detections of the camera.
+        rows: rows of the points.
     """
 
     camera: int
@@ -30,7 +30,13 @@ class Part:
 def relabelled(
     points: F32, clusters: Clusters, parts: list[Part], cameras: list[str], config: ClusteringConfig
 ) -> tuple[Clusters, I32, Splits]:
-    """The clusters with the parts as clusters of their own, the row of each part (-1 at the end), and why."""
+    """Make each part a cluster of its own.
+
+    Returns:
+        The new clusters.
+        The cluster row of each part, with -1 appended.
+        The splits: which clusters lost how many points to which detection.
+    """
     before, fresh = len(clusters), 0
     origins = []
     for part in parts:
@@ -43,11 +49,11 @@ def relabelled(
         left[sources[known]] -= counts[known]
     unchanged, alive = left == clusters.count, left > 0
     number = np.empty(len(parts), np.int64)
-    made: list[tuple[int, int, int]] = []  # part, cluster that it took from, points
+    made: list[tuple[int, int, int]] = []  # part, source cluster, points
     for j, (sources, counts) in enumerate(origins):
         pairs = list(zip(sources.tolist(), counts.tolist(), strict=True))
         whole = [(n, k) for k, n in pairs if k >= 0 and n == clusters.count[k]]
-        if whole:  # a part that holds all of a cluster has its number
+        if whole:  # A part that holds all points of a cluster keeps the number of the cluster.
             number[j] = max(whole)[1]
             alive[number[j]] = True
             unchanged[number[j]] = len(pairs) == 1

@@ -1,4 +1,4 @@
-"""DBSCAN on a grid, and boxes around its clusters."""
+"""DBSCAN on a grid, and the boxes of its clusters."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from bevviz.model.results import Clusters, ClusterState
 from bevviz.stages.cells import cell_keys, sort_by, sort_by_key
 from bevviz.support.kernel import kernel, unordered_kernel
 
-MIN_SIZE = 0.01  # metres: no box is thinner, so that each has a volume and can be drawn and hit
+MIN_SIZE = 0.01  # metres: no side of a box is shorter, so that each box has a volume and can be drawn and hit
 
 
 def cluster(points: F32, config: ClusteringConfig) -> Clusters:
-    """DBSCAN clusters of the obstacle points, each with its size verdict and its boxes.
+    """Cluster the obstacle points with DBSCAN. Compute the size verdict and the boxes of each cluster.
 
     Args:
         points: (P, 3) float32 finite points.
-        config: DBSCAN's parameters and the size limits.
+        config: the parameters of DBSCAN and the size limits.
 
     Returns:
-        Clusters in the order of their first points. Clusters outside the size limits are there too, with
+        Clusters in the order of their first points. Clusters outside the size limits are included, with
         their state. The oriented boxes have size x >= size y and yaw in (-pi/2, pi/2]. No side of a box is
         shorter than ``MIN_SIZE``.
     """
@@ -33,11 +33,11 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
 
 
 def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
-    """Counts, size verdicts and boxes of clusters, whoever found them.
+    """Compute counts, size verdicts and boxes of clusters of any method.
 
     Args:
         points: (P, 3) float32 finite points.
-        labels: (P,) int32, -1 noise, each number from 0 to the largest on some point.
+        labels: (P,) int32. -1 is noise; every number from 0 to the largest is the label of a point.
         config: the size limits.
     """
     count, centroid, low, high, oriented = _boxes(points, labels)
@@ -54,14 +54,14 @@ def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
 def redescribe(
     points: F32, labels: I32, before: Clusters, kept_rows: I64, named: I32, config: ClusteringConfig
 ) -> Clusters:
-    """As ``describe``, of clusters of which some are as they were.
+    """Describe clusters as ``describe`` does, and reuse the values of unchanged clusters.
 
     Args:
         points: (P, 3) float32 finite points.
         labels: (P,) int32, as in ``describe``.
-        before: the clusters that they were.
-        kept_rows: (K,) row in these of each cluster that is unchanged, -1 for the others.
-        named: rows that are no smaller and no larger than they should be, whatever the limits.
+        before: the clusters before the change.
+        kept_rows: (K,) row in ``before`` of each unchanged cluster, -1 for the others.
+        named: rows of clusters that are kept, regardless of the size limits.
         config: the size limits.
     """
     fresh = np.flatnonzero(kept_rows < 0)
@@ -86,32 +86,32 @@ def redescribe(
 
 
 def dbscan(points: F32, eps: float, min_points: int) -> I32:
-    """Exact DBSCAN (Ester et al. 1996) on a grid.
+    """Compute exact DBSCAN clustering (Ester et al. 1996) on a grid.
 
-    Points are binned in cells whose diagonal is shorter than ``eps`` (Gunawan 2013): a cell with
-    ``min_points`` points has core points only, and the core points of a cell belong together without any
-    distance being measured. Cells are then joined by union-find. Distances are compared as Open3D does:
-    in double precision and strictly, two points exactly ``eps`` apart are no neighbours.
+    Points are binned in cells whose diagonal is shorter than ``eps`` (Gunawan 2013). A cell with
+    ``min_points`` points has only core points. The core points of a cell belong together; no distance is
+    measured. Union-find then joins the cells. Distances are compared in double precision and strictly, as
+    Open3D does: two points exactly ``eps`` apart are not neighbours.
 
     Args:
         points: (N, 3) float32 finite points.
         eps: radius of the neighbourhood in metres.
-        min_points: neighbours, the point itself included, that make a core point.
+        min_points: neighbours that make a core point, including the point itself.
 
     Returns:
-        (N,) int32 labels, numbered in the order of each cluster's first point; -1 is noise. A border point
-        goes to the cluster of the nearest core point.
+        (N,) int32 labels, numbered in the order of each cluster's first point. Noise has the label -1. A
+        border point gets the cluster of its nearest core point.
     """
     if len(points) == 0:
         return np.zeros(0, np.int32)
-    # A hair less than eps / sqrt(3), so that rounding never puts points eps apart into one cell.
+    # The factor keeps the diagonal below eps, so that rounding never puts points eps apart into one cell.
     keys, strides = cell_keys(points, eps / math.sqrt(3) * (1 - 1e-6), reach=2)
     return _dbscan(points, keys, np.sort(strides)[::-1], eps * eps, min_points)
 
 
 # --- DBSCAN ------------------------------------------------------------------------------------
-# Points are sorted by cell: those of cell c are start[c]:start[c + 1], its core points come first. The cells
-# that may hold neighbours of c's points are neighbours[near[c]:near[c + 1]].
+# Points are sorted by cell. The points of cell c are start[c]:start[c + 1], core points first. The cells
+# that may hold neighbours of these points are neighbours[near[c]:near[c + 1]].
 
 
 @kernel
@@ -129,6 +129,7 @@ def _dbscan(points: F32, keys: I64, strides: I64, eps2: float, min_points: int) 
 
 @kernel
 def _cell_boxes(x: F32, y: F32, z: F32, start: I32) -> F64:
+    """Return (C, 6) lowest and highest x, y, z of the points of each cell."""
     box = np.empty((len(start) - 1, 6))
     for c in range(len(box)):
         for axis in range(3):
@@ -142,23 +143,23 @@ def _cell_boxes(x: F32, y: F32, z: F32, start: I32) -> F64:
 
 @kernel
 def _gap(low: float, high: float, other_low: float, other_high: float) -> float:
-    """Distance between two intervals, 0 where they overlap."""
+    """Return the distance between two intervals, 0 if they overlap."""
     return max(low - other_high, other_low - high, 0.0)
 
 
 @kernel
 def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]:
-    """Other cells whose points may be nearer than eps, as (C + 1,) starts into one list.
+    """List the other cells whose points may be nearer than eps, as (C + 1,) starts into one list.
 
     Cells come sorted by key. The neighbours of a cell lie in five rows, one for each offset along the
-    slowest axis, and each row is a range of keys that moves forward with the cell: no search is needed.
-    Only those behind a cell in that order are looked at: it is their neighbour as well.
+    slowest axis. Each row is a range of keys that moves forward with the cell, so no search is needed.
+    Only cells later in that order are examined: the neighbour relation is symmetric.
     """
     cells = len(keys)
     reach = 2 * strides[1] + 2
     begin = np.zeros(3, np.int64)
     near = np.zeros(cells + 1, np.int32)
-    found = np.empty(8 * cells, np.int32)  # those of cell c end at last[c]
+    found = np.empty(8 * cells, np.int32)  # the neighbours of cell c end at last[c]
     last = np.empty(cells, np.int32)
     used = 0
     for c in range(cells):
@@ -176,7 +177,7 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
                 dx = _gap(box[c, 0], box[c, 3], box[o, 0], box[o, 3])
                 dy = _gap(box[c, 1], box[c, 4], box[o, 1], box[o, 4])
                 dz = _gap(box[c, 2], box[c, 5], box[o, 2], box[o, 5])
-                # Written always and kept sometimes: there is no branch to mispredict.
+                # The value is always written and sometimes kept. There is no branch to mispredict.
                 found[used] = o
                 used += dx * dx + dy * dy + dz * dz < eps2
                 o += 1
@@ -214,7 +215,7 @@ def _core_points(
     eps2: float,
     min_points: int,
 ) -> I32:
-    """Number of core points of each cell. Moves them to the front of their cell, in every array."""
+    """Return the number of core points of each cell. Move them to the front of their cell, in every array."""
     cells = len(start) - 1
     cores = np.zeros(cells, np.int32)
     for c in range(cells):
@@ -254,6 +255,7 @@ def _core_points(
 
 @kernel
 def _root(parent: I32, c: int) -> int:
+    """Return the root of a cell's tree, and shorten the path to it."""
     while parent[c] != c:
         parent[c] = parent[parent[c]]
         c = parent[c]
@@ -264,7 +266,7 @@ def _root(parent: I32, c: int) -> int:
 def _join(
     x: F32, y: F32, z: F32, start: I32, cores: I32, box: F64, near: I32, neighbours: I32, eps2: float
 ) -> I32:
-    """Union-find over the cells: parents, cells with core points nearer than eps in one tree."""
+    """Join cells with core points nearer than eps by union-find. Return the parent of each cell."""
     parent = np.arange(len(cores)).astype(np.int32)
     for c in range(len(cores)):
         for k in range(near[c], near[c + 1]):
@@ -306,7 +308,8 @@ def _label(
     neighbours: I32,
     eps2: float,
 ) -> I32:
-    root = np.full(len(order), -1, np.int32)  # of the cloud's points, in the order of the cloud
+    """Return the (N,) labels of the points in the order of the cloud."""
+    root = np.full(len(order), -1, np.int32)  # for each point, in the order of the cloud
     for c in range(len(cores)):
         for i in range(start[c], start[c + 1]):
             if i < start[c] + cores[c]:
@@ -337,19 +340,19 @@ def _label(
 
 
 def _upright(oriented: F32) -> Boxes3D:
-    """Boxes from rows of centre, size and yaw in [0, pi/2), the longer side turned to x."""
+    """Make boxes from rows of centre, size and yaw in [0, pi/2). Turn the longer side to x."""
     size, yaw = np.maximum(oriented[:, 3:6], np.float32(MIN_SIZE)), oriented[:, 6].copy()
     wide = size[:, 1] > size[:, 0]
     size[wide, :2] = size[wide, 1::-1]
     yaw[wide] -= np.float32(np.pi / 2)
-    # -pi/2 and pi/2 are the same box; the interval is open below.
+    # -pi/2 and pi/2 describe the same box. The interval is open below.
     yaw[yaw <= -np.float32(np.pi / 2)] += np.float32(np.pi)
     return Boxes3D(oriented[:, :3], size, yaw)
 
 
 @unordered_kernel
 def _closeness(x: F64, y: F64, angle: float) -> float:
-    """Zhang's closeness: how near the points lie to the sides of the tightest rectangle at this angle."""
+    """Return Zhang's closeness: how near the points are to the sides of the tightest rectangle."""
     c, s = math.cos(angle), math.sin(angle)
     low_u = low_v = np.inf
     high_u = high_v = -np.inf
@@ -357,7 +360,7 @@ def _closeness(x: F64, y: F64, angle: float) -> float:
         u, v = c * x[i] + s * y[i], c * y[i] - s * x[i]
         low_u, high_u = min(low_u, u), max(high_u, u)
         low_v, high_v = min(low_v, v), max(high_v, v)
-    # Of two opposite sides, the one that the points lie along is the one that the sensor saw.
+    # The sensor saw the side of each opposite pair that the points lie along.
     far_low_u = far_high_u = far_low_v = far_high_v = 0.0
     for i in range(len(x)):
         u, v = c * x[i] + s * y[i], c * y[i] - s * x[i]
@@ -376,7 +379,7 @@ def _closeness(x: F64, y: F64, angle: float) -> float:
 
 @kernel
 def _heading(x: F64, y: F64) -> float:
-    """Angle in [0, pi/2) of the best rectangle: every 3 degrees, then every 0.25 about the best."""
+    """Return the angle in [0, pi/2) of the best rectangle: every 3 degrees, then every 0.25 near the best."""
     best, heading = -1.0, 0.0
     for k in range(30):
         angle = math.radians(3.0 * k)
@@ -394,13 +397,13 @@ def _heading(x: F64, y: F64) -> float:
 
 @kernel
 def _boxes(points: F32, labels: I32) -> tuple[I32, F32, F32, F32, F32]:
-    """Points, centroid, lowest and highest corner, and oriented box (centre, size, yaw) of each cluster.
+    """Return point count, centroid, lowest and highest corner, and oriented box of each cluster.
 
-    The heading is found by L-shape fitting with the closeness criterion (Zhang et al. 2017), on at most
-    about 256 points of a cluster spread evenly over it; the extent is that of all of them.
+    An oriented box is centre, size and yaw. L-shape fitting with the closeness criterion (Zhang et al. 2017)
+    gives the heading, from at most about 256 evenly spread points of a cluster. All points give the extent.
     """
     order, start = sort_by(labels + np.int32(1), max(labels) + 2 if len(labels) else 1)
-    start = start[1:]  # the first are noise
+    start = start[1:]  # the first group is noise
     clusters = len(start) - 1
     centroid = np.empty((clusters, 3), np.float32)
     low = np.full((clusters, 3), np.inf, np.float32)
@@ -417,7 +420,7 @@ def _boxes(points: F32, labels: I32) -> tuple[I32, F32, F32, F32, F32]:
         step = (count + 255) // 256
         x, y = np.empty((count + step - 1) // step), np.empty((count + step - 1) // step)
         for i in range(len(x)):
-            # About the mean, so that a box far from the origin loses no digits.
+            # Coordinates relative to the mean keep their precision far from the origin.
             x[i] = points[order[start[k] + i * step], 0] - mean[0]
             y[i] = points[order[start[k] + i * step], 1] - mean[1]
         yaw = _heading(x, y)

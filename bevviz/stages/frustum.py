@@ -1,4 +1,4 @@
-"""What a camera's boxes say of the clusters: which points are one object, and how large it is."""
+"""Split and merge clusters by the detections of the cameras, and fit a box to each detected object."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from bevviz.stages.clustering import MIN_SIZE
 from bevviz.stages.frustum_points import MARGIN, choose, fit_from, leftover, points_inside
 from bevviz.stages.mask_lookup import cover
 
-EDGE_PIXELS = 2.0  # one sigma of the edges of an image box,
-EDGE_SHARE = 0.03  # or this share of its width, where that is more
-TALL_SHARE = 0.08  # the same of a height, which also depends on where the object stands in the box
-LOWEST = 2.0  # sigmas: what is hidden may be as low as it likes
-LOWEST_CUT = 1.0  # of what the image cuts off
-REACH_SPREAD = 2.0  # sigmas of its size that an object may be deep
-BORDER = 2.0  # pixels from the border of the image that a box is cut off at
-SAME = 0.7  # IoU from which image boxes of two classes show one object: NMS is by class
-KIN = 0.1  # share of an object's points from which a cluster is one that it is made of
-NOBODY = -2  # in place of the detection that has a point: nobody can have it
+EDGE_PIXELS = 2.0  # pixels, one sigma of the edges of an image box,
+EDGE_SHARE = 0.03  # or this share of the box's width if that is more
+TALL_SHARE = 0.08  # sigma of a height as a share of it; the object may stand anywhere in the box
+LOWEST = 2.0  # sigmas: a lower height costs no more than this, because the object may be partly hidden
+LOWEST_CUT = 1.0  # the same for a box that the image border cuts
+REACH_SPREAD = 2.0  # sigmas of its size by which an object may be deeper than its class
+BORDER = 2.0  # pixels: a box nearer to the image border than this is cut off by it
+SAME = 0.7  # IoU above which image boxes of two classes show one object, because NMS works by class
+KIN = 0.1  # share of an object's points above which a cluster counts as a part of the object
+NOBODY = -2  # value of ``taker`` for a point that no detection may claim
 
 
 def claim(
@@ -50,36 +50,39 @@ def claim(
 ) -> tuple[Clusters, tuple[Claims | None, ...], Splits]:
     """Split and merge clusters by the boxes of detections.
 
-    In the frustum of each kept detection, what holds together seen from above (gaps below ``fusion.max_gap``)
-    and is not deeper than the class can be is a candidate. It is rated::
+    Candidates are searched in the frustum of each kept detection. A candidate is a set of points that is
+    connected seen from above (gaps below ``fusion.max_gap``) and not deeper than its class can be. Its rating
+    is ::
 
         score * overlap * t(height) * share
 
-    with the part of the image box that the candidate's outline covers; how well the box's height in metres at
-    the candidate's distance agrees with that of the class (Student's t, lenient with what is lower, as it may
-    be hidden in part); and how much of what it hangs together with is in the box. The best rated detection of
-    all takes its points, others that wanted them look again, and so on. What is taken in the end is what lies
-    in the box of the class's size that is fitted (``boxfit.fit``) to the candidate: that joins what something
-    in front has parted, and leaves out what stands too near.
+    ``overlap`` is the part of the image box that the candidate's outline covers. ``t(height)`` is the
+    agreement of the box's height in metres at the candidate's distance with that of the class. It is
+    Student's t, lenient with lower heights because the object may be partly hidden. ``share`` is the share of
+    the connected points that are in the box. The best rated detection of all claims its points. Other
+    detections that wanted these points search again. This is repeated until none is left. Then
+    ``box_fit.fit`` fits a box of the class's size to the candidate, and the detection claims the points in
+    it. This joins parts that an occluder separated, and drops points that stand too near.
 
-    Of a detection with a mask (``fusion.masks``) only what this covers is in the frustum; what is beside it
-    in the box is as if it were not there. Where too few points are in it, it is left aside.
+    For a detection with a mask (``fusion.masks``) only points under the mask are in the frustum. The other
+    points in the box are ignored. A mask with too few points is ignored.
 
-    Noise can be taken, clusters outside the size limits cannot, nor is anything made that is smaller. A
-    cluster that an earlier camera has shaped is not shaped again, but can be taken as it is.
+    Noise can be claimed. Clusters outside the size limits cannot, and no smaller cluster is made. A cluster
+    that an earlier camera has changed is not changed again, but can be claimed unchanged.
 
     Args:
         points: (P, 3) obstacle points, z up.
-        height: (P,) metres above the ground, where known: objects of known size stand on it.
-        clusters: of those points.
-        cameras: their detections, and the points in their images; those that lack either are skipped.
+        height: (P,) metres above the ground, if known. Objects of known size stand on the ground.
+        clusters: clusters of those points.
+        cameras: detections, and the points in the images. A camera without either is skipped.
         fusion: rules.
         objects: sizes of the classes.
         clustering: size limits.
 
     Returns:
-        The clusters as they are now, every point of the old ones in one of them; for each camera what its
-        detections took; and what was split and merged.
+        The new clusters; every point of the old clusters is in one of them.
+        The claims of each camera.
+        The splits and merges.
     """
     work = _Work(points, height, clusters, fusion, objects.sizes, clustering.min_cluster_points)
     taken = [work.look(result) for result in cameras]
@@ -94,20 +97,22 @@ def claim(
 
 
 def _same(found: Detections, a: int, b: int) -> bool:
-    """Whether two boxes show one object under two names."""
+    """Return whether two boxes show one object under two names."""
     overlap = geometry.iou(found.xyxy[[a]], found.xyxy[[b]])[0, 0]
     return found.names[a] != found.names[b] and bool(overlap >= SAME)
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
+    """Points that a detection may claim."""
+
     fit: float
     rows: I64
-    depth: float  # metres on the ground to where it begins
+    depth: float  # metres on the ground to its front
 
 
 class _Work:
-    """One frame: the points that are still free, and the parts that were taken."""
+    """Claims of one frame: the points that are still free, and the parts already claimed."""
 
     def __init__(
         self,
@@ -122,15 +127,15 @@ class _Work:
         self.sizes, self.smallest = sizes, smallest
         self.fewest = max(config.min_points, smallest)
         self.parts: list[Part] = []
-        kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise is the last
+        kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise has label -1, the last element
         self.usable = kept[clusters.labels]
         self.owner = np.full(len(points), -1, np.int64)
         self._cameras = 0
-        order, self._start = sort_by(clusters.labels + np.int32(1), len(clusters) + 1)  # noise comes first
+        order, self._start = sort_by(clusters.labels + np.int32(1), len(clusters) + 1)  # noise first
         self._order = order.astype(np.int64)
 
     def look(self, result: CameraResult) -> Claims | None:
-        """What the detections of one camera take; clusters are numbers of parts."""
+        """Return the claims of one camera's detections. Their ``cluster`` is the number of a part."""
         camera, number = result.camera, self._cameras
         self._cameras += 1
         if (
@@ -156,7 +161,8 @@ class _Work:
             if candidate.fit * scores[d] < self.config.min_rating:
                 continue
             takers = view.taker[candidate.rows]
-            if (lost := takers.max(initial=-1)) >= 0:  # others were better: what is left?
+            # A better detection has some of the points. Search again among the remaining points.
+            if (lost := takers.max(initial=-1)) >= 0:
                 if not _same(found, int(lost), d):
                     waiting[d] = view.best(d)
                 continue
@@ -180,23 +186,23 @@ class _Work:
         return claims
 
     def _owned(self, rows: I64) -> int:
-        """The part of an earlier camera that most of these points are of, -1: none."""
+        """Return the part of an earlier camera that owns most of these points, -1 for none."""
         owners = self.owner[rows]
         owners = owners[owners >= 0]
         return int(np.bincount(owners).argmax()) if 2 * len(owners) > len(rows) else -1
 
     def unowned(self, rows: I64) -> Bool:
-        """(N,) which of these points no part has."""
+        """Return the (N,) mask of points that no part owns."""
         return np.asarray(self.owner[rows] < 0)
 
     def free_of(self, k: int) -> I64:
-        """Points of a cluster that no part has."""
+        """Return the points of a cluster that no part owns."""
         rows = self._order[self._start[k + 1] : self._start[k + 2]]
         return rows[self.owner[rows] < 0]
 
 
 class _View:
-    """The points as one camera sees them, from above with the camera at the origin."""
+    """Points as one camera sees them, on the ground plane with the camera at the origin."""
 
     def __init__(
         self,
@@ -210,18 +216,18 @@ class _View:
         self._work, self._uv, self._detections = work, uv, detections
         points_from_camera = geometry.inverse(camera_from_points)
         self._place = points_from_camera[:2, 3].copy()
-        self.taker = np.where(work.usable, np.int32(-1), np.int32(NOBODY))  # detection that has each point
+        self.taker = np.where(work.usable, np.int32(-1), np.int32(NOBODY))  # detection
         self._seen = np.flatnonzero((depth > 0) & (depth <= work.config.max_depth) & ~np.isnan(uv[:, 0]))
-        # Directions of the middles of the left, upper, right and lower edge of each box.
+        # Rays go through the middles of the left, upper, right and lower edge of each box.
         x0, y0, x1, y1 = detections.xyxy.T.astype(np.float64)
         mx, my = (x0 + x1) / 2, (y0 + y1) / 2
         corners = np.stack([x0, my, mx, y0, x1, my, mx, y1], axis=1).reshape(-1, 2)
         rays = geometry.rays(corners, intrinsics).reshape(-1, 4, 3)
         middle = (rays[:, 0] + rays[:, 2]) / 2
-        flat = np.hypot(middle[:, 0], 1)  # of a ray's length, what lies on the ground
-        self._tall = (rays[:, 3, 1] - rays[:, 1, 1]) / flat  # metres high for each metre of distance
+        flat = np.hypot(middle[:, 0], 1)  # horizontal length of a ray of depth 1
+        self._tall = (rays[:, 3, 1] - rays[:, 1, 1]) / flat  # metres of height for each metre of distance
         self._wide = (rays[:, 2, 0] - rays[:, 0, 0]) / flat
-        across = rays[:, [0, 2]] @ points_from_camera[:2, :3].T  # (D, 2, 2) on the ground
+        across = rays[:, [0, 2]] @ points_from_camera[:2, :3].T  # (D, 2, 2) directions on the ground
         across /= np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-9)
         self._normals = np.stack([-across[..., 1], across[..., 0]], axis=2)
         self._normals[:, 1] *= -1
@@ -248,7 +254,7 @@ class _View:
         self._size = np.array([size or (np.nan,) * 6 for size in sizes], np.float64).reshape(-1, 6)
 
     def best(self, d: int) -> _Candidate:
-        """The best rated of what is free in a detection's frustum."""
+        """Return the best rated candidate among the free points in a detection's frustum."""
         config, (length, width, height, *spread) = self._work.config, self._size[d].tolist()
         rows, rating, depth = choose(
             self._work.points,
@@ -270,15 +276,16 @@ class _View:
         return _Candidate(rating, rows, depth)
 
     def _allowed(self, d: int, rows: I64) -> I64:
-        """Without what is beside a detection's mask."""
+        """Drop the points of the box that the detection's mask does not cover."""
         return rows[~self._barred[d][rows]] if d in self._barred else rows
 
     def settled(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
-        """The object's points, its box (centre, size, heading), and which of its sides were seen."""
+        """Return the object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
         if not grow:
             return rows, *self._upright(d, rows, *self._fitted(d, rows, candidate.depth))
-        # Its clusters are its own beyond the image that cuts it off, and beside a box that is too tight.
+        # The object's clusters may continue beyond the image border that cuts the box, and beside a tight
+        # box.
         counts = np.bincount(work.clusters.labels[rows] + 1)
         own = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
         kin = self._allowed(d, np.concatenate([*own, np.zeros(0, np.int64)]))
@@ -309,14 +316,17 @@ class _View:
         return rows, box, seen
 
     def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
-        """Place, length, width and heading on the ground, and the sides that face the camera."""
+        """Return centre, length, width and heading on the ground, and the sides that face the camera."""
         prior = self._size[d, [0, 3, 1, 4]]
         longest = max(self._wide[d], self._tall[d]) * depth
         edge = self._edge[d] * depth
         return fit_from(self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about)
 
     def _upright(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
-        """The box (centre, size, heading), longer than wide without a class, and which sides are seen."""
+        """Return the box (centre, size, heading) and which sides are seen.
+
+        The box of a detection without class size has length >= width.
+        """
         work, (x, y, length, width, heading) = self._work, flat.tolist()
         has_size = not math.isnan(self._size[d, 0])
         seen = [facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0]
@@ -338,7 +348,10 @@ class _View:
 def _beside_mask(
     uv: F32, seen: I64, detections: Detections, d: int, config: FusionConfig, fewest: int
 ) -> Bool | None:
-    """(P,) points in a detection's box beside its mask; None: it has none, or too few points are in it."""
+    """Return the (P,) mask of points in a detection's box that its instance mask does not cover.
+
+    The result is None if the detection has no instance mask or too few points are under it.
+    """
     masks = detections.masks
     if masks is None or not config.masks or not masks.has(d):
         return None

@@ -1,4 +1,4 @@
-"""The points in an image box's frustum: the best candidate among them, and those in the box fitted to it."""
+"""Points in the frustum of an image box: the best candidate, and the points in the box fitted to it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.stages.box_fit import fit
 from bevviz.support.kernel import kernel
 
-MARGIN = 0.05  # of a box's width that is looked at on either side of it
-TIGHT = 0.15  # of a box's sides that it may be too tight by
-AROUND = 0.5  # of its width, in which points tell that an object goes on
-TAIL = 4.0  # degrees of freedom of Student's distribution, of how far a height is from its class's
-WINDOWS = 8  # that overlap at each depth
-SKIN = 0.1  # metres around a box in which a point is still its own
-SLACK = 0.5  # metres around a box in which what is left of a cluster, too small to be one, is its own
+MARGIN = 0.05  # share of a box's width that is searched on either side of it
+TIGHT = 0.15  # share of a box's sides by which the box may be too tight
+AROUND = 0.5  # share of a box's width on either side in which points show that an object continues
+TAIL = 4.0  # degrees of freedom of Student's t for the difference of a height from that of its class
+WINDOWS = 8  # a window in depth moves by its length divided by this
+SKIN = 0.1  # metres around a fitted box in which a point still belongs to it
+SLACK = 0.5  # metres around a box in which a remainder of a cluster, too small for a cluster, belongs to it
 
 
 @kernel
@@ -37,24 +37,27 @@ def choose(
     fewest: int,
     least: float,
 ) -> tuple[I64, float, float]:
-    """Points of the best candidate, how well it fits and how far away it begins.
+    """Choose the best candidate in the frustum of an image box.
 
     Args:
         points: (P, 3).
-        place: (2,) where the camera is.
+        place: (2,) position of the camera.
         uv: (P, 2) pixels.
-        seen: points in the image.
-        taker: (P,) -1 where nobody has it.
+        seen: rows of the points in the image.
+        taker: (P,) -1 for a free point.
         box: (4,) the image box.
-        gap: points that are this near hold together.
-        reach: how deep an object can be; NaN: as deep as it is large.
-        ratio: how large it is for each metre of distance.
-        tall: how high it is for each metre of distance.
-        height: of its class, NaN where unknown.
-        sigma: of that.
-        lowest: in sigmas, how much lower it may be for nothing more.
-        fewest: points.
-        least: part of the image box that is covered.
+        gap: metres; points this near are connected.
+        reach: metres, largest depth of the object. NaN: its depth is at most its size.
+        ratio: size of the object for each metre of distance.
+        tall: height of the object for each metre of distance.
+        height: metres, height of the class, NaN if unknown.
+        sigma: metres, sigma of that height.
+        lowest: sigmas; a lower height costs no more than this.
+        fewest: smallest number of points of a candidate.
+        least: smallest part of the image box that a candidate covers.
+
+    Returns:
+        The rows of the candidate's points, its rating without the score, and the distance of its front.
     """
     margin, around = MARGIN * (box[2] - box[0]), AROUND * (box[2] - box[0])
     there = np.empty(len(seen), np.int64)
@@ -77,7 +80,7 @@ def choose(
     if high_x < low_x:
         return there[:0], 0.0, 0.0
 
-    # What holds together: cells half as wide as the gap, flooded two cells far. -1: to be flooded, -2: empty.
+    # Find connected points: cells half as wide as the gap are flooded two cells far. -1 waits, -2 is empty.
     cell = gap / 2
     columns, rows = int((high_x - low_x) / cell) + 1, int((high_y - low_y) / cell) + 1
     grid = np.full((columns, rows), -2, np.int32)
@@ -165,7 +168,7 @@ def choose(
 def fit_from(
     points: F32, rows: I64, place: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
 ) -> tuple[F64, I64]:
-    """``boxfit.fit`` of some points seen from a place."""
+    """Fit a box with ``box_fit.fit`` to points seen from a place."""
     xy = np.empty((len(rows), 2))
     for k, i in enumerate(rows):
         xy[k, 0], xy[k, 1] = points[i, 0] - place[0], points[i, 1] - place[1]
@@ -177,7 +180,7 @@ def fit_from(
 
 @kernel
 def _within(points: F32, i: int, flat: F64, skin: float) -> bool:
-    """Whether a point is in a box seen from above (place, length, width, heading), or as near as ``skin``."""
+    """Return whether a point is within ``skin`` of a box seen from above (centre, length, width, heading)."""
     c, s = math.cos(flat[4]), math.sin(flat[4])
     x, y = points[i, 0] - flat[0], points[i, 1] - flat[1]
     along, across = abs(c * x + s * y), abs(c * y - s * x)
@@ -196,18 +199,20 @@ def points_inside(
     flat: F64,
     unseen: bool,
 ) -> I64:
-    """Points in an object's box that nobody has: of those in the image box, and of its clusters beside that.
+    """Return the free points in an object's box.
+
+    The points are those in the image box, and those of the object's clusters beside it.
 
     Args:
         points: (P, 3).
-        uv: (P, 2) their pixels.
-        seen: those in the image.
-        kin: those of the object's clusters.
-        taker: (P,) -1 where no detection of this camera has it.
-        owner: (P,) -1 where none of any camera has.
+        uv: (P, 2) pixels of the points.
+        seen: rows of the points in the image.
+        kin: rows of the points of the object's clusters.
+        taker: (P,) -1 for a point that no detection of this camera has.
+        owner: (P,) -1 for a point that no detection of any camera has.
         box: (4,) image box.
-        flat: (5,) place, length, width and heading of the object's box.
-        unseen: those of its clusters that are outside the image count, too.
+        flat: (5,) centre, length, width and heading of the object's box.
+        unseen: whether points of its clusters outside the image count, too.
     """
     margin, across, along = MARGIN * (box[2] - box[0]), TIGHT * (box[2] - box[0]), TIGHT * (box[3] - box[1])
     found = np.empty(len(seen) + len(kin), np.int64)
@@ -238,7 +243,10 @@ def points_inside(
 
 @kernel
 def leftover(points: F32, own: I64, rows: I64, flat: F64, smallest: int) -> I64:
-    """What is left of a cluster, where that is beside the object and too small to be one; else nothing."""
+    """Return the remainder of a cluster, or nothing.
+
+    It is returned if it is beside the object and too small for a cluster of its own.
+    """
     taken = np.zeros(len(points), np.bool_)
     for i in rows:
         taken[i] = True

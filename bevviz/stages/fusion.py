@@ -1,4 +1,4 @@
-"""Which 2D detection is which LiDAR cluster."""
+"""Match 2D detections with LiDAR clusters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bevviz.model.results import (
 from bevviz.stages.mask_lookup import cover
 from bevviz.support.kernel import kernel
 
-# What makes a cluster look like a detection, each from 0 to 1 (see ``fuse``).
+# Weights of the three similarities of a cluster and a detection, each from 0 to 1 (see ``fuse``).
 IOU_WEIGHT, SHARE_WEIGHT, NEARNESS_WEIGHT = 0.6, 0.25, 0.15
 
 
@@ -38,40 +38,40 @@ def fuse(
 ) -> Fusion:
     """Match one camera's detections with the clusters.
 
-    ``frustum``: a box in the image encloses the silhouette of what is seen of an object, so the object's
-    cluster lies in the box's frustum, fills it, and has little outside of it; what is behind shows only
-    around that silhouette. Each pair of a kept detection and a kept cluster with points in its frustum
-    is rated ::
+    ``frustum``: a box in the image encloses the visible silhouette of an object. So the object's cluster lies
+    in the frustum of the box, fills it, and has little outside of it. Objects behind it show only around that
+    silhouette. Each pair of a kept detection and a kept cluster with points in its frustum is rated ::
 
         score * (0.6 IoU + 0.25 share of the cluster's points in the frustum + 0.15 nearest depth / depth)
 
-    with the IoU of the detection and the box around the projected cluster, and the median depth of the
-    points in the frustum relative to that of the nearest permitted cluster in it. The matches are the
-    one-to-one assignment of greatest total rating: of two boxes on one object the surer one gets it,
-    and of two clusters that fit equally the near one is taken. With ``claims`` the clusters were made for the
-    detections (``frustum.claim``), and each has the one that was.
+    The IoU is that of the detection and the box around the projected cluster. The depth is the median of the
+    points in the frustum; the nearest depth is that of the nearest permitted cluster in the frustum. The
+    matches are the one-to-one assignment of greatest total rating. Of two boxes on one object the box with
+    the higher score is matched. Of two clusters that fit equally the nearer one is matched. With ``claims``
+    the clusters were made for the detections (``frustum.claim``), and each detection has the cluster made for
+    it.
 
-    ``centroid``: the tutorial's way. Each cluster's centroid, projected without distortion, takes the
-    nearest centre of a 2D box within ``match_radius``, so that one box may name several clusters.
+    ``centroid`` is the method of the tutorial. Each cluster's centroid, projected without distortion, gets
+    the nearest centre of a 2D box within ``match_radius``. One box may name several clusters.
 
     Args:
         uv: (P, 2) obstacle points in pixels, NaN where not in front of the camera.
         depth: (P,) metres along the optical axis.
         clusters: clusters of those points.
-        detections: of this camera's image; those not KEPT only have their points counted.
+        detections: detections in this camera's image. Detections that are not KEPT only get a point count.
         intrinsics: the camera.
         camera_from_points: (4, 4) optical frame from the clusters' frame.
         config: method and its thresholds.
-        claims: what each detection took, where they split the clusters.
+        claims: points that each detection claimed, if detections split the clusters.
 
     Returns:
-        The matches, and for every detection and cluster the decision and the evidence.
+        The matches, and the decision and the evidence for every detection and cluster.
     """
     u, v = uv.T
     visible = np.flatnonzero(
         (u >= -0.5) & (u < intrinsics.width - 0.5) & (v >= -0.5) & (v < intrinsics.height - 0.5) & (depth > 0)
     )
-    visible = visible[np.argsort(u[visible])]  # for _in_boxes
+    visible = visible[np.argsort(u[visible])]  # _in_boxes needs this order
     uv, depth, labels = uv[visible], depth[visible], clusters.labels[visible]
     cluster_uv = _boxes_around(uv, labels, len(clusters))
     inside = _in_boxes(uv, detections.xyxy)
@@ -92,7 +92,7 @@ def fuse(
             has_other = claims.cluster[pairs.detection] >= 0
             is_taken = np.isin(pairs.cluster, claims.cluster[claims.cluster >= 0])
             reason[(reason == Decision.TAKEN) & ~has_other & ~is_taken] = Decision.MISFIT
-        # Permitted pairs come first as the most telling, then those that fit best.
+        # Permitted pairs come first because they explain most, then pairs of a higher overlap.
         order = np.lexsort((-pairs.points, -pairs.iou, pairs.cost))
 
     reason[matched] = Decision.MATCHED
@@ -116,7 +116,7 @@ def fuse(
         pairs.detection[best_detection],
         reason[best_detection],
     )
-    # A centroid may be before the camera and its cluster yet outside the image: that is the reason then.
+    # A centroid may be in front of the camera although its cluster is outside the image.
     cluster_decision[~in_view & (cluster_decision == Decision.TOO_FAR)] = Decision.OUT_OF_VIEW
     return Fusion(
         detection_decision=detection_decision,
@@ -132,7 +132,7 @@ def fuse(
 
 
 def _covered(uv: F32, inside: list[I64], detections: Detections, config: FusionConfig) -> I32 | None:
-    """How many of the points in each box are in its mask, -1 without one; None: there are no masks."""
+    """Count the points of each box that its mask covers, -1 without a mask. Return None without any masks."""
     masks = detections.masks
     if masks is None or not config.masks:
         return None
@@ -143,13 +143,13 @@ def _covered(uv: F32, inside: list[I64], detections: Detections, config: FusionC
 
 
 def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: ClusteringConfig) -> Objects:
-    """Named 3D boxes from all cameras: where several name one cluster, the best score wins.
+    """Return named 3D boxes from all cameras. If several cameras name one cluster, the best score wins.
 
     Args:
-        clusters: the frame's clusters.
-        cameras: results; those without fusion are skipped.
-        config: ``boxes`` chooses oriented or axis-aligned ones. Oriented ones are those that were fitted when
-            detections split the clusters, where they did.
+        clusters: clusters of the frame.
+        cameras: results; a camera without fusion is skipped.
+        config: ``boxes`` selects oriented or axis-aligned boxes. If detections split the clusters, the
+            oriented boxes are those fitted at that time.
     """
     best: dict[int, tuple[float, str, str, int, Claims | None]] = {}
     for result in cameras:
@@ -180,7 +180,7 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
 
 
 def in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
-    """(count,) clusters that are in the image of a camera whose detections were compared with them."""
+    """Return the (count,) mask of clusters in the image of a camera with a fusion result."""
     seen = np.zeros(count, bool)
     for result in cameras:
         if result.fusion is not None:
@@ -191,24 +191,24 @@ def in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
 
 @kernel
 def assign(cost: F64, unmatched: float) -> I32:
-    """Optimal one-to-one assignment in which a row may also stay alone.
+    """Solve the one-to-one assignment of least total cost. A row may also stay unassigned.
 
     Shortest augmenting paths with dual variables (Jonker and Volgenant 1987, in the form of Crouse 2016,
-    "On implementing 2D rectangular assignment algorithms"), on the matrix widened by columns that stand
-    for staying alone.
+    "On implementing 2D rectangular assignment algorithms"). Additional columns of the matrix stand for
+    unassigned rows.
 
     Args:
         cost: (R, C), inf where a pair is forbidden.
-        unmatched: cost of a row that stays alone.
+        unmatched: cost of an unassigned row.
 
     Returns:
-        (R,) column of each row, -1 for alone, of least total cost.
+        (R,) column of each row, -1 if it is unassigned.
     """
     rows, columns = cost.shape
     u, v = np.zeros(rows), np.zeros(columns + rows)
     column_of = np.full(rows, -1, np.int32)
     row_of = np.full(columns + rows, -1, np.int32)
-    shortest = np.empty(columns + rows)  # path costs from a start to each column
+    shortest = np.empty(columns + rows)  # path costs from the start row to each column
     before = np.empty(columns + rows, np.int32)  # row before each column on that path
     done = np.empty(columns + rows, np.bool_)
     for start in range(rows):
@@ -245,7 +245,7 @@ def assign(cost: F64, unmatched: float) -> I32:
 
 
 def _boxes_around(uv: F32, labels: I32, count: int) -> F32:
-    """(count, 4) image box around the points of each label, NaN for labels without points."""
+    """Return (count, 4) image boxes around the points of each label, NaN for labels without points."""
     clustered = np.flatnonzero(labels >= 0)
     order = clustered[np.argsort(labels[clustered], kind="stable")]
     label, start = np.unique(labels[order], return_index=True)
@@ -257,7 +257,7 @@ def _boxes_around(uv: F32, labels: I32, count: int) -> F32:
 
 
 def _in_boxes(uv: F32, xyxy: F32) -> list[I64]:
-    """Rows of the points in each box; ``uv`` is sorted by u."""
+    """Return the rows of the points in each box. ``uv`` is sorted by u."""
     left = np.searchsorted(uv[:, 0], xyxy[:, 0], "left")
     right = np.searchsorted(uv[:, 0], xyxy[:, 2], "right")
     v = uv[:, 1]
@@ -276,11 +276,15 @@ def _frustum_pairs(
     detections: Detections,
     config: FusionConfig,
 ) -> tuple[Pairs, I32]:
-    """Every kept detection with every kept cluster in its frustum; TAKEN, or the rule that forbids it."""
+    """Pair every kept detection with every kept cluster in its frustum.
+
+    Returns:
+        The pairs, and for each TAKEN or the rule that forbids it.
+    """
     kept = np.flatnonzero(detections.kept)
     point = np.concatenate([np.zeros(0, np.int64), *(inside[d] for d in kept)])
     detection = np.repeat(kept, [len(inside[d]) for d in kept])
-    usable = np.append(clusters.kept, False)[labels[point]]  # noise, -1, is the last
+    usable = np.append(clusters.kept, False)[labels[point]]  # noise has label -1, the last element
     point, detection = point[usable], detection[usable]
 
     key = detection * max(len(clusters), 1) + labels[point]
@@ -317,7 +321,7 @@ def _frustum_pairs(
 
 
 def _assign_pairs(pairs: Pairs, allowed: I64) -> I64:
-    """Which of the allowed pairs are matches."""
+    """Return the rows of ``allowed`` that are matches."""
     d, row = np.unique(pairs.detection[allowed], return_inverse=True)
     k, column = np.unique(pairs.cluster[allowed], return_inverse=True)
     cost = np.full((len(d), len(k)), np.inf)
@@ -333,7 +337,11 @@ def _centroid_pairs(
     camera_from_points: F64,
     config: FusionConfig,
 ) -> tuple[Pairs, I64]:
-    """Every kept detection with every kept cluster before the camera, and their order by distance."""
+    """Pair every kept detection with every kept cluster in front of the camera.
+
+    Returns:
+        The pairs, and their rows ordered by distance.
+    """
     center = apply(camera_from_points, clusters.centroid)
     kept = np.flatnonzero(detections.kept)
     ahead = np.flatnonzero(clusters.kept & (center[:, 2] > 0))
@@ -355,17 +363,18 @@ def _centroid_pairs(
 
 
 def _distance(a: F32, b: F32) -> F32:
-    """(Q,) distances between the centres of (Q, 4) boxes."""
+    """Return the (Q,) distances between the centres of (Q, 4) boxes."""
     offset = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
     return np.hypot(offset[:, 0], offset[:, 1]).astype(np.float32)
 
 
 def _first_of_each(values: I32, order: I64) -> I64:
-    """The first row of each value when the rows are taken in this order."""
+    """Return the first row of each value, with the rows in this order."""
     return order[np.unique(values[order], return_index=True)[1]]
 
 
 def _decide(default: I32, row: I32, partner: I32, reason: I32) -> tuple[I32, I32]:
+    """Return decision and partner of each element: ``default`` and -1, replaced at the given rows."""
     decision, other = default.astype(np.int32), np.full(len(default), -1, np.int32)
     decision[row], other[row] = reason, partner
     return decision, other

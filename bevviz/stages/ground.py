@@ -1,4 +1,4 @@
-"""Ground segmentation: the reference's single plane, and a surface that follows slopes and kerbs."""
+"""Ground segmentation: one plane as in the reference, or a surface that follows slopes and kerbs."""
 
 from __future__ import annotations
 
@@ -12,39 +12,40 @@ from bevviz.model.results import Ground
 from bevviz.stages.cells import sort_by
 from bevviz.support.kernel import kernel
 
-# Rings are as wide as sqrt(r^2 + RING_SCALE^2) / RING_COUNT: half a metre near the sensor, 4% of the range
+# A ring is sqrt(r^2 + RING_SCALE^2) / RING_COUNT wide: half a metre near the sensor, 4% of the range
 # far away, where the beams are sparse.
 RING_SCALE = 12.5
 RING_COUNT = 25.0
-NEAR = 20.0  # metres around the sensor in which the first plane is sought
-TALL = 2.0  # metres: what is higher may hang over the ground, a crown or a bridge
+NEAR = 20.0  # metres: radius around the sensor in which the first plane is searched
+TALL = 2.0  # metres: a higher point may hang over the ground, like a tree crown or a bridge
 MEMORY = 5.0  # metres over which the slope of the ground is remembered
-BANK = 0.7  # metres up for each one outwards: the steepest bank, 35 degrees
-ACROSS = 0.5  # share of a bin that a bank must be seen across: a vehicle's side is not
-ROUGH = 0.1  # metres of grass on it
-WIDE = 4.0  # metres that it goes on for to the side: a car's bonnet does not
+BANK = 0.7  # metres up for each metre outwards: the steepest bank, 35 degrees
+ACROSS = 0.5  # smallest share of a bin's depth that a bank spans; the side of a vehicle spans less
+ROUGH = 0.1  # metres: height of the grass on a bank
+WIDE = 4.0  # metres: a bank is at least this wide; a car's bonnet is narrower
 
 
 def segment_ground(points: F32, config: GroundConfig) -> Ground:
-    """Tell the ground from the obstacles.
+    """Separate the ground from the obstacles.
 
-    ``plane`` takes the one with the most points within ``distance_threshold``, whichever it is, even a
-    wall, as Open3D's ``segment_plane`` does; the heights are above that plane.
+    ``plane`` takes the plane with the most points within ``distance_threshold``, as Open3D's
+    ``segment_plane`` does. This plane may be a wall. The heights are above this plane.
 
-    ``polar`` follows the ground outward from the sensor over sectors and rings, as Himmelsbach et al. 2010,
-    but through all sectors at once: each bin offers its lowest point that is no further than ``max_step``
-    from where the rings before lead to, unless something stands in it whose foot may be hidden, and the
-    ground goes to the median of the offers of the sectors around. So a kerb is followed, a car is too high
-    a step, a reflection below the road too low; where nothing is offered the ground goes on as it was. What
-    is below the ground counts as ground.
+    ``polar`` follows the ground outward from the sensor over sectors and rings (Himmelsbach et al. 2010), but
+    through all sectors at once. Each bin offers its lowest point that is within ``max_step`` of the height
+    that the inner rings predict. A bin with an object whose foot may be hidden offers nothing. The ground
+    moves to the median of the offers of the neighbouring sectors. So it follows a kerb. A car is too high a
+    step, and a reflection below the road is too low. Without offers the ground continues with its last slope.
+    Points below the ground count as ground.
 
     Args:
         points: (N, 3) float32 finite points, z up, the sensor near x = y = 0.
         config: the method and its parameters.
 
     Returns:
-        Ground. Without a plane to start from (fewer than three points, all on a line, none where
-        ``sensor_height`` would have them) nothing is ground and all heights are NaN.
+        Ground. Without a first plane no point is ground and all heights are NaN. This happens with fewer than
+        three points, with all points on a line, or with no points near the height that ``sensor_height``
+        predicts.
     """
     return _plane(points, config) if config.method == "plane" else _polar(points, config)
 
@@ -66,7 +67,7 @@ def _unknown(count: int) -> Ground:
 
 @kernel
 def _above(points: F32, plane: F64) -> F32:
-    """(N,) signed distance of points from a plane a, b, c, d of unit normal."""
+    """Return the (N,) signed distances of points from a plane a, b, c, d with a unit normal."""
     a, b, c, d = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2]), np.float32(plane[3])
     distance = np.empty(len(points), np.float32)
     for i in range(len(points)):
@@ -75,10 +76,10 @@ def _above(points: F32, plane: F64) -> F32:
 
 
 def _largest_plane(points: F32, threshold: float, config: GroundConfig, upright: float = 0.0) -> Bool:
-    """(N,) the points nearer than the threshold to the best plane through three random points (RANSAC).
+    """Find the best plane through three random points (RANSAC). Return its (N,) inlier mask.
 
-    Only planes whose unit normal has |z| of at least ``upright`` take part.
-    All False: no three points made a plane.
+    Only planes whose unit normal has |z| of at least ``upright`` are considered.
+    The mask is all False if no three points span such a plane.
     """
     if len(points) < 3:
         return np.zeros(len(points), np.bool_)
@@ -93,7 +94,10 @@ def _largest_plane(points: F32, threshold: float, config: GroundConfig, upright:
 
 @kernel
 def _best_support(points: F32, anchor: F32, normal: F32, threshold: np.float32) -> Bool:
-    """(N,) the points near the plane, of those through each anchor, that has the most."""
+    """Return the (N,) inlier mask of the plane with the most inliers.
+
+    Each row of ``anchor`` and ``normal`` defines a plane.
+    """
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
     near = np.zeros(len(x), np.bool_)
     most, best = 0, -1
@@ -114,9 +118,14 @@ def _best_support(points: F32, anchor: F32, normal: F32, threshold: np.float32) 
 
 
 def _fit(points: F32, inliers: Bool) -> F64:
-    """(4,) plane, unit normal upwards, by least squares along the axis nearest to its normal, as Open3D's."""
+    """Fit a plane by least squares along the axis nearest to its normal, as Open3D does.
+
+    Returns:
+        (4,) a, b, c, d with a unit normal that points upwards.
+    """
     center, scatter = _moments(points, inliers)
-    # The cofactors of the scatter matrix: the row with the largest diagonal one is the normal.
+    # The rows of the cofactors of the scatter matrix are parallel to the normal. The row with the largest
+    # diagonal element is the most accurate.
     cofactors = np.cross(scatter[[1, 2, 0]], scatter[[2, 0, 1]])
     normal = cofactors[np.argmax(np.diagonal(cofactors))]
     normal = normal / (np.linalg.norm(normal) * (-1 if normal[2] < 0 else 1))
@@ -125,7 +134,7 @@ def _fit(points: F32, inliers: Bool) -> F64:
 
 @kernel
 def _moments(points: F32, chosen: Bool) -> tuple[F64, F64]:
-    """(3,) mean and (3, 3) scatter about it of the chosen points."""
+    """Return the (3,) mean of the chosen points and their (3, 3) scatter about it."""
     center, scatter = np.zeros(3), np.zeros((3, 3))
     count = 0
     for i in range(len(points)):
@@ -175,7 +184,7 @@ def _polar(points: F32, config: GroundConfig) -> Ground:
 
 
 def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F64 | None:
-    """The ground around the sensor as a plane, from the lowest points of the bins."""
+    """Fit a plane to the ground around the sensor, from the lowest points of the bins."""
     steepest = math.radians(config.max_slope)
     expected = math.nan if config.sensor_height is None else -config.sensor_height
     low = _near_ground(points, _lowest(points, order, start), expected, config.max_step, math.tan(steepest))
@@ -184,15 +193,15 @@ def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F
 
 
 def _place(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
-    """Ring and sector of each point, with the fraction of the way through it; the points sorted by both."""
-    # NumPy has vectorised arcsinh and arctan2, which compiled loops have not.
+    """Return ring and sector of each point with fractions, and the points sorted by both."""
+    # NumPy has vectorised arcsinh and arctan2; compiled loops do not.
     ring, turn = np.arcsinh(_range(points)), np.arctan2(points[:, 1], points[:, 0])
     return (ring, *_bin(ring, turn, rings, sectors))
 
 
 @kernel
 def _range(points: F32) -> F32:
-    """(N,) horizontal distance from the sensor, in units of RING_SCALE."""
+    """Return the (N,) horizontal distances from the sensor, in units of RING_SCALE."""
     scale = np.float32(1 / RING_SCALE)
     found = np.empty(len(points), np.float32)
     for i in range(len(points)):
@@ -202,9 +211,9 @@ def _range(points: F32) -> F32:
 
 @kernel
 def _bin(ring: F32, turn: F32, rings: int, sectors: int) -> tuple[F32, I32, I32]:
-    """Sector of each point, and the points sorted by ring and sector.
+    """Return the sector of each point, and the points sorted by ring and sector.
 
-    ``ring`` comes in as arcsinh of the range and is scaled in place, ``turn`` in radians.
+    ``ring`` comes in as arcsinh of the range and is scaled in place. ``turn`` is in radians.
     """
     scale, whole = np.float32(sectors / (2 * math.pi)), np.float32(sectors)
     sector = np.empty(len(ring), np.float32)
@@ -213,9 +222,9 @@ def _bin(ring: F32, turn: F32, rings: int, sectors: int) -> tuple[F32, I32, I32]
         ring[i] *= np.float32(RING_COUNT)
         s = scale * turn[i]
         s += whole if s < 0 else np.float32(0)
-        # Rounding takes a tiny negative angle to the whole turn, which is the first sector again.
+        # A tiny negative angle is rounded to a whole turn, which is the first sector again.
         sector[i] = s if s < whole else np.float32(0)
-        # Beyond max_range the last ring goes on.
+        # The last ring continues beyond max_range.
         row[i] = min(int(ring[i]), rings - 1) * sectors + np.int32(sector[i])
     order, start = sort_by(row, rings * sectors)
     return sector, order, start
@@ -223,9 +232,10 @@ def _bin(ring: F32, turn: F32, rings: int, sectors: int) -> tuple[F32, I32, I32]
 
 @kernel
 def _near_ground(points: F32, lowest: I32, expected: float, max_step: float, steepest: float) -> F32:
-    """The lowest points that the first plane is sought in: those around the sensor where there are any.
+    """Return the lowest points to fit the first plane to.
 
-    ``expected``: height of the ground below the sensor, NaN where it is not known.
+    Points within NEAR of the sensor are used if there are at least three of them.
+    ``expected`` is the height of the ground below the sensor, NaN if it is not known.
     """
     chosen = np.empty(len(lowest), np.int32)
     distance = np.empty(len(lowest))
@@ -260,7 +270,7 @@ def _heights(
     steepest: float,
     threshold: float,
 ) -> tuple[F32, Bool]:
-    """(N,) height above the ground, and whether it is below the threshold."""
+    """Return the (N,) heights above the ground, and a mask of the heights below the threshold."""
     rise = _above(points, plane) / np.float32(plane[2])
     surface = _follow(rise, ring, order, start, radius, sectors, max_step, steepest)
     _settle(surface, rise, order, start, threshold / 2)
@@ -270,7 +280,7 @@ def _heights(
 
 @kernel
 def _lowest(points: F32, order: I32, start: I32) -> I32:
-    """Index of the lowest point of each occupied bin."""
+    """Return the index of the lowest point of each occupied bin."""
     lowest = np.empty(len(start) - 1, np.int32)
     found = 0
     for b in range(len(start) - 1):
@@ -296,18 +306,18 @@ def _follow(
     max_step: float,
     steepest: float,
 ) -> F64:
-    """(R, S) height of the ground above the first plane, ring by ring outwards."""
+    """Return the (R, S) heights of the ground above the first plane, computed ring by ring outwards."""
     surface = np.zeros((len(radius), sectors))
     level = np.zeros(sectors)
     slope = np.zeros(sectors)
-    unseen = np.full(sectors, -NEAR)  # metres since the last offer; the first plane is good for NEAR
+    unseen = np.full(sectors, -NEAR)  # metres since the last offer; the first plane is valid for NEAR metres
     offer, banked = np.empty(sectors), np.empty(sectors)
     for r in range(len(radius)):
         step = radius[r] - radius[r - 1] if r > 0 else radius[0]
         keep = math.exp(-step / MEMORY)
         for s in range(sectors):
             level[s] += slope[s] * step
-            # The longer the ground was hidden, the less is known of where it comes up again.
+            # The longer the ground was hidden, the less certain its next height is.
             gate = max_step * (1 + max(unseen[s], 0.0) / MEMORY)
             offer[s] = banked[s] = np.inf
             lowest, top, near, far = np.inf, -np.inf, np.inf, -np.inf
@@ -320,15 +330,15 @@ def _follow(
                     near, far = min(near, ring[order[k]]), max(far, ring[order[k]])
             if top <= gate:
                 continue
-            # What rises no steeper than a bank over most of the bin is one; what rises at once stands there,
-            # and the lowest point of it need not be its foot.
+            # Points that rise no steeper than a bank over most of the bin are a bank. Points that rise at
+            # once are an object, and its lowest point need not be its foot.
             across = (far - near) * step
             bank = across >= ACROSS * step and top - lowest <= BANK * across + ROUGH
             banked[s] = level[s] + lowest if bank and lowest <= gate + BANK * step else np.inf
             if offer[s] > level[s]:
                 offer[s] = np.inf
         _widen(offer, banked, WIDE * sectors / (2 * math.pi * radius[r]))
-        # Offers of sectors within a metre to each side.
+        # The median is over the sectors within a metre to each side.
         reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
         around = np.empty(2 * reach + 1)
         for s in range(sectors):
@@ -357,10 +367,10 @@ def _follow(
 
 @kernel
 def _widen(offer: F64, banked: F64, least: float) -> None:
-    """Take the offers of banks where at least so many sectors beside each other have one."""
+    """Accept the offers of banks where at least ``least`` adjacent sectors have one."""
     sectors = len(offer)
     run = 0
-    for place in range(2 * sectors):  # around twice: a run may go over the first sector
+    for place in range(2 * sectors):  # Two rounds, because a run may cross the first sector.
         if banked[place % sectors] < np.inf:
             run += 1
             continue
@@ -374,7 +384,7 @@ def _widen(offer: F64, banked: F64, least: float) -> None:
 def _settle(surface: F64, rise: F32, order: I32, start: I32, band: float) -> None:
     """Move each bin of the surface to the mean of the points within the band around it.
 
-    The lowest points, which it was made of, lie below the ground by the noise of the sensor.
+    The surface was made from the lowest points, which lie below the ground by the noise of the sensor.
     """
     flat = surface.ravel()
     for b in range(len(flat)):
@@ -389,7 +399,7 @@ def _settle(surface: F64, rise: F32, order: I32, start: I32, band: float) -> Non
 
 @kernel
 def _height(rise: F32, ring: F32, sector: F32, surface: F64) -> F32:
-    """(N,) height above the surface, which is bilinear between the middles of its bins."""
+    """Return the (N,) heights above the surface, which is interpolated bilinearly between the bin centres."""
     rings, sectors = surface.shape
     height = np.empty(len(rise), np.float32)
     for i in range(len(rise)):

@@ -1,4 +1,4 @@
-"""Which points an instance mask covers."""
+"""Look up which points an instance mask covers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from bevviz.support.kernel import kernel
 
 
 def cover(masks: Masks, d: int, uv: F32, margin: float = 0.0) -> Bool:
-    """(N,) which of these pixels of the image a detection's object covers; NaN is none.
+    """Return the (N,) mask of pixels that a detection's object covers. NaN pixels are not covered.
 
-    ``margin``: pixels to the left, right, above and below it that count, too.
+    ``margin``: a pixel also counts if the object covers a position this many pixels left, right, above or
+    below it.
     """
     return _cover(masks.packed, masks.start(d), masks.place[d], masks.grid, uv, margin)
 

@@ -1,4 +1,4 @@
-"""Two opinions on what is there: objects of somebody else's method, and what our fusion would have made."""
+"""Compare the objects of another method with the detections of the cameras and with our fused objects."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from bevviz.model.results import (
 )
 from bevviz.stages.visibility import image_boxes, in_view, visible
 
-MARGIN = 0.2  # metres around a box in which points are still its own
-HELD = 0.5  # share of a cluster's points that are in the box which it is of
-RIVAL = 0.7  # of the share that another box has of it: with less, it is that one's
-PARTLY = 0.2  # the same, where no other cluster has more points in the box
+MARGIN = 0.2  # metres around a box in which points still belong to it
+HELD = 0.5  # smallest share of a cluster's points in the box that it belongs to
+RIVAL = 0.7  # share relative to the box with the most of a cluster; with less, only that box has the cluster
+PARTLY = 0.2  # like HELD, for a cluster that has the most points in the box
 SAID = (Opinion.CONFIRMED, Opinion.NAMED_OTHERWISE)
-NEAR = 0.1  # IoU from which a detection is worth a word where none looks at a box
+NEAR = 0.1  # IoU from which a nearby detection is reported for a box without detections
 
 
 @dataclass(frozen=True, slots=True)
 class _Sight:
-    """What one camera says of each box; fields as of ``Opinions``."""
+    """Opinion of one camera on each box. The fields are those of ``Opinions``."""
 
     opinion: I32
     detection: I32
@@ -53,31 +53,33 @@ def opinions(
     config: OpinionsConfig,
     known: Sequence[str] = (),
 ) -> Opinions:
-    """Hold objects that our fusion did not make and those that it would have made against each other.
+    """Compare objects of another method with the objects that our fusion would make.
 
-    A kept detection looks at a box if the cluster that the fusion matched it with is in the box: half of its
-    points, or a fifth where it has most of the points there. Where another box has far more of them, the
-    detection has to overlap this one in the image, too, IoU ``min_iou``. A detection that has no cluster
-    looks at the box that it overlaps most in the image, if IoU is ``min_iou`` or more and the box is not
-    hidden; one that has a cluster elsewhere looks at none. A camera says of a box
+    A detection belongs to a box in one of two ways. If the fusion matched it with a cluster, the cluster is
+    in the box: half of its points, or a fifth if it has the most points in the box. If another box has far
+    more of these points, the detection also has to overlap this box in the image with IoU ``min_iou``. A
+    detection without a cluster belongs to the box that it overlaps most in the image, if the IoU is
+    ``min_iou`` or more and the box is not hidden. A detection whose cluster is elsewhere belongs to no box.
+    The opinion of a camera on a box is
 
-    - CONFIRMED, where a detection looks at it whose class is right for it;
-    - NAMED_OTHERWISE, where only others do;
-    - CONTRADICTED, where none does, although ``min_shown`` of the box is in the image, ``min_visible``
-      of it not hidden, it is ``min_height`` high, and the detector knows a class that is right for it;
-    - else that it is not seen, and why.
+    - CONFIRMED if a detection of a matching class belongs to it;
+    - NAMED_OTHERWISE if only detections of other classes do;
+    - CONTRADICTED if no detection does, although ``min_shown`` of the box is in the image, ``min_visible`` of
+      it is not hidden, it is ``min_height`` high, and the detector knows a matching class;
+    - otherwise unseen, with the reason.
 
-    Of several cameras the one counts whose answer comes first here, and then that which shows more of it.
+    With several cameras the opinion that comes first in this list counts. For equal opinions the camera that
+    shows more of the box counts.
 
     Args:
-        objects: of somebody else's method, in the frame of the points.
-        fused: of ``fusion.merge``.
-        obstacles: (P, 3) that the clusters are of; None: there are none.
-        clusters: of those points.
-        cameras: what each has found.
-        ranges: of ``visibility.range_image``.
-        config: of when a camera has to find a box.
-        known: classes that the detector knows; empty: nobody knows which.
+        objects: objects of the other method, in the frame of the points.
+        fused: objects from ``fusion.merge``.
+        obstacles: (P, 3) points of the clusters, or None.
+        clusters: clusters of those points.
+        cameras: detections and fusion of each camera.
+        ranges: from ``visibility.range_image``.
+        config: conditions under which a camera has to find a box.
+        known: classes that the detector knows; empty if unknown.
     """
     boxes, count = objects.boxes, len(objects)
     open_ = visible(ranges, boxes)
@@ -97,7 +99,8 @@ def opinions(
         for field in _Sight.__slots__:
             getattr(best, field)[rows] = getattr(sight, field)[rows]
         for k in rows.tolist():
-            there = sight.shown[k] > 0 or sight.opinion[k] in SAID  # by its cluster, beside the image
+            # An object can be named by its cluster although its box is beside the image.
+            there = sight.shown[k] > 0 or sight.opinion[k] in SAID
             camera[k] = result.camera.name if there else ""
     return Opinions(
         fused=fused,
@@ -114,11 +117,11 @@ def opinions(
 
 
 def right_names(label: str, known: Sequence[str]) -> frozenset[str]:
-    """Which of the names of a detector are right for an object that a method calls so, in lower case."""
+    """Return the detector's class names that match a label of another method, in lower case."""
     wanted, names = accepted_names(label, known), {name.lower() for name in known}
     if right := wanted & names:
         return right
-    # A method may have the names of a detector, and the detector those of a data set.
+    # The method may use the names of a detector, and the detector those of a data set.
     return frozenset(name.lower() for name in known if label.lower() in accepted_names(name, ()))
 
 
@@ -126,7 +129,7 @@ def right_names(label: str, known: Sequence[str]) -> frozenset[str]:
 
 
 def _named_clusters(fused: Objects, cameras: Sequence[CameraResult], clusters: Clusters | None) -> I64:
-    """Rows of the clusters that a detection has named, in order."""
+    """Return the rows of clusters that a detection has named, in order."""
     matched = np.zeros(0 if clusters is None else len(clusters), np.bool_)
     for result in cameras:
         if result.fusion is not None:
@@ -136,11 +139,11 @@ def _named_clusters(fused: Objects, cameras: Sequence[CameraResult], clusters: C
 
 
 def _held(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: I64) -> F32:
-    """(K, len(named)) share of the points of each of these clusters that are in each box."""
+    """Return the (K, len(named)) share of the points of each named cluster that are in each box."""
     held = np.zeros((len(boxes), len(named)), np.float32)
     if points is None or clusters is None or held.size == 0:
         return held
-    column = np.full(len(clusters) + 1, -1, np.int64)  # noise, -1, is the last
+    column = np.full(len(clusters) + 1, -1, np.int64)  # noise has label -1, the last element
     column[named] = np.arange(len(named))
     own = column[clusters.labels]
     rows = np.flatnonzero(own >= 0)
@@ -153,12 +156,12 @@ def _held(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: 
 
 
 def _least_iou(held: F32, own: Bool, config: OpinionsConfig) -> F32:
-    """(K, C) that a detection with that cluster needs with each box to look at it, inf: never.
+    """Return the (K, C) IoU that a detection with that cluster needs to belong to each box, inf for never.
 
     Args:
         held: (K, C) share of the cluster in the box.
-        own: (K, C) whether it has most of the points in the box.
-        config: for where another box has far more of it.
+        own: (K, C) whether the cluster has the most points in the box.
+        config: gives the IoU needed if another box has far more of the cluster.
     """
     of_box = own & (held >= PARTLY)
     first = held >= RIVAL * held.max(axis=0, initial=0)
@@ -167,7 +170,7 @@ def _least_iou(held: F32, own: Bool, config: OpinionsConfig) -> F32:
 
 
 def _partners(fused: Objects, named: I64, held: F32, least: F32) -> I32:
-    """(J,) the box that holds most of the cluster of each of our objects, -1: it is in none."""
+    """Return the (J,) box that holds most of the cluster of each of our objects, -1 for none."""
     partner = np.full(len(fused), -1, np.int32)
     if len(held):
         columns = np.searchsorted(named, fused.cluster)
@@ -181,7 +184,7 @@ def _partners(fused: Objects, named: I64, held: F32, least: F32) -> I32:
 
 
 def _unseen(count: int, opinion: Opinion) -> _Sight:
-    """To be filled in."""
+    """Return the initial opinions of a camera, to be filled in."""
     zero = np.zeros(count, np.float32)
     return _Sight(
         np.full(count, opinion, np.int32),
@@ -204,6 +207,7 @@ def _sight(
     config: OpinionsConfig,
     known: Sequence[str],
 ) -> _Sight:
+    """Return the opinion of one camera on each box."""
     count, around = len(objects), image_boxes(objects.boxes, result.camera)
     overlap = geometry.iou(around, detections.xyxy)
     by_cluster, has_cluster = _by_cluster(result, detections, overlap, named, held, least)
@@ -220,9 +224,9 @@ def _sight(
     fits = np.array([[n.lower() in right[label] for n in detections.names] for label in objects.names], bool)
     fits = fits.reshape(count, len(detections))
 
-    # Of those that look at it, one of a right class, with a cluster, that fits best.
+    # Of the detections that belong to a box, the best has a matching class, a cluster, and the most overlap.
     rank = np.where(looks, 8 + 4 * fits + np.where(np.isnan(by_cluster), 0, 2 * by_cluster) + overlap, 0)
-    # Where none does, what is nearest, be it weak: of a right class rather than another.
+    # Without such a detection the nearest is reported, even a weak one. A matching class is preferred.
     beside = (overlap >= NEAR) & (detections.state != DetectionState.SUPPRESSED)
     rank = np.maximum(rank, np.where(beside, 2 * fits + overlap, 0))
     sight = _unseen(count, Opinion.CONTRADICTED)
@@ -249,7 +253,12 @@ def _sight(
 def _by_cluster(
     result: CameraResult, detections: Detections, overlap: F32, named: I64, held: F32, least: F32
 ) -> tuple[F32, Bool]:
-    """(K, D) share of a detection's cluster that is in the box it is of, else NaN; (D,) which have one."""
+    """Return how much of each detection's cluster is in each box.
+
+    Returns:
+        (K, D) share of the cluster in a box that it belongs to, else NaN.
+        (D,) whether the detection has a cluster.
+    """
     share = np.full((len(held), len(detections)), np.nan, np.float32)
     has_cluster = np.zeros(len(detections), np.bool_)
     if result.fusion is None:
@@ -259,6 +268,6 @@ def _by_cluster(
     has_cluster[detection] = True
     for d, column in zip(detection.tolist(), np.searchsorted(named, matched).tolist(), strict=True):
         looks = overlap[:, d] >= least[:, column]
-        mine = np.where(looks, held[:, column], np.nan)  # several, where one box names them
+        mine = np.where(looks, held[:, column], np.nan)  # One box can name several clusters.
         share[:, d] = np.fmax(share[:, d], mine)
     return share, has_cluster

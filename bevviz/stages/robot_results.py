@@ -1,4 +1,4 @@
-"""What the robot itself published as the result of a stage, in place of our own: ``topic:NAME``."""
+"""Results that the robot published, used as a stage instead of ours: ``topic:NAME``."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from bevviz.model.results import (
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.user_stages import heights, placed
 
-NEAR = 0.05  # metres from a point of ours to one of the robot's that make them the same
+NEAR = 0.05  # metres: a point of ours within this distance of a point of the robot's is the same point
 
 
 def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
-    """Ground is what the robot's cloud of obstacles has not.
+    """Return as ground all points that are not in the robot's cloud of obstacles.
 
-    A point of ours is an obstacle where one of the robot's is within a voxel's diagonal, or 5 cm: both may
-    have thinned the same scan in their own way.
+    A point is an obstacle if one of the robot's points is within a voxel's diagonal, at least 5 cm. Both
+    sides may have downsampled the same scan in different ways.
 
     Raises:
-        StageError: there is none at this time.
+        StageError: the robot published no cloud at this time.
     """
     cloud = next((c for c in frame.robot_clouds if c.topic == topic), None)
     if cloud is None:
@@ -49,10 +49,12 @@ def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
 
 
 def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
-    """The robot's boxes as clusters: each holds the points in it, those in several are the nearest one's.
+    """Return the robot's boxes as clusters.
+
+    A point in several boxes belongs to the box with the nearest centre.
 
     Raises:
-        StageError: there are none at this time.
+        StageError: the robot published no boxes at this time.
     """
     boxes = in_points_frame(frame, _boxes(frame, topic))
     labels = np.full(len(points), -1, np.int32)
@@ -75,10 +77,11 @@ def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
 
 
 def detect(frame: Frame, camera: Camera, topic: str) -> Detections:
-    """The robot's boxes in the camera's image, all of them kept.
+    """Return the robot's boxes in the camera's image, all of them kept.
 
     Raises:
-        StageError: there are none at this time, or nobody says which of several cameras they are of.
+        StageError: the robot published no detections at this time, or it is unknown which of several cameras
+            they belong to.
     """
     for found in frame.robot_detections:
         if found.topic == topic and not found.camera and len(frame.cameras) > 1:
@@ -92,17 +95,17 @@ def detect(frame: Frame, camera: Camera, topic: str) -> Detections:
 
 
 def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clusters | None) -> Objects:
-    """The robot's named boxes.
+    """Return the robot's named boxes.
 
     Raises:
-        StageError: there are none at this time.
+        StageError: the robot published no boxes at this time.
     """
     labelled = _boxes(frame, topic)
     return placed(in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters)
 
 
 def detections_of(found: LabelledBoxes2D) -> Detections:
-    """Image boxes that somebody else states, best first as all detections are, none of them refused."""
+    """Make detections from labelled image boxes, best score first. All are kept."""
     order = np.argsort(-found.scores, kind="stable")
     zero = np.zeros(len(order), np.int32)
     kept = np.full(len(order), DetectionState.KEPT, np.int32)
@@ -112,7 +115,7 @@ def detections_of(found: LabelledBoxes2D) -> Detections:
 
 
 def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
-    """Boxes that somebody else states, in the frame of the points."""
+    """Move labelled 3D boxes into the frame of the points."""
     points_from_boxes = np.eye(4)
     if labelled.world_from_boxes is not None:
         points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
@@ -120,7 +123,7 @@ def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
 
 
 def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:
-    """Also those that a person has labelled."""
+    """Return the boxes of a topic, from the robot or from the ground truth."""
     for labelled in (*frame.robot_boxes, frame.truth):
         if labelled is not None and labelled.topic == topic:
             return labelled
@@ -128,7 +131,10 @@ def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:
 
 
 def _within(points: F32, others: F32, reach: float) -> Bool:
-    """(N,) which points have one of the others in their cell, ``reach`` wide, or in a cell beside it."""
+    """Return the (N,) mask of points with one of the others in their cell or in a cell beside it.
+
+    A cell is ``reach`` wide.
+    """
     found = np.zeros(len(points), np.bool_)
     if not len(points) or not len(others):
         return found
@@ -143,4 +149,5 @@ def _within(points: F32, others: F32, reach: float) -> Bool:
 
 
 def _missing(topic: str, what: str) -> StageError:
+    """Return the error of a topic without a message."""
     return StageError(f"the robot published no {what} on {topic} at the time of this scan")

@@ -1,4 +1,4 @@
-"""Which cluster is which object of the frames before: a constant-velocity Kalman filter for each."""
+"""Track clusters over frames with a constant-velocity Kalman filter for each object."""
 
 from __future__ import annotations
 
@@ -16,32 +16,33 @@ from bevviz.model.results import Clusters, Objects, Tracks
 from bevviz.stages.fusion import assign
 from bevviz.support.kernel import kernel
 
-INITIAL_SPEED = 5.0  # m/s, one sigma of what is seen for the first time
+INITIAL_SPEED = 5.0  # m/s, one sigma of the speed of a new track
 SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading
-SIZE_WEIGHT = 1.0  # of a box that is e times larger or smaller, against a distance as large as the gate
-LEAST_VOTE = 1.0  # below it a name is forgotten: scores of a class, decayed
-HEADING_SPEED = 1.0  # m/s from which the direction of motion tells front from back
+SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate
+LEAST_VOTE = 1.0  # a track whose decayed scores sum up to less loses its name
+HEADING_SPEED = 1.0  # m/s above which the direction of motion distinguishes front from back
 
 
 @dataclass(slots=True)
 class _State:
-    """One row for each track. Arrays only, so that rows are chosen and added in one place."""
+    """State of all tracks, one row for each. All fields are arrays, so that rows are selected together."""
 
     id: I64
     mean: F64  # (T, 2, 3) position and velocity
     covariance: F64  # (T, 2, 2) the same for each axis
     size: F64  # (T, 3)
-    whole: Bool  # the size is that of all of it, not of what was seen
+    whole: Bool  # whether the size is that of the whole object, not of its visible part
     yaw: F64
     hits: I32
     sightings: I32
     born: I64  # stamp
     seen: I64  # stamp
     votes: F64  # (T, classes)
-    trail: F32  # (T, L, 3) NaN before it was born
+    trail: F32  # (T, L, 3) NaN before the birth
 
     @staticmethod
     def empty() -> _State:
+        """Return the state without tracks."""
         nothing = np.zeros(0, np.bool_)
         return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), nothing, 0, 0, 0, TrackingConfig())
 
@@ -49,6 +50,7 @@ class _State:
     def new(
         ids: I64, boxes: Boxes3D, whole: Bool, stamp: int, classes: int, length: int, config: TrackingConfig
     ) -> _State:
+        """Return the state of new tracks, one for each box."""
         n = len(ids)
         mean = np.zeros((n, 2, 3))
         mean[:, 0] = boxes.center
@@ -71,29 +73,31 @@ class _State:
         return len(self.id)
 
     def chosen(self, rows: NDArray[Any]) -> _State:
+        """Return the state of some rows."""
         return _State(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def joined(self, other: _State) -> _State:
+        """Return the state with the rows of another appended."""
         return _State(
             *(np.concatenate([getattr(s, field.name) for s in (self, other)]) for field in fields(self))
         )
 
 
 class Tracker:
-    """Tracks the clusters of consecutive frames; the fused objects give them their classes.
+    """Tracker of the clusters of consecutive frames. The fused objects name the tracks.
 
-    After SORT (Bewley et al. 2016) and AB3DMOT (Weng et al. 2020): predict, assign, update, with what they
-    track in the image or in 3D boxes taken from the clusters, so that a track lives on while the detector
-    misses its object or the camera does not see it.
+    It follows SORT (Bewley et al. 2016) and AB3DMOT (Weng et al. 2020): predict, assign, update. These track
+    image boxes and 3D detections; here the boxes come from the clusters. So a track survives while the
+    detector misses its object or the camera does not see it.
 
-    Positions are those of the fixed frame, where there is one: what stands still then has speed zero however
-    the robot moves. It begins anew, with ids that were never given, where stamps jump or the frame changes.
+    Positions are in the fixed frame if there is one. A standing object then has speed zero however the robot
+    moves. The tracker restarts with new ids if stamps jump or the frame changes.
     """
 
     def __init__(self) -> None:
         self._state = _State.empty()
         self._classes: list[str] = []
-        self._stamps: list[int] = []  # of the columns of the trails
+        self._stamps: list[int] = []  # stamps of the columns of the trails
         self._frame: tuple[str, bool] | None = None
         self._next = 0
 
@@ -105,18 +109,19 @@ class Tracker:
         objects: Objects | None,
         config: TrackingConfig,
     ) -> Tracks:
-        """The tracks after this frame.
+        """Return the tracks after this frame.
 
         Args:
-            frame: for its stamp and pose. A stamp twice is the same instant seen again.
-            clusters: only those that were kept are tracked, by their oriented boxes, or by those of the
-                objects that they are, where these are completed to the size of their class.
-            in_view: (K,) clusters that some camera could name: without a name they lose the one they had.
+            frame: gives stamp and pose. The same stamp twice is the same instant seen again.
+            clusters: only kept clusters are tracked, by their oriented boxes. If an object completed the box
+                to the size of its class, that box is used.
+            in_view: (K,) clusters that some camera could name. Without a name their tracks gradually lose the
+                name they had.
             objects: names of clusters.
             config: noise, gate, birth and death.
 
         Returns:
-            Every track that lives, also those without a name.
+            Every living track, also tracks without a name.
         """
         absolute = frame.world_from_points is not None
         place = (frame.world_frame if absolute else frame.points_frame, absolute)
@@ -159,19 +164,19 @@ class Tracker:
         return self._tracks(frame.stamp, place, cluster, named, innovation, config)
 
     def _predict(self, dt: float, config: TrackingConfig) -> None:
-        """Constant velocity, disturbed by accelerations that are constant from frame to frame."""
+        """Predict with constant velocity. Noise is an acceleration that is constant between two frames."""
         step = np.array([[1.0, dt], [0.0, 1.0]])
         disturbed = config.acceleration * np.array([dt**2 / 2, dt])
         self._state.mean = step @ self._state.mean
         self._state.covariance = step @ self._state.covariance @ step.T + np.outer(disturbed, disturbed)
 
     def _assign(self, boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64, config: TrackingConfig) -> I32:
-        """(T,) box of each track, -1: none. Least squared distance on the ground, relative to the gate.
+        """Return the (T,) box of each track, -1 for none.
 
-        The gate is ``tracking.gate``, wider where the place is uncertain to more than a third of it (three
-        sigma). Sizes that differ cost as well. A track that never was whole is compared with what is seen. Of
-        a part of an object that was whole before, the centre may lie nearer to the sensor, and it may be
-        smaller, for nothing more.
+        The assignment minimises squared distances on the ground, relative to the gate. The gate is
+        ``tracking.gate``, or three sigma of the position if that is wider. Different sizes cost as well. A
+        track that never was whole is compared with the visible box. The visible part of an object that was
+        whole before may be smaller and its centre may lie nearer to the sensor, at no cost.
         """
         state = self._state
         column = np.full(len(state), -1, np.int32)
@@ -190,7 +195,7 @@ class Tracker:
             np.stack([_extent(seen.size), _extent(boxes.size)]),
             whole,
         )
-        # Most boxes have one track near, and it has no other: only the rest has to be assigned.
+        # Most tracks have one box near, and that box has no other track. Only the others need an assignment.
         nearest = cost.argmin(1)
         alone = (near_track == 1) & (near_box[nearest] == 1)
         column[alone] = nearest[alone]
@@ -201,10 +206,10 @@ class Tracker:
         return column
 
     def _as_known(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
-        """The measured boxes with what earlier frames saw: a track that knows all of it keeps its size.
+        """Complete the measured boxes with sizes from earlier frames. A whole track keeps its size.
 
-        Where only a part is measured of what was whole before, the box goes on away from the sensor. Where
-        the whole is measured for the first time, the track moves to its centre, which is no motion.
+        If only a part of a whole object is measured, its box is extended away from the sensor. If the whole
+        object is measured for the first time, the track moves to its centre. This is not motion.
         """
         state = self._state
         first = whole & ~state.whole[rows]
@@ -229,7 +234,7 @@ class Tracker:
         return Boxes3D(center, size, boxes.yaw)
 
     def _correct(self, rows: NDArray[Any], boxes: Boxes3D, config: TrackingConfig) -> F32:
-        """Update with the measured boxes; how far on the ground they are from where they were expected."""
+        """Update with the measured boxes. Return the (T,) distances on the ground from the predictions."""
         state = self._state
         covariance = state.covariance[rows]
         gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
@@ -248,6 +253,7 @@ class Tracker:
         return np.asarray(np.hypot(innovation[:, 0], innovation[:, 1]), np.float32)
 
     def _remember(self, stamp: int, config: TrackingConfig) -> None:
+        """Append the positions to the trails, and drop those older than ``config.trail``."""
         self._stamps.append(stamp)
         state = self._state
         here = state.mean[:, :1].astype(np.float32)
@@ -264,7 +270,7 @@ class Tracker:
         dt: float,
         config: TrackingConfig,
     ) -> I32:
-        """(T,) row of the object that names each track in this frame, -1: none."""
+        """Add the scores of this frame's objects. Return the (T,) object of each track, -1 for none."""
         state = self._state
         looked_at = np.append(in_view, False)[cluster]
         state.votes[looked_at] *= np.exp(-dt / config.class_memory)
@@ -293,6 +299,7 @@ class Tracker:
         innovation: F32,
         config: TrackingConfig,
     ) -> Tracks:
+        """Return the tracks of the current state."""
         state = self._state
         best = state.votes.argmax(1) if len(self._classes) else np.zeros(len(state), np.int64)
         yaw = np.arctan2(np.sin(state.yaw), np.cos(state.yaw))
@@ -317,7 +324,7 @@ class Tracker:
 
 
 def _extent(size: F32 | F64) -> F64:
-    """(N, 2) logarithms of the shorter and the longer side on the ground."""
+    """Return the (N, 2) logarithms of the shorter and the longer side on the ground."""
     return np.asarray(np.log(np.maximum(np.sort(size[:, :2]), 0.1)), np.float64)
 
 
@@ -325,9 +332,14 @@ def _extent(size: F32 | F64) -> F64:
 def _costs(
     place: F64, gate: F64, extent: F64, sight: F64, known: Bool, center: F32, measured: F64, whole: Bool
 ) -> tuple[F64, I32, I32]:
-    """(T, K) costs, inf beyond the squared gate, and how many of the others are near each track and box.
+    """Return the cost of each track and box, and the numbers of candidates.
 
-    ``center`` and ``measured`` are (2, K, ...): as seen, and as completed where that is known (``whole``).
+    ``center`` and ``measured`` are (2, K, ...): as seen, and as completed if the box is ``whole``.
+
+    Returns:
+        (T, K) costs, inf beyond the squared gate.
+        (T,) boxes near each track.
+        (K,) tracks near each box.
     """
     cost = np.full((len(place), len(whole)), np.inf)
     near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(whole), np.int32)
@@ -354,7 +366,7 @@ def _costs(
 
 
 def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
-    """How far rectangles are turned from the nearest of their four headings, and which that is."""
+    """Return how far rectangles are turned from the nearest of four headings, and which heading that is."""
     turn = measured - expected
     quarters = np.round(turn / (np.pi / 2)).astype(np.int64)
     return turn - quarters * (np.pi / 2), quarters
@@ -363,9 +375,12 @@ def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
 def _completed(
     seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64, gate: float
 ) -> tuple[Boxes3D, Bool]:
-    """The boxes of clusters, those of named objects instead where they are whole; and which these are.
+    """Replace boxes of clusters by whole boxes of objects where known.
 
-    What is smaller than the gate stays as measured: its centre is known well enough, and more steadily.
+    Boxes smaller than the gate stay as measured: their centres are accurate enough and steadier.
+
+    Returns:
+        The boxes, and which of them are whole.
     """
     whole = np.zeros(len(kept), np.bool_)
     if objects is None or objects.seen is None or not len(objects) or not len(kept):
@@ -382,5 +397,5 @@ def _completed(
 
 
 def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
-    """Upright boxes in another upright frame."""
+    """Move upright boxes into another upright frame."""
     return geometry.moved(boxes.chosen(rows), pose)

@@ -1,4 +1,4 @@
-"""Somebody else's functions as stages: what they return is checked, and the rest is derived from it."""
+"""User-defined stages: call them, check what they return, derive the other fields of the result."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ from bevviz.model.frame import F32, I32, Bool, Boxes3D
 from bevviz.model.results import Clusters, Detections, DetectionState, Ground, Objects
 from bevviz.stages.clustering import describe
 
-CELL = 1.0  # metres: edge of a cell of the ground's level, where only its points are known
-REACH = 200.0  # metres around the origin in which that level is kept
+CELL = 1.0  # metres: edge of a cell of the ground level, which is derived from ground points
+REACH = 200.0  # metres around the origin within which that level is stored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Foreign:
-    """A function of somebody else's, with its parameters."""
+    """A user's function with its parameters."""
 
     plugin: Plugin
     call: Callable[..., Any]
 
     def __call__(self, array: NDArray[Any]) -> Any:
-        """What it makes of a copy of the array: nobody may change that of a frame."""
+        """Call the function with a copy of the array, so that it cannot change the frame."""
         return self.call(array.copy())
 
     @property
     def name(self) -> str:
+        """The name of the function in the configuration."""
         return self.plugin.name
 
 
 def foreign(config: Config, section: str) -> Foreign | None:
-    """The function that a stage's section names; None: it names none of somebody else's.
+    """Return the user's function that a stage's section names; None if the section names a built-in method.
 
     Raises:
-        UserError: it cannot be had, or, being a class, cannot be made.
+        UserError: the function cannot be imported, or its class cannot be instantiated.
     """
     plugin = plugin_of(config, section)
     if plugin is None:
@@ -55,7 +56,7 @@ def foreign(config: Config, section: str) -> Foreign | None:
         return Foreign(plugin, lambda array: plugin.target(array, *params))
     try:
         made = plugin.target(*params)
-    except Exception as error:  # whatever a user's class may do
+    except Exception as error:  # A user's class may raise anything.
         raise UserError(
             f"{section}: {plugin.name} cannot be made: {type(error).__name__}: {error}"
         ) from error
@@ -68,20 +69,20 @@ def foreign(config: Config, section: str) -> Foreign | None:
 
 
 def ground_of(points: F32, returned: Any, name: str) -> Ground:
-    """Ground of ``(N, 3) -> (N,) bool``; the heights above it are derived.
+    """Make Ground from the returned (N,) bool mask. The heights above the ground are derived.
 
     Raises:
-        StageError: it returned something else.
+        StageError: the function returned something else.
     """
     mask = _array(name, returned, "a mask", (len(points),), "b")
     return Ground(mask.astype(np.bool_), heights(points, mask))
 
 
 def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str) -> Clusters:
-    """Clusters of ``(P, 3) -> (P,) int labels``, -1 noise; counts, boxes and size verdicts are derived.
+    """Make Clusters from the returned (P,) int labels, -1 for noise. Counts, boxes and sizes are derived.
 
     Raises:
-        StageError: it returned something else.
+        StageError: the function returned something else.
     """
     labels = _array(name, returned, "labels", (len(points),), "iu").astype(np.int64)
     if len(labels) and labels.min() < -1:
@@ -90,10 +91,12 @@ def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str)
 
 
 def detections_of(threshold: float, returned: Any, name: str) -> Detections:
-    """Detections of ``(H, W, 3) BGR -> xyxy (D, 4), score (D,), names``, best first.
+    """Make Detections from the returned ``xyxy (D, 4), score (D,), names``, best score first.
+
+    The function was called with a (H, W, 3) BGR image.
 
     Raises:
-        StageError: it returned something else.
+        StageError: the function returned something else.
     """
     xyxy, score, names = _several(name, returned, "xyxy, score and class names")
     xyxy = _array(name, xyxy, "boxes xyxy", (-1, 4), "fiu").astype(np.float32)
@@ -112,13 +115,13 @@ def detections_of(threshold: float, returned: Any, name: str) -> Detections:
 
 
 def objects_of(returned: Any, name: str, obstacles: F32 | None, clusters: Clusters | None) -> Objects:
-    """Objects of ``(N, 4) x y z intensity -> boxes (K, 7), score (K,), names``.
+    """Make Objects from the returned ``boxes (K, 7), score (K,), names``.
 
-    A box is x, y, z of its centre, length, width, height and yaw, in metres and radians. The cluster of
-    each object is derived.
+    The function was called with an (N, 4) array of x, y, z, intensity. A box is x, y, z of its centre,
+    length, width, height and yaw, in metres and radians. The cluster of each object is derived.
 
     Raises:
-        StageError: it returned something else.
+        StageError: the function returned something else.
     """
     rows, score, names = _several(name, returned, "boxes, score and class names")
     rows = _array(name, rows, "boxes", (-1, 7), "fiu").astype(np.float32)
@@ -129,7 +132,7 @@ def objects_of(returned: Any, name: str, obstacles: F32 | None, clusters: Cluste
 
 
 def with_intensity(points: F32, intensity: NDArray[Any] | None) -> F32:
-    """(N, 4) x, y, z and intensity, 0 where the sensor tells none."""
+    """Return (N, 4) x, y, z and intensity, 0 for a sensor without intensity."""
     cloud = np.zeros((len(points), 4), np.float32)
     cloud[:, :3] = points
     if intensity is not None:
@@ -140,11 +143,14 @@ def with_intensity(points: F32, intensity: NDArray[Any] | None) -> F32:
 def placed(
     boxes: Boxes3D, names: Sequence[str], score: F32, obstacles: F32 | None, clusters: Clusters | None
 ) -> Objects:
-    """Boxes that no detection named, each with the kept cluster that has most points in it, -1: none."""
+    """Make objects from boxes without detections. An object's cluster has the most points in its box.
+
+    Only kept clusters count. An object without such a cluster gets -1.
+    """
     own = np.full(len(boxes), -1, np.int32)
     if obstacles is not None and clusters is not None:
         kept = np.append(clusters.kept, False)
-        candidates = np.flatnonzero(kept[clusters.labels])  # noise, -1, is the last
+        candidates = np.flatnonzero(kept[clusters.labels])  # noise has label -1, the last element
         points, labels = obstacles[candidates], clusters.labels[candidates]
         for k, rows in geometry.inside_each(points, boxes):
             if len(rows):
@@ -154,10 +160,10 @@ def placed(
 
 
 def heights(points: F32, ground: Bool) -> F32:
-    """(N,) metres above the ground around each point, where only the ground's points are known.
+    """Return (N,) metres above the ground near each point, derived from the ground points.
 
-    The level of a square metre is the mean of the ground's points in it; where there are none, that of the
-    nearest square metre with some. NaN: there is no ground at all.
+    The ground level of a square metre is the mean of its ground points. Without ground points it is that of
+    the nearest square metre with some. All heights are NaN if there is no ground.
     """
     if not ground.any():
         return np.full(len(points), np.nan, np.float32)
@@ -171,20 +177,20 @@ def heights(points: F32, ground: Bool) -> F32:
     _, nearest = cv2.distanceTransformWithLabels(
         empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    # Labels count the known cells from 1, in whatever order: look them up at these cells themselves.
+    # OpenCV numbers the known cells from 1 in an unspecified order. Look the numbers up at the cells.
     level = np.zeros(len(known) + 1)
     level[nearest.ravel()[known]] = total[known] / count[known]
     return np.asarray(points[:, 2] - level[nearest.ravel()[cell]], np.float32)
 
 
-# --- what was returned -------------------------------------------------------------------------
+# --- checks of returned values -----------------------------------------------------------------
 
 
 def _array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str) -> NDArray[Any]:
-    """The value as an array of that shape (-1: any length) and kind of dtype, finite."""
+    """Return the value as a finite array of that shape (-1: any length) and kind of dtype."""
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError, RuntimeError) as error:  # a tensor on another device, a ragged list
+    except (TypeError, ValueError, RuntimeError) as error:  # e.g. a tensor on another device or a ragged list
         raise StageError(f"{name} returned no array for {what}: {error}") from None
     if array.size == 0 and shape[0] in (-1, 0):
         return np.zeros((0, *shape[1:]), array.dtype if array.dtype.kind in kinds else kinds[0])
@@ -202,6 +208,7 @@ def _array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str)
 
 
 def _several(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
+    """Unpack a tuple or list of three values."""
     if not isinstance(value, tuple | list) or len(value) != 3:
         count = f"{len(value)} values" if isinstance(value, tuple | list) else f"a {type(value).__name__}"
         raise StageError(f"{name} returned {count}, not {what}")
@@ -209,6 +216,7 @@ def _several(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
 
 
 def _scored(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[str]]:
+    """Check scores and names of boxes."""
     scores = _array(name, score, "scores", (count,), "fiu").astype(np.float32)
     try:
         listed = [str(text) for text in names]
@@ -220,7 +228,7 @@ def _scored(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[st
 
 
 def _numbered(labels: NDArray[np.int64]) -> I32:
-    """The same clusters, numbered in the order of each one's first point."""
+    """Renumber the clusters in the order of their first points."""
     found, first, number = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(found), np.int32)
     rank[np.argsort(np.where(found < 0, -1, first), kind="stable")] = np.arange(len(found))

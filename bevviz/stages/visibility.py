@@ -1,4 +1,4 @@
-"""What of boxes can be seen: what is in a camera's image, and what nothing nearer hides."""
+"""Visibility of boxes: their extent in a camera's image, and their occlusion by nearer points."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from bevviz.model.frame import F32, F64, Boxes3D, Camera
 from bevviz.support.kernel import kernel
 
 STEP = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
-NEARER = np.float32(0.7)  # metres that a return must be nearer than the box to hide it
+NEARER = np.float32(0.7)  # metres: a return hides a box if it is at least this much nearer
 BELOW, ABOVE = np.float32(np.radians(-40)), np.float32(np.radians(20))
-NEAR_PLANE = 0.1  # metres before the camera, from which on a box is drawn in its image
+NEAR_PLANE = 0.1  # metres before the camera; only the part of a box beyond it is drawn
 
 _EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
@@ -21,11 +21,13 @@ _EDGES = np.array(
 
 
 def image_boxes(boxes: Boxes3D, camera: Camera) -> F32:
-    """(K, 4) box around what of each 3D box is before the camera, cut at the image's edge; NaN: nothing.
+    """Return (K, 4) image boxes around the part of each 3D box before the camera, clipped to the image.
+
+    A row is NaN if no part of the box is in the image.
 
     Args:
         boxes: in the frame of the points.
-        camera: without a place nothing is in its image.
+        camera: without intrinsics and pose every row is NaN.
     """
     around = np.full((len(boxes), 4), np.nan, np.float32)
     if camera.intrinsics is None or (uv := image_points(boxes, camera)) is None:
@@ -41,10 +43,10 @@ def image_boxes(boxes: Boxes3D, camera: Camera) -> F32:
 
 
 def image_points(boxes: Boxes3D, camera: Camera) -> F32 | None:
-    """(K, 20, 2) pixels of each box's 8 corners, and of where its 12 edges meet the near plane.
+    """Return (K, 20, 2) pixels of each box: its 8 corners, and where its 12 edges meet the near plane.
 
-    NaN: not before the camera, or the edge does not meet it. None: there are no boxes, or the camera's place
-    is not known.
+    A pixel is NaN if the corner is not before the camera or the edge does not meet the plane. The result is
+    None if there are no boxes or the camera has no intrinsics or no pose.
     """
     if camera.intrinsics is None or camera.camera_from_points is None or not len(boxes):
         return None
@@ -61,7 +63,7 @@ def image_points(boxes: Boxes3D, camera: Camera) -> F32 | None:
 
 
 def in_view(boxes: Boxes3D, camera: Camera) -> F64:
-    """(K,) share of each box that is inside the image; 0 where the camera's place is not known."""
+    """Return the (K,) share of each box inside the image; 0 if the camera's pose is not known."""
     if camera.intrinsics is None or camera.camera_from_points is None or len(boxes) == 0:
         return np.zeros(len(boxes))
     steps = np.linspace(-0.45, 0.45, 5, dtype=np.float32)
@@ -83,15 +85,16 @@ def in_view(boxes: Boxes3D, camera: Camera) -> F64:
 
 
 def range_image(points: F32) -> F32:
-    """(rows, columns) metres to the nearest return in each direction, inf where there is none.
+    """Return (rows, columns) metres to the nearest return in each direction, inf without a return.
 
     Args:
-        points: (N, 3) from the sensor, z up. Rows go up from 40 degrees below, columns around from behind.
+        points: (N, 3) from the sensor, z up. Rows go up from 40 degrees below the horizon. Columns go around,
+            starting behind the sensor.
     """
     x, y, z = np.ascontiguousarray(points.T)
     flat = np.sqrt(x * x + y * y)
     away = np.sqrt(flat * flat + z * z)
-    # Not in the loop: NumPy has arctan2 of many numbers at once, four times as fast.
+    # This is outside the loop, because NumPy's vectorised arctan2 is four times as fast.
     elevation, azimuth = np.arctan2(z, flat), np.arctan2(y, x)
     shape = round(float((ABOVE - BELOW) / STEP)), round(2 * np.pi / float(STEP))
     image = np.full(shape, np.inf, np.float32)
@@ -100,14 +103,14 @@ def range_image(points: F32) -> F32:
 
 
 def visible(image: F32, boxes: Boxes3D) -> F32:
-    """(K,) share of the directions to each box in which nothing stands that is nearer than all of the box.
+    """Return the (K,) unoccluded share of each box: directions without a return nearer than the whole box.
 
-    A cell of the image is a direction to the box if its middle is: one that the box's lower edge only touches
-    has the ground before it.
+    A cell of the image is a direction to the box if its centre is inside the box's angles. A cell that only
+    touches the lower edge of the box shows the ground before it.
 
     Args:
-        image: of ``range_image``.
-        boxes: in the frame of its points. One that holds the sensor is seen whole.
+        image: from ``range_image``.
+        boxes: in the frame of the points of ``range_image``. A box that contains the sensor is fully visible.
     """
     if len(boxes) == 0:
         return np.zeros(0, np.float32)
@@ -131,6 +134,7 @@ def visible(image: F32, boxes: Boxes3D) -> F32:
 
 @kernel
 def _keep_nearest(image: F32, elevation: F32, azimuth: F32, away: F32) -> None:
+    """Write the nearest distance of each cell."""
     rows, columns = image.shape
     for i in range(len(away)):
         row = int(np.floor((elevation[i] - BELOW) / STEP))
@@ -142,6 +146,7 @@ def _keep_nearest(image: F32, elevation: F32, azimuth: F32, away: F32) -> None:
 
 @kernel
 def _open(image: F32, azimuth: F32, elevation: F32, near: F32) -> F32:
+    """Return the (K,) share of cells between the angles without a return nearer than ``near`` - NEARER."""
     rows, columns = image.shape
     found = np.ones(len(near), np.float32)
     for k in range(len(near)):
@@ -161,7 +166,10 @@ def _open(image: F32, azimuth: F32, elevation: F32, near: F32) -> F32:
 
 @kernel
 def _cells(low: float, high: float) -> tuple[int, int]:
-    """First cell and end of those whose middle is between; where none is, the one that holds its middle."""
+    """Return the first and the end of the cells whose centre is between ``low`` and ``high``.
+
+    If there is none, return the cell that holds the middle of the interval.
+    """
     first, end = int(np.ceil(low - 0.5)), int(np.floor(high - 0.5)) + 1
     if end <= first:
         first = int(np.floor((low + high) / 2))

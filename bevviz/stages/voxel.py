@@ -1,4 +1,4 @@
-"""Voxel grid."""
+"""Voxel grid downsampling."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ S = TypeVar("S", bound=np.generic)
 def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
     """Keep one point for each occupied voxel.
 
-    The grid begins half a voxel below the cloud's lowest corner, as in Open3D's ``voxel_down_sample``,
-    whose points ``average`` reproduces.
+    The grid begins half a voxel below the lowest corner of the cloud, as in Open3D's ``voxel_down_sample``.
+    ``average`` gives the same points as that function.
 
     Args:
         points: (N, 3) float32 finite points.
-        config: ``size`` in metres, 0 keeps every point; ``average`` takes the mean of a voxel's points,
-            else its first point stands for it.
+        config: ``size`` is in metres; 0 keeps every point. With ``average`` the mean of its points stands for
+            a voxel, otherwise its first point.
 
     Returns:
         Voxels in the order in which the cloud first enters them.
@@ -39,7 +39,7 @@ def voxel_grid(points: F32, config: VoxelConfig) -> Voxels:
 
 @kernel
 def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
-    """One point for each unequal key, and which of them stands for each point."""
+    """Return one point for each distinct key, and for each input point the row of its voxel."""
     number, first = group(keys)
     kept = np.empty((len(first), 3), np.float32)
     for k in range(len(first)):
@@ -59,7 +59,7 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
 
 @kernel
 def of_points(values: NDArray[S], inverse: I32) -> NDArray[S]:
-    """(N,) for each point what is values of its voxel."""
+    """Return the (N,) values of the points, each copied from the voxel of the point."""
     found = np.empty(len(inverse), values.dtype)
     for i in range(len(inverse)):
         found[i] = values[inverse[i]]

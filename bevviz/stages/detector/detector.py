@@ -1,4 +1,4 @@
-"""A detector: image in, boxes out, with what the thresholds made of every candidate."""
+"""Run an ONNX detector on an image and apply the thresholds to its candidates."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from bevviz.stages.detector.suppression import nms
 
 DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
 MIN_SIDE, MAX_SIDE = 8, 4096  # pixels of the input: one cell of a grid, and the widest cameras of vehicles
-MAX_CANDIDATES = 30_000  # that enter the NMS, best first, as Ultralytics bounds what a nonsense model costs
+MAX_CANDIDATES = 30_000  # best candidates that enter the NMS; Ultralytics has the same limit
 
-# From the fastest down. DirectML and others that are not named here are used when asked for.
+# Supported types of the image input.
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 @dataclass(frozen=True, slots=True)
 class Inference:
-    """What a network said of an image, before any threshold."""
+    """Output of a network for one image, before any threshold."""
 
     outputs: tuple[Any, ...]
     where: Placement
@@ -43,23 +43,23 @@ class Inference:
 class Detector:
     """An ONNX detector: BGR image in, 2D boxes in that image's pixels out.
 
-    What the model wants (input size, type, colour order, letterbox) and how its output is to be read
-    (``layout``) comes from the model itself: its inputs, its metadata, and what one run on an image that
-    shows nothing returns.
+    The model itself tells which input it needs (size, type, colour order, letterbox) and how to read its
+    output (``layout``). The sources are its inputs, its metadata, and its output for an image without
+    objects.
 
     Args:
         config: model file, thresholds, provider and threads.
 
     Attributes:
-        names: class names by class id, empty where nobody tells them.
-        layout: how the output is read.
+        names: class names by class id, empty if unknown.
+        layout: layout of the output.
         provider: onnxruntime execution provider in use, such as ``CPU``.
-        input_size: height, width of the network's input; the largest one where the model leaves it open.
+        input_size: height, width of the network's input; the largest size if the model leaves it open.
         description: all of this in one line.
 
     Raises:
-        UserError: no such file, no ONNX file, no detector that is known, wrong class names, or no such
-            provider.
+        UserError: the file is missing or no ONNX file, the detector is unknown, class names are wrong, or the
+            provider is missing.
     """
 
     def __init__(self, config: DetectorConfig) -> None:
@@ -73,7 +73,7 @@ class Detector:
         self._input, self._rank = image.name, len(image.shape)
         self._check_inputs(image, others)
         self._dtype = TYPES[image.type]
-        self._sized = others[0].name if others else None  # an input for the size of the image
+        self._sized = others[0].name if others else None  # name of an input for the size of the image
 
         height, width = image.shape[-2:]
         self._is_open = not isinstance(height, int), not isinstance(width, int)
@@ -110,21 +110,21 @@ class Detector:
         """Detect in an (H, W, 3) uint8 BGR image.
 
         Returns:
-            Candidates with a score of ``detector.explain_threshold`` or more, best first: every one that
-            is KEPT, and the best of the others up to ``detector.max_candidates`` in all. Those
-            BELOW_THRESHOLD are exactly what a lower ``detector.conf_threshold`` would keep: a weak
+            Candidates with a score of ``detector.explain_threshold`` or more, best first: all KEPT
+            candidates, and the best of the others up to ``detector.max_candidates`` in total. The candidates
+            BELOW_THRESHOLD are exactly those that a lower ``detector.conf_threshold`` would keep. A weak
             candidate that overlaps a stronger one of its class is SUPPRESSED.
 
         Raises:
-            UserError: the model answers with what it should not, such as scores above 1.
+            UserError: the model returns impossible numbers, such as scores above 1.
         """
         return self.interpret(self.infer(bgr)) if bgr.size else Detections.empty()
 
     def restated(self, config: DetectorConfig) -> Detector:
-        """The same network with other thresholds or classes; it is not loaded again.
+        """Return a detector with other thresholds or classes that shares this network.
 
         Raises:
-            UserError: wrong class names.
+            UserError: class names are wrong.
         """
         other = copy(self)
         other._config = config
@@ -132,21 +132,21 @@ class Detector:
         return other
 
     def prepare(self, bgr: U8) -> tuple[Any, Placement]:
-        """The network's input for an image that is not empty, and where the image lies in it."""
+        """Return the network's input for a non-empty image, and the placement of the image in it."""
         feed, size = self.layout.feed, (bgr.shape[0], bgr.shape[1])
         where = feed.place(size, self.input_size, self._is_open, self._stride)
         return feed.blob(bgr, where, self._dtype), where
 
     def infer(self, bgr: U8) -> Inference:
-        """Run the network alone, on an image that is not empty."""
+        """Run only the network, on a non-empty image."""
         blob, where = self.prepare(bgr)
         return Inference(tuple(self._run(self._head.wanted, blob).values()), where)
 
     def interpret(self, found: Inference) -> Detections:
-        """What the thresholds make of the network's output; ``__call__`` says what.
+        """Apply the thresholds to the network's output. The result is that of ``__call__``.
 
         Raises:
-            UserError: as ``__call__``.
+            UserError: as in ``__call__``.
         """
         config, where = self._config, found.where
         with reading(self._where):
@@ -166,7 +166,8 @@ class Detector:
             suppressor, overlap = np.full(len(order), -1, np.int32), np.zeros(len(order), np.float32)
         else:
             suppressor, overlap = nms(xyxy, class_id, config.iou_threshold, offset)
-        # Clipped after the NMS, as in the families' own post-processing: what lies outside suppresses, too.
+        # Boxes are clipped after the NMS, as the families' own code does: boxes outside the image suppress,
+        # too.
         xyxy = where.to_image(xyxy)
         np.clip(xyxy, 0, np.array(where.image_size[::-1] * 2, np.float32), out=xyxy)
         seen = (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
@@ -184,7 +185,7 @@ class Detector:
                 weights = self._head.coefficients(found.outputs, weighed)
                 masks = make_masks(weights, found.outputs[-1][0], inner[row[kept]], kept, len(row), where)
         return Detections(
-            xyxy=xyxy[row] - np.float32(0.5),  # networks count from the corner of the first pixel
+            xyxy=xyxy[row] - np.float32(0.5),  # networks count pixels from the corner of the first pixel
             score=score[row],
             class_id=class_id[row],
             names=tuple(self._name(c) for c in class_id[row].tolist()),
@@ -195,6 +196,7 @@ class Detector:
         )
 
     def _check_inputs(self, image: Any, others: list[Any]) -> None:
+        """Raise a UserError if the inputs are not those of a detector."""
         shape = image.shape
         found = listed((i.name, i.shape) for i in (image, *others))
         batch = shape[0] if self._rank == 4 and isinstance(shape[0], int) else 1
@@ -211,6 +213,7 @@ class Detector:
             raise UserError(f"{self._where}: its input is {image.type}; supported: {', '.join(TYPES)}")
 
     def _check_size(self) -> None:
+        """Raise a UserError if the input is too small or too large."""
         height, width = self.input_size
         if any(not MIN_SIDE <= side <= MAX_SIDE for side in self.input_size):
             raise UserError(
@@ -219,15 +222,16 @@ class Detector:
             )
 
     def _run(self, outputs: list[str] | None, blob: Any) -> dict[str, Any]:
+        """Run the network on one blob and return the outputs by name."""
         given = {self._input: blob if self._rank == 4 else blob[0]}
         if self._sized is not None:
-            given[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of the input
+            given[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of it
         return self._session.run(given, outputs)
 
     def _probe(self) -> dict[str, Any]:
-        """What the network returns for grey patches: it can tell its layout, and shows nothing.
+        """Run the network on grey patches without objects. The output helps to find the layout.
 
-        This also pays the first run's allocations before the first real image.
+        This also makes the allocations of the first run before the first real image.
         """
         height, width = self.input_size
         patch = np.random.default_rng(0).uniform(0.3, 0.6, (1, 3, -(-height // 32), -(-width // 32)))
@@ -237,6 +241,7 @@ class Detector:
         return self._run(None, blob)
 
     def _wanted_classes(self) -> I32 | None:
+        """Return the ids of the configured classes, None for all classes."""
         for name in self._config.classes:
             if name not in self.names:
                 near = difflib.get_close_matches(name, self.names, 1)
@@ -247,20 +252,25 @@ class Detector:
         return np.array([self.names.index(name) for name in self._config.classes], np.int32)
 
     def _name(self, class_id: int) -> str:
+        """Return the name of a class, or its number as a name."""
         return self.names[class_id] if 0 <= class_id < len(self.names) else f"class_{class_id}"
 
 
 def _best(row: Any, state: Any, limit: int) -> Any:
-    """Every row that is KEPT, and the best of the others up to that many in all; rows have the best first."""
+    """Return the rows that are KEPT and the best of the others, at most ``limit`` in total.
+
+    ``row`` is sorted, best score first. All KEPT rows are returned even if they are more than ``limit``.
+    """
     kept = state[row] == DetectionState.KEPT
     room = max(limit - np.count_nonzero(kept), 0)
     others = np.flatnonzero(~kept)
-    # Survivors of NMS first: a duplicate is the least worth a word, and never outlives its suppressor.
+    # Survivors of the NMS come first: a duplicate explains least, and never outlives its suppressor.
     others = others[np.argsort(state[row[others]], kind="stable")]
     return np.delete(row, others[room:])
 
 
 def _open(path: Path, config: DetectorConfig) -> NetworkSession:
+    """Open the session of a detector file."""
     if not path.is_file():
         raise UserError(f"detector.model {path}: no such file")
     if path.suffix == ".pt":
@@ -269,6 +279,6 @@ def _open(path: Path, config: DetectorConfig) -> NetworkSession:
         )
     options = ort.SessionOptions()
     options.intra_op_num_threads = config.threads
-    # Threads that spin between runs cost as much processor time as the network, and the LiDAR stages need it.
+    # Spinning threads would use as much processor time as the network, and the LiDAR stages need that time.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     return open_session(path, config.provider, options)

@@ -1,4 +1,4 @@
-"""How an image becomes the input of a network, and how boxes come back."""
+"""Convert images to inputs of networks, and boxes back to images."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from bevviz.model.frame import F32, U8
 
-GREY = 114  # of the letterbox's border, the same in all these families
+GREY = 114  # grey of the letterbox's border, the same in all these families
 
 
 class Fit(Enum):
-    """How an image is laid into an input of another shape."""
+    """How an image is fitted into an input of another shape."""
 
     CENTRE = "letterbox, the image in its middle"
     CORNER = "letterbox, the image at the top left"
@@ -24,53 +24,53 @@ class Fit(Enum):
 
 
 class Resampling(Enum):
-    """What the family was trained and tested with."""
+    """How pixels are interpolated, as the family was trained and tested."""
 
     FOUR = "of the four nearest pixels, rounded to bytes"  # OpenCV
-    ALL = "of all pixels that a new one covers, rounded to bytes"  # Pillow, and torchvision of its images
-    UNROUNDED = "of the four nearest pixels, not rounded"  # torchvision of tensors
+    ALL = "of all pixels that a new one covers, rounded to bytes"  # Pillow, and torchvision for Pillow images
+    UNROUNDED = "of the four nearest pixels, not rounded"  # torchvision for tensors
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where an image lies in a network's input."""
+    """Position of an image in a network's input."""
 
     input_size: tuple[int, int]  # height, width
-    inner: tuple[int, int]  # height, width of the image in there ...
-    corner: tuple[int, int]  # ... and the row and column of its first pixel
-    image_size: tuple[int, int]  # height, width of the image itself
+    inner: tuple[int, int]  # height, width of the image in the input
+    corner: tuple[int, int]  # row and column of its first pixel in the input
+    image_size: tuple[int, int]  # height, width of the original image
 
     def to_image(self, xyxy: F32) -> F32:
-        """Boxes of the input in pixels of the image, counted from the corner of its first one."""
+        """Convert boxes from the input to the image, in pixels from the corner of its first pixel."""
         scale = np.array([inner / image for inner, image in zip(self.inner, self.image_size, strict=True)])
         moved: F32 = xyxy - np.array(self.corner[::-1] * 2, np.float32)
-        with np.errstate(over="ignore"):  # what lies beyond all measure is clipped to the image
+        with np.errstate(over="ignore"):  # an overflow is clipped to the image later
             moved /= np.tile(scale[::-1], 2).astype(np.float32)
         return moved
 
 
 @dataclass(frozen=True, slots=True)
 class Feed:
-    """The input that a family of networks was trained with, in float32."""
+    """Input that a family of networks was trained with, in float32."""
 
     fit: Fit
     rgb: bool = True
-    divisor: float = 255.0  # 1: values of 0..255
+    divisor: float = 255.0  # 1 keeps values of 0..255
     resampling: Resampling = Resampling.FOUR
     margin: int = 0  # pixels that the letterbox keeps free in height and width
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)  # taken off each channel after the division ...
-    std: tuple[float, float, float] = (1.0, 1.0, 1.0)  # ... and then divided by
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from each channel after the division
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)  # divides each channel after that
 
     def place(
         self, image_size: tuple[int, int], size: tuple[int, int], is_open: tuple[bool, bool], stride: int
     ) -> Placement:
-        """Where an image goes.
+        """Place an image in the input.
 
         Args:
             image_size: height, width.
-            size: of the network's input, height and width, the largest where an axis is open.
-            is_open: which of the two may be smaller ...
-            stride: ... by multiples of this.
+            size: height and width of the network's input, the largest size for an open axis.
+            is_open: for height and width, whether the axis may be smaller.
+            stride: pixels; an open axis is a multiple of this.
         """
         if self.fit is Fit.STRETCH:
             return Placement(size, size, (0, 0), image_size)
@@ -78,7 +78,7 @@ class Feed:
             return Placement(image_size, image_size, (0, 0), image_size)
         given, whole = np.array(image_size), np.array(size)
         exact = given * float(np.min((whole - self.margin) / given))
-        # Megvii cuts the resized image's fraction of a pixel off, the others round it.
+        # Megvii truncates the size of the resized image, the other families round it.
         inner = np.maximum(exact.astype(int) if self.fit is Fit.CORNER else np.rint(exact).astype(int), 1)
         outer = np.where(is_open, -(-inner // stride) * stride, whole)
         corner = 0 * outer if self.fit is Fit.CORNER else (outer - inner) // 2
@@ -86,14 +86,14 @@ class Feed:
         return Placement((h, w), (height, width), (top, left), image_size)
 
     def blob(self, bgr: U8, where: Placement, dtype: type) -> Any:
-        """The (1, 3, height, width) input."""
+        """Return the (1, 3, height, width) input."""
         (height, width), (top, left) = where.inner, where.corner
         inner: Any = bgr
         if self.resampling is Resampling.UNROUNDED:
             inner = bgr.astype(np.float32) / np.float32(self.divisor)
         if bgr.shape[:2] != where.inner:
             if self.resampling is Resampling.ALL:
-                from PIL import Image  # not every model needs it
+                from PIL import Image  # imported here because few models need it
 
                 small = Image.fromarray(bgr).resize((width, height), Image.Resampling.BILINEAR)
                 inner = np.asarray(small)
@@ -105,7 +105,7 @@ class Feed:
             canvas[top : top + height, left : left + width] = inner
         blob = cv2.dnn.blobFromImage(canvas, swapRB=self.rgb)
         if canvas.dtype == np.uint8 and self.divisor != 1:
-            blob /= np.float32(self.divisor)  # a product with the reciprocal has other last digits
+            blob /= np.float32(self.divisor)  # multiplying with the reciprocal would change the last digits
         if any(self.mean):
             blob -= np.array(self.mean, np.float32)[:, None, None]
             blob /= np.array(self.std, np.float32)[:, None, None]

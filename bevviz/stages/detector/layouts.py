@@ -1,8 +1,8 @@
-"""A table of the layouts that outputs of models have, and what tells one from the other.
+"""Table of the output layouts of detection models, and the rules that distinguish them.
 
-A file says little of this itself. What its exporter wrote into the metadata counts first, then names and
-shapes of its outputs, then their values for an image that shows nothing. What these do not settle is refused:
-boxes read from the wrong columns look like a bad detector.
+A model file says little about its layout. The exporter's metadata count first, then names and shapes of the
+outputs, then their values for an image without objects. An ambiguous model is refused, because boxes read
+from the wrong columns look like a bad detector.
 """
 
 from __future__ import annotations
@@ -20,54 +20,56 @@ from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, def
 from bevviz.stages.detector.outputs import Boxes, Candidates, Listed, Scored
 from bevviz.stages.detector.session import clip, listed
 
-CLASS_OFFSET = 7680.0  # pixels by which Ultralytics moves the boxes of each class in its NMS
+CLASS_OFFSET = 7680.0  # pixels by which Ultralytics shifts the boxes of each class in its NMS
 
 
 class Found(NamedTuple):
-    """The outputs that a layout is to be read from."""
+    """Outputs to read with a layout."""
 
     outputs: tuple[str, ...]
-    classes: int | None = None  # None: the outputs do not tell how many
+    classes: int | None = None  # None: the outputs do not show how many
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What can be known of a model without its documentation."""
+    """Facts that a model file shows without documentation."""
 
     metadata: Mapping[str, str]
     inputs: tuple[str, ...]  # names
-    dtype: type  # of the image's input ...
-    rank: int  # ... its number of axes ...
-    size: tuple[int, int]  # ... and its height and width
-    names: tuple[str, ...] | None  # of the classes
-    outputs: Mapping[str, Any]  # name -> array, for an image that shows nothing
+    dtype: type  # dtype of the image input
+    rank: int  # number of axes of the image input
+    size: tuple[int, int]  # height and width of the image input
+    names: tuple[str, ...] | None  # class names
+    outputs: Mapping[str, Any]  # name -> array, for an image without objects
 
     @property
     def ultralytics(self) -> bool:
+        """Whether Ultralytics exported the model."""
         return self.metadata.get("author") == "Ultralytics"
 
     @property
     def task(self) -> str:
+        """The task in the metadata, empty if missing."""
         return self.metadata.get("task", "")
 
     @property
     def tables(self) -> dict[str, Any]:
-        """name -> (rows, columns) of the outputs that have these for one image."""
+        """Outputs that are one table, by name, as (rows, columns) arrays."""
         return {name: o[0] for name, o in self.outputs.items() if o.ndim == 3 and len(o) == 1}
 
     @property
     def masks(self) -> int:
-        """Columns that weigh prototypes of masks, which are an output of their own of a quarter's size."""
+        """Number of columns that weight mask prototypes, an output of a quarter of the input size."""
         quarter = tuple(n // 4 for n in self.size)
         return next((o.shape[1] for o in self.outputs.values() if o.ndim == 4 and o.shape[2:] == quarter), 0)
 
     def named(self, *names: str) -> tuple[str, ...] | None:
-        """The outputs that are called so, or end so after the name of a graph."""
+        """Return the outputs with these names, also after a graph's name. Return None if one is missing."""
         found = [[o for o in self.outputs if o == name or o.endswith(f"_{name}")] for name in names]
         return tuple(o[0] for o in found) if all(len(o) == 1 for o in found) else None
 
     def classes(self, columns: int) -> int | str:
-        """How many of the columns that follow the boxes are classes, or why that does not fit."""
+        """Return how many of the columns after the boxes are classes, or why that is impossible."""
         if self.names is None:
             return columns - self.masks if columns > self.masks else "it has no scores of classes"
         more = columns - len(self.names)
@@ -82,16 +84,16 @@ Finder = Callable[[Facts], Found | str | None]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How one family of networks states what it found, and the image that it wants."""
+    """Output format of one family of networks, and the input that it needs."""
 
     name: str
     find: Finder
     split: Callable[..., Scored | Listed]
     boxes: Boxes
     feed: Feed
-    class_offset: float | None = None  # in the NMS; None: the network itself leaves one box an object
-    batch: bool = True  # the outputs' first axis is that of the images
-    background: bool = False  # class 0 is none
+    class_offset: float | None = None  # pixels, for the NMS; None: the network does its own NMS
+    batch: bool = True  # the first axis of the outputs is the batch
+    background: bool = False  # class 0 is the background
 
     def __str__(self) -> str:
         return self.name
@@ -99,33 +101,34 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """How one model is to be read."""
+    """Reader of one model's outputs."""
 
     layout: Layout
     outputs: tuple[str, ...]
     classes: int | None
-    names: tuple[str, ...]  # of the classes, empty where nobody tells
-    prototypes: str = ""  # output that masks are made of; empty: there are none
+    names: tuple[str, ...]  # class names, empty if unknown
+    prototypes: str = ""  # output with mask prototypes; empty: none
 
     @property
     def wanted(self) -> list[str]:
-        """Every output that is read."""
+        """Names of all outputs to read."""
         return [*self.outputs, *filter(None, [self.prototypes])]
 
     def split(self, outputs: Sequence[Any]) -> Scored | Listed:
+        """Split the outputs into boxes, scores and classes."""
         batch = self.layout.batch
         return self.layout.split(self.classes, *(output[0] if batch else output for output in outputs))
 
     def candidates(self, outputs: Sequence[Any], size: tuple[int, int], least: float) -> Candidates:
-        """What a run found with a score of ``least`` or more.
+        """Return the detections of a run with a score of ``least`` or more.
 
         Args:
-            outputs: those that are wanted, of one image.
+            outputs: the wanted outputs for one image.
             size: height and width of the input.
-            least: score.
+            least: lowest score.
 
         Raises:
-            ValueError: the numbers cannot be what they are taken for.
+            ValueError: the numbers contradict the layout.
         """
         split = self.split(outputs[: len(self.outputs)])
         found = read.candidates(split, self.layout.boxes, size, least)
@@ -136,12 +139,12 @@ class Head:
         return found
 
     def coefficients(self, outputs: Sequence[Any], rows: I64) -> Any:
-        """(K, C) weights of the prototypes in these rows: the last columns."""
+        """Return the (K, C) weights of the prototypes in these rows. They are the last columns."""
         table = outputs[0][0].T if self.layout.split is read.columns else outputs[0][0]
         return table[rows, -outputs[-1].shape[1] :]
 
     def doubt(self, facts: Facts) -> str:
-        """Why the outputs for an image that shows nothing cannot be what they are taken for, else empty."""
+        """Return why the outputs for an image without objects contradict the layout, empty if they do not."""
         found = self.split([facts.outputs[name] for name in self.outputs])
         if isinstance(found, Listed):
             real = found.score > 0
@@ -153,11 +156,14 @@ class Head:
         return wrong or read.wrong_boxes(found.boxes, self.layout.boxes, facts.ultralytics)
 
 
-# --- what tells them apart ---------------------------------------------------------------------
+# --- rules that distinguish layouts ------------------------------------------------------------
 
 
 def _in_a_table(find: Callable[[Facts, str, Any], Found | str | None]) -> Finder:
-    """``find`` in the first table that it knows; not where the boxes have a table of their own."""
+    """Apply ``find`` to each table until one matches.
+
+    There is no match if the boxes have a table of their own.
+    """
 
     def find_in_any(facts: Facts) -> Found | str | None:
         if any(table.shape[1] == 4 for table in facts.tables.values()):
@@ -174,15 +180,17 @@ def _in_a_table(find: Callable[[Facts, str, Any], Found | str | None]) -> Finder
 
 
 def _found(outputs: tuple[str, ...], classes: int | str) -> Found | str:
+    """Return the match, or the reason why it cannot be read."""
     return classes if isinstance(classes, str) else Found(outputs, classes)
 
 
 def _whole(values: Any) -> bool:
+    """Return whether all values are whole numbers."""
     return bool((values == np.rint(values)).all())
 
 
 def _is_rtdetr(facts: Facts) -> bool:
-    """Of Ultralytics; older files do not name the head."""
+    """Return whether it is an RT-DETR of Ultralytics. Older files do not name the head."""
     head = facts.metadata.get("head")
     described = "rtdetr" in facts.metadata.get("description", "").lower()
     return facts.ultralytics and (head == "RTDETRDecoder" or (head is None and described))
@@ -190,26 +198,30 @@ def _is_rtdetr(facts: Facts) -> bool:
 
 @_in_a_table
 def _rtdetr_list(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find an RT-DETR of Ultralytics with a list of boxes."""
     listed = table.shape[1] == 6 and _whole(table[:, 5])
     return Found((name,)) if listed and _is_rtdetr(facts) else None
 
 
 @_in_a_table
 def _rtdetr_scores(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find an RT-DETR of Ultralytics with a score of each class."""
     return _found((name,), facts.classes(table.shape[1] - 4)) if _is_rtdetr(facts) else None
 
 
 def _rtdetr_repository(facts: Facts) -> Found | str | None:
+    """Find an RT-DETR or D-FINE of the authors' repositories."""
     names = facts.named("boxes", "scores", "labels")
     return Found(names) if names and "orig_target_sizes" in facts.inputs else None
 
 
 def _rfdetr(facts: Facts) -> Found | str | None:
+    """Find an RF-DETR."""
     names = facts.named("dets", "labels")
     if names is None or any(name not in facts.tables for name in names):
         return None
     columns = facts.tables[names[1]].shape[1]
-    # COCO's weights have a column for each category id, all others one for the background, as the last.
+    # COCO's weights have a column for each category id. Other weights have the background as last column.
     classes = columns if columns == len(COCO_CATEGORIES) else columns - 1
     if facts.names is not None and len(facts.names) != classes:
         return f"it scores {classes} classes, but has {len(facts.names)} class names"
@@ -217,6 +229,8 @@ def _rfdetr(facts: Facts) -> Found | str | None:
 
 
 def _supergradients(*names: str) -> Finder:
+    """Return a finder of YOLO-NAS with these outputs."""
+
     def find(facts: Facts) -> Found | str | None:
         found = facts.named(*names)
         if found and facts.dtype is not np.uint8:
@@ -227,6 +241,7 @@ def _supergradients(*names: str) -> Finder:
 
 
 def _torchvision(facts: Facts) -> Found | str | None:
+    """Find a torchvision detector."""
     if facts.rank != 3:
         return None
     boxes = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 4]
@@ -236,6 +251,7 @@ def _torchvision(facts: Facts) -> Found | str | None:
 
 
 def _two_tables(facts: Facts) -> Found | str | None:
+    """Find a model with one table of boxes and one of scores."""
     shapes = {name: table.shape for name, table in facts.tables.items()}
     boxes = next((name for name, shape in shapes.items() if shape[1] == 4), None)
     if boxes is None:
@@ -249,50 +265,56 @@ def _two_tables(facts: Facts) -> Found | str | None:
 
 
 def _yolov7_list(facts: Facts) -> Found | str | None:
+    """Find a YOLOv7 with NMS."""
     lists = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 7]
     return Found((lists[0],)) if lists else None
 
 
 @_in_a_table
 def _yolov8(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a YOLOv8 or one of its relatives."""
     rows, columns = table.shape
-    # These boxes need no grid to be decoded: the right count of classes will do.
+    # These boxes are decoded already, so the right number of classes is sufficient.
     known = columns in read.cells(facts.size) or (facts.names is not None and rows - 4 == len(facts.names))
     return _found((name,), facts.classes(rows - 4)) if known and columns > rows > 4 else None
 
 
 def _with_objectness(facts: Facts, name: str, table: Any, anchors: int) -> Found | str | None:
-    """A row for each of a cell's anchors: box, objectness, classes."""
+    """Find a table with a row for each anchor of each cell: box, objectness, classes."""
     rows, columns = table.shape
-    # Rows could also be those of a list, 300 as a rule, so that only whole pyramids count.
+    # The rows could also be a list, usually of 300. Therefore only complete pyramids count.
     pyramids = [count for count, strides in read.cells(facts.size).items() if {8, 16, 32} <= set(strides)]
     if rows % anchors or rows // anchors not in pyramids or columns < 6:
         return None
     if facts.ultralytics or (columns == 6 and table[:, 5].any() and _whole(table[:, 5])):
-        return None  # none of Ultralytics' heads has an objectness, and whole numbers are a list's classes
+        return None  # no head of Ultralytics has an objectness, and whole numbers are the classes of a list
     return _found((name,), facts.classes(columns - 5))
 
 
 @_in_a_table
 def _yolov5(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a YOLOv5."""
     return _with_objectness(facts, name, table, anchors=3)
 
 
 @_in_a_table
 def _yolox(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a YOLOX."""
     found = _with_objectness(facts, name, table, anchors=1)
-    # In strides; pixels would lie all over the input.
+    # The coordinates are in strides. Pixels would be distributed over the whole input.
     return found if found is not None and np.median(np.abs(table[:, :2])) <= 8 else None
 
 
 @_in_a_table
 def _yolov6(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a YOLOv6. Its objectness is constant."""
     constant = table.shape[1] > 4 and (table[:, 4] == 1).all()
     return _with_objectness(facts, name, table, anchors=1) if constant else None
 
 
 @_in_a_table
 def _yolox_decoded(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a YOLOX with decoded boxes."""
     found = _with_objectness(facts, name, table, anchors=1)
     if isinstance(found, Found) and facts.names is None and found.classes != len(COCO):
         return "its fifth column may be an objectness or a class: set detector.names"
@@ -301,6 +323,7 @@ def _yolox_decoded(facts: Facts, name: str, table: Any) -> Found | str | None:
 
 @_in_a_table
 def _end_to_end(facts: Facts, name: str, table: Any) -> Found | str | None:
+    """Find a list of boxes after NMS inside the network."""
     said = facts.metadata.get("end2end") == "True" or "'nms': True" in facts.metadata.get("args", "")
     more = table.shape[1] - 6
     known = more in (0, facts.masks) or (more > 0 and facts.ultralytics and said)
@@ -316,13 +339,13 @@ DETR = Feed(Fit.STRETCH, resampling=Resampling.ALL)
 ROBOFLOW = Feed(
     Fit.STRETCH, resampling=Resampling.UNROUNDED, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
 )
-DECI = Feed(Fit.CENTRE, divisor=1, margin=4)  # pixels are divided in the network
+DECI = Feed(Fit.CENTRE, divisor=1, margin=4)  # the network divides the pixels itself
 NATIVE = Feed(Fit.NATIVE)
 
 NAS_LISTS = _supergradients("pred_boxes", "pred_scores", "pred_classes")
 NAS_LIST = _supergradients("flat_predictions")
 
-# The first that is found counts: what has names or metadata of its own comes before what only has a shape.
+# The first match counts. Layouts with typical names or metadata come before layouts with only a shape.
 LAYOUTS = (
     Layout("RT-DETR", _rtdetr_list, read.one_list(0, 4, 5), Boxes.FRACTIONS, SQUARE),
     Layout("RT-DETR", _rtdetr_scores, read.rows, Boxes.FRACTIONS, SQUARE),
@@ -346,10 +369,10 @@ SUPPORTED = ", ".join(dict.fromkeys(map(str, LAYOUTS)))
 
 
 def find_head(facts: Facts) -> Head:
-    """How a model is to be read.
+    """Find out how to read a model.
 
     Raises:
-        ValueError: it cannot be; why, and what to do.
+        ValueError: the model cannot be read. The message says why, and how to fix it.
     """
     stranger = _stranger(facts)
     if stranger:
@@ -372,7 +395,7 @@ def find_head(facts: Facts) -> Head:
 
 
 def _prototypes(layout: Layout, found: Found, facts: Facts) -> str:
-    """The output that masks are made of, where the table has weights for it beyond all else; else empty."""
+    """Return the output with mask prototypes if the table has weights for it, else an empty name."""
     by_columns, listed = layout.split is read.columns, found.classes is None
     if len(found.outputs) > 1 or found.outputs[0] not in facts.tables or not facts.masks:
         return ""
@@ -384,6 +407,7 @@ def _prototypes(layout: Layout, found: Found, facts: Facts) -> str:
 
 
 def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:
+    """Return the class names, with a background class if the layout has one."""
     if (found.classes or 0) > MAX_CLASSES:
         raise ValueError(
             f"read as {layout}, it scores {found.classes:,} classes, "
@@ -396,14 +420,17 @@ def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:
 
 
 def _bytes(layout: Layout, facts: Facts) -> str:
-    """Only of networks that divide their pixels themselves is it known which colour they want first."""
+    """Return why an input of bytes cannot be used, else empty.
+
+    The colour order of such an input is known only for networks that divide the pixels themselves.
+    """
     if facts.dtype is np.uint8 and layout.feed is not DECI:
         return "it takes pixels as bytes, and nothing tells the order of colours: export it for floats"
     return ""
 
 
 def _stranger(facts: Facts) -> str:
-    """What is known not to be readable, and what to do, else empty."""
+    """Return why a known family cannot be read and how to fix it, else empty."""
     names, maps = set(facts.outputs), [o for o in facts.outputs.values() if o.ndim in (4, 5)]
     if facts.ultralytics and facts.task not in ("", "detect", "segment", "pose"):
         return f"a model for the task '{clip(facts.task)}': export one for detect, segment or pose"

@@ -1,4 +1,4 @@
-"""Instance masks: prototypes of the whole image, weighted for each object and cut out by its box."""
+"""Instance masks from prototypes of the whole image, weighted for each object and cropped to its box."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from bevviz.stages.detector.image import Placement
 
 
 def masks(coefficients: F32, prototypes: F32, xyxy: F32, rows: I64, count: int, where: Placement) -> Masks:
-    """Masks as of YOLACT (Bolya et al. 2019), in the order of operations of Ultralytics 8.4.
+    """Compute masks as YOLACT does (Bolya et al. 2019), in the order of operations of Ultralytics 8.4.
 
-    The weighted sum of the prototypes, made as large as the network's input, is above 0 where the object is.
+    The weighted sum of the prototypes, enlarged to the network's input, is above 0 on the object.
 
     Args:
         coefficients: (K, C) weights.
         prototypes: (C, h, w), of the whole input.
         xyxy: (K, 4) boxes in pixels of the input.
-        rows: (K,) detections that they are of ...
-        count: ... and how many of these there are.
-        where: the image in the input.
+        rows: (K,) detections that the masks belong to.
+        count: number of all detections.
+        where: placement of the image in the input.
     """
     (height, width), (channels, low, across) = where.input_size, prototypes.shape
     logits = (coefficients.astype(np.float32) @ prototypes.astype(np.float32).reshape(channels, -1)).reshape(
         -1, low, across
     )
-    # Cells whose left and upper corner is in the box.
+    # A cell is in the box if its left upper corner is.
     edges = np.ceil(np.clip(xyxy, 0, np.array([width, height] * 2, np.float32))).astype(int)
     place, cells = np.zeros((count, 4), np.int32), [np.zeros(0, bool)] * count
     for values, (x0, y0, x1, y1), row in zip(logits, edges.tolist(), rows.tolist(), strict=True):
@@ -41,7 +41,7 @@ def masks(coefficients: F32, prototypes: F32, xyxy: F32, rows: I64, count: int, 
 
 
 def _enlarged(values: F32, size: tuple[int, int], x0: int, y0: int, x1: int, y1: int) -> F32:
-    """A part of an image that is made as large as ``size``, and no more of it than that needs."""
+    """Return a crop of an image enlarged to ``size``. Only the part that the crop needs is enlarged."""
     if x1 <= x0 or y1 <= y0:
         return np.zeros((0, 0), np.float32)
     fy, fx = size[0] // values.shape[0], size[1] // values.shape[1]

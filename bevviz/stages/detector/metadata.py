@@ -8,14 +8,14 @@ from typing import Any
 
 from bevviz.stages.detector.session import clip
 
-DEFAULT_SIZE = 640  # pixels a side where a model leaves its input open: most families are trained so
+DEFAULT_SIZE = 640  # pixels a side for an open input; most families are trained with this size
 DEFAULT_STRIDE, MAX_STRIDE = 32, 256  # pixels; the coarsest grids of known families have 128
 # Characters of one value. 100,000 class names fit; Python takes 0.3 GB to parse as much.
 MAX_TEXT = 2_000_000
 
 
 def literal(metadata: Mapping[str, str], key: str) -> Any:
-    """Return the Python literal in a metadata value, None where there is none.
+    """Return the Python literal in a metadata value, None if there is none.
 
     Raises:
         ValueError: the text is too long.

@@ -1,4 +1,4 @@
-"""Class names: of a model's metadata, of a file, or of COCO."""
+"""Class names from a model's metadata, from a file, or from COCO."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bevviz.stages.detector.session import clip
 from bevviz.support.files import CONFIG_LIMIT, read_text
 
 MAX_CLASSES = 100_000  # the largest set of classes, ImageNet-21k, has 21,841
-MAX_NAME = 200  # characters of a class name, which stands in every frame of a recording
+MAX_NAME = 200  # characters of a class name; every frame of a recording repeats the name
 
 COCO = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
@@ -25,7 +25,7 @@ COCO = (
     "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
-# COCO's annotations number 80 categories up to 90: these ids are left out, and 0 is the background.
+# COCO's annotations number 80 categories up to 90. These ids are unused, and 0 is the background.
 COCO_GAPS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 _found = iter(COCO)
 COCO_CATEGORIES = tuple(
@@ -35,7 +35,7 @@ GIVEN = dict(zip(CLASS_LISTS, (COCO, COCO_CATEGORIES), strict=True))
 
 
 def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
-    """Return the class names in a model's metadata, None where there are none.
+    """Return the class names in a model's metadata, None if there are none.
 
     Ultralytics writes ``names`` as a dict of class id -> name, others as a list.
 
@@ -57,6 +57,7 @@ def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
 
 
 def _sound(where: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names as a tuple, or raise a ValueError if they are too many or too long."""
     if len(names) > MAX_CLASSES:
         raise ValueError(
             f"{where} hold {len(names):,} class names, and no more than {MAX_CLASSES:,} are read"
@@ -71,10 +72,10 @@ def _sound(where: str, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def read_names(value: str) -> tuple[str, ...]:
-    """The names that ``detector.names`` stands for.
+    """Return the class names that ``detector.names`` refers to.
 
     Raises:
-        UserError: no such file, or one without names.
+        UserError: the file is missing or has no names.
     """
     if value in GIVEN:
         return GIVEN[value]
@@ -89,6 +90,6 @@ def read_names(value: str) -> tuple[str, ...]:
 
 
 def default_names(count: int | None) -> tuple[str, ...]:
-    """COCO's where their number says so, else numbers; none where not even their number is known."""
+    """Return the names of COCO if the count fits, otherwise numbered names. No count gives no names."""
     known = {len(names): names for names in GIVEN.values()}
     return known.get(count or 0) or tuple(f"class_{i}" for i in range(count or 0))

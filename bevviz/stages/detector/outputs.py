@@ -1,4 +1,4 @@
-"""What the numbers in a model's outputs mean, and whether they can mean that."""
+"""Read boxes and scores from a model's outputs, and check whether the numbers are plausible."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from bevviz.model.frame import F32, I32, I64
 from bevviz.stages.detector.names import MAX_CLASSES
 
-SLACK = 0.01  # by which half precision and quantisation may take a score above 1 ...
-NEGATIVE = -1e-3  # ... and below 0
-PIXELS = 2.0  # boxes that all lie within this are not in pixels
-EVERYWHERE = 0.2  # the median score that no class has over all places of an image that shows nothing
+SLACK = 0.01  # tolerance above 1 of scores in half precision or after quantisation
+NEGATIVE = -1e-3  # the same below 0
+PIXELS = 2.0  # boxes that all lie within this many pixels are not in pixels
+EVERYWHERE = 0.2  # for an image without objects, no class has a higher median score over all positions
 
 
 class Boxes(Enum):
-    """How four numbers state a box."""
+    """Format of the four numbers of a box."""
 
     CENTRE = "centre and size in pixels of the input"
     CORNERS = "corners in pixels of the input"
@@ -31,11 +31,11 @@ class Scored(NamedTuple):
 
     boxes: Any  # (N, 4)
     scores: Any  # (N, classes)
-    objectness: Any = None  # (N,) that the scores are to be multiplied with
+    objectness: Any = None  # (N,) factor of the scores
 
 
 class Listed(NamedTuple):
-    """Boxes with one class. Rows that fill the list up have a score of 0 or less."""
+    """Boxes with one class each. Padding rows have a score of 0 or less."""
 
     boxes: Any  # (N, 4)
     score: Any  # (N,)
@@ -43,56 +43,61 @@ class Listed(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """What a network found, in pixels of its input, beyond its border too."""
+    """Candidates of a network in pixels of its input. They may extend beyond its border."""
 
     xyxy: F32  # (N, 4)
     score: F32  # (N,)
     class_id: I32  # (N,)
-    row: I64  # (N,) of the network's table
+    row: I64  # (N,) row in the network's table
 
 
-# --- which columns -----------------------------------------------------------------------------
-# Each takes the count of classes and outputs of one image.
+# --- selecting columns -------------------------------------------------------------------------
+# Each function takes the number of classes and the outputs for one image.
 
 
 def columns(classes: int | None, table: Any) -> Scored:
+    """Split a table with one column for each candidate."""
     return Scored(table[:4].T, table[4:].T[:, :classes])
 
 
 def rows(classes: int | None, table: Any) -> Scored:
+    """Split a table with one row for each candidate."""
     return Scored(table[:, :4], table[:, 4:][:, :classes])
 
 
 def rows_with_objectness(classes: int | None, table: Any) -> Scored:
+    """Split a table with box, objectness and class scores in each row."""
     return Scored(table[:, :4], table[:, 5:][:, :classes], table[:, 4])
 
 
 def two_tables(classes: int | None, boxes: Any, scores: Any) -> Scored:
+    """Split a table of boxes and a table of class scores."""
     return Scored(boxes, scores[:, :classes])
 
 
 def three_lists(_: int | None, boxes: Any, score: Any, class_id: Any) -> Listed:
+    """Combine lists of boxes, scores and classes."""
     return Listed(boxes, score, class_id)
 
 
 def one_list(box: int, score: int, class_id: int) -> Callable[[int | None, Any], Listed]:
-    """With these in that column, the box from there on."""
+    """Return a function that reads a list with these columns. ``box`` is the first of four columns."""
     return lambda _, table: Listed(table[:, box : box + 4], table[:, score], table[:, class_id])
 
 
 def queries(classes: int | None, boxes: Any, logits: Any) -> Listed:
-    """The best pairs of query and class, as many as there are queries (RF-DETR's ``PostProcess``)."""
+    """Return the best pairs of query and class, as many as there are queries (RF-DETR's ``PostProcess``)."""
     score = 1 / (1 + np.exp(-logits[:, :classes].astype(np.float32)))
     best = np.argsort(-score, axis=None, kind="stable")[: len(boxes)]
     query, class_id = np.divmod(best, score.shape[1])
     return Listed(boxes[query], score[query, class_id], class_id)
 
 
-# --- reading them ------------------------------------------------------------------------------
+# --- decoding ----------------------------------------------------------------------------------
 
 
 def cells(size: tuple[int, int]) -> dict[int, tuple[int, ...]]:
-    """Count of grid cells -> strides, for every run of neighbouring strides that divide the input."""
+    """Return number of grid cells -> strides, for every run of adjacent strides that divide the input."""
     height, width = size
     whole = [s for s in (4, 8, 16, 32, 64) if height % s == 0 and width % s == 0]
     runs = [tuple(whole[i:j]) for i in range(len(whole)) for j in range(i + 1, len(whole) + 1)]
@@ -100,7 +105,7 @@ def cells(size: tuple[int, int]) -> dict[int, tuple[int, ...]]:
 
 
 def candidates(found: Scored | Listed, boxes: Boxes, size: tuple[int, int], least: float) -> Candidates:
-    """Everything with a score of ``least`` or more, in an input of this height and width."""
+    """Return all candidates with a score of ``least`` or more, for an input of this height and width."""
     if isinstance(found, Listed):
         row = np.flatnonzero(found.score >= least)
         score, class_id = found.score[row], found.class_id[row]
@@ -111,11 +116,11 @@ def candidates(found: Scored | Listed, boxes: Boxes, size: tuple[int, int], leas
 
 
 def _best_classes(found: Scored, least: float) -> tuple[Any, Any, Any]:
-    """Rows whose best class reaches that score, with the score and the class."""
+    """Return the rows whose best class has at least that score, with the score and the class."""
     if found.objectness is None:
         row = np.flatnonzero(found.scores.max(axis=1) >= least)
         scores = found.scores[row]
-    else:  # no product with a class's score exceeds it
+    else:  # the product with a class score is never higher than the objectness
         row = np.flatnonzero(found.objectness >= least)
         scores = found.scores[row] * found.objectness[row, None]
     class_id = scores.argmax(axis=1)
@@ -125,7 +130,7 @@ def _best_classes(found: Scored, least: float) -> tuple[Any, Any, Any]:
 
 
 def _corners(kind: Boxes, boxes: Any, row: Any, count: int, size: tuple[int, int]) -> F32:
-    """Corners in pixels. Half precision is added up as such: so do the exporters."""
+    """Convert boxes to corners in pixels. Half precision is added in half precision, as the exporters do."""
     xyxy: F32
     if kind is Boxes.CORNERS:
         xyxy = boxes.astype(np.float32)
@@ -142,7 +147,7 @@ def _corners(kind: Boxes, boxes: Any, row: Any, count: int, size: tuple[int, int
 
 
 def _grid(size: tuple[int, int], strides: tuple[int, ...]) -> tuple[F32, F32]:
-    """(N, 2) column and row, and (N, 1) stride, of each cell in the order of YOLOX's output."""
+    """Return (N, 2) column and row and (N, 1) stride of each cell, in the order of YOLOX's output."""
     cell, stride = [], []
     for s in strides:
         at = np.indices((size[0] // s, size[1] // s), np.float32)[::-1].reshape(2, -1).T
@@ -151,11 +156,11 @@ def _grid(size: tuple[int, int], strides: tuple[int, ...]) -> tuple[F32, F32]:
     return np.concatenate(cell), np.concatenate(stride)
 
 
-# --- whether they can be right -----------------------------------------------------------------
+# --- plausibility ------------------------------------------------------------------------------
 
 
 def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
-    """Why these cannot be scores and classes, empty where they can."""
+    """Return why these numbers cannot be scores and classes, empty if they can."""
     if score.size and score.max() > 1 + SLACK:
         return f"it has scores up to {score.max():.3g}"
     if class_id.size and class_id.max() > MAX_CLASSES:
@@ -169,9 +174,9 @@ def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
 
 
 def wrong_scores(found: Scored, counted: bool) -> str:
-    """Why these cannot be scores for an image that shows nothing, empty where they can.
+    """Return why these numbers cannot be scores for an image without objects, empty if they can.
 
-    ``counted``: something tells that there are so many classes.
+    ``counted``: whether another source confirms the number of classes.
     """
     tables = [found.scores] if found.objectness is None else [found.scores, found.objectness]
     if not all(table.size for table in tables):
@@ -189,7 +194,7 @@ def wrong_scores(found: Scored, counted: bool) -> str:
 
 
 def wrong_boxes(boxes: Any, kind: Boxes, trusted: bool) -> str:
-    """Why these cannot be boxes, empty where they can."""
+    """Return why these numbers cannot be boxes, empty if they can."""
     if boxes.size and not np.isfinite(boxes).any():
         return "none of its boxes has numbers that are finite"
     largest = np.abs(boxes).max() if boxes.size else 0.0

@@ -1,4 +1,4 @@
-"""What a network runs on: the best of what is installed and works, and a word where that is not the best."""
+"""Choose the execution provider of a network: the best one that is installed and works."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from bevviz.errors import UserError
 from bevviz.stages.detector.session import SUFFIX, NetworkSession
 from bevviz.support import progress
 
-# TensorRT compiles each network for minutes before its first frame: where it is asked for by name alone.
+# TensorRT compiles each network for minutes before its first frame. So it is used only on request.
 PREFERRED = ("CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
-# Of onnxruntime-gpu; where what one of these needs is missing, onnxruntime says so in many lines.
+# Libraries of onnxruntime-gpu. onnxruntime prints many lines if one of their dependencies is missing.
 SHARED = "libonnxruntime_providers_shared.so"
 LIBRARIES = {"CUDA": "libonnxruntime_providers_cuda.so", "Tensorrt": "libonnxruntime_providers_tensorrt.so"}
 HELP = {
@@ -28,15 +28,16 @@ HELP = {
 def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str = "") -> NetworkSession:
     """Open the network of an ONNX file.
 
+    With ``auto``, print why better installed providers are not used.
+
     Args:
-        path: of the network.
-        asked: execution provider, by its short or whole name; auto: the best that works. Where that is not
-            the best that is installed, it is said why.
+        path: file of the network.
+        asked: execution provider by its short or whole name, or ``auto`` for the best that works.
         options: of the session.
-        where: the file is stated; empty: as the detector's.
+        where: how errors name the file; empty: as ``detector.model``.
 
     Raises:
-        UserError: that provider is not installed or does not work; no network.
+        UserError: the provider is not installed or does not work, or the file is no network.
     """
     session, failed = _opened(path, asked, options, where or f"detector.model {path}")
     for name, reason in failed.items():
@@ -45,7 +46,7 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str
 
 
 def network(path: Path, asked: str) -> str:
-    """What the network of an ONNX file runs on here, in words; where it cannot be run, why."""
+    """Describe the provider that would run a network here, or why the network cannot run."""
     try:
         session, failed = _opened(path, asked, ort.SessionOptions(), f"detector.model {path}")
     except UserError as error:
@@ -58,7 +59,7 @@ def network(path: Path, asked: str) -> str:
 def _opened(
     path: Path, asked: str, options: ort.SessionOptions, where: str
 ) -> tuple[NetworkSession, dict[str, str]]:
-    """Open the session, and say why each provider that would be better does not work."""
+    """Open the session. Also return why each better provider does not work."""
     if path.exists() and not path.is_file():  # onnxruntime would wait for a pipe
         raise UserError(f"{where}: it is no file")
     available = [name.removesuffix(SUFFIX) for name in ort.get_available_providers()]
@@ -97,11 +98,11 @@ def _opened(
 
 @lru_cache
 def obstacle(name: str) -> str:
-    """Why an execution provider that is installed cannot be loaded; empty: as far as is known, it can."""
+    """Return why an installed execution provider cannot be loaded, empty if no reason is known."""
     folder = Path(ort.__file__).parent / "capi"
     if not (folder / LIBRARIES.get(name, "")).is_file():
         return ""
-    if hasattr(ort, "preload_dlls"):  # those that came as packages; it prints what it does not find
+    if hasattr(ort, "preload_dlls"):  # of installed packages; prints missing ones
         with contextlib.redirect_stdout(io.StringIO()):
             ort.preload_dlls()
     try:
@@ -116,5 +117,5 @@ def obstacle(name: str) -> str:
 
 @lru_cache
 def tell(line: str) -> None:
-    """Once."""
+    """Print a line, once for each text."""
     progress.say(line)

@@ -1,6 +1,6 @@
 """Load and run the networks of ONNX files within limits.
 
-A file from elsewhere, or a broken one, may ask for any time and any memory.
+A broken or foreign file may need any time and any memory.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ import onnxruntime as ort
 from bevviz.errors import UserError, first_line
 from bevviz.support.cleanup import ENDLESS_THREAD
 
-# Seconds to load a network, and for each answer. Ten times what the largest detectors take on a small board.
+# Seconds to load a network, and for each answer: ten times what the largest detectors take on a small board.
 SECONDS = 120.0
 # The same for providers that compile a network before its first answer, which takes minutes.
 COMPILING_SECONDS = 1800.0
 INTERPRETING = ("CPU", "CUDA")  # providers that do not compile networks
 # Bytes that the networks of this process may take. The largest 3D detectors take 2 GB.
 MAX_MEMORY = 8 * 2**30
-# A smaller machine gives them this part of its memory: the recording needs the other half.
+# On a smaller machine the networks may take this share of its memory. The recording needs the other half.
 MEMORY_SHARE = 0.5
 # Numbers in all inputs of a network. 800 MB as float32; the largest known maps of pillars hold 1.3e8.
 MAX_INPUT_NUMBERS = 200_000_000
@@ -40,15 +40,15 @@ MAX_OUTPUT_NUMBERS = 100_000_000
 MAX_TENSORS = 100
 MAX_NAME = 1000  # characters in the name of an input or output, which stands in error messages
 
-CHECK = 0.05  # seconds between two looks at the memory: 100 MB fill up meanwhile
-GRACE = 1.0  # seconds that a network has to end when it is told to
+CHECK = 0.05  # seconds between two checks of the memory; up to 100 MB are filled in this time
+GRACE = 1.0  # seconds that a network has to end after a stop request
 SUFFIX = "ExecutionProvider"
-SILENT = 4  # onnxruntime's severity "fatal": it must not print errors that we report ourselves
+SILENT = 4  # onnxruntime's severity "fatal", so that it does not print errors that we report ourselves
 LISTED, TEXT = 8, 200  # inputs or outputs in an error message, and characters of each text in it
 SMALLER = "use a smaller network, or export it with a smaller input"
 
 NUMBERS = re.compile(r"tensor\((u?int(8|16|32|64)|float|float16|double|bool)\)")
-# Beginnings of onnxruntime's messages that say nothing to users: error codes, and places in its source.
+# Beginnings of onnxruntime's messages that do not help users: error codes, and positions in its source.
 CODE = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
 SOURCE = re.compile(r"\S*/onnxruntime/core/\S+:\d+ .*\) (?=\S)")
 OUT_OF_MEMORY = re.compile(r"Failed to allocate memory|Available memory of|bad_alloc|bad allocation")
@@ -102,7 +102,7 @@ class NetworkSession:
             wanted: names of outputs; None: all.
 
         Returns:
-            The outputs by their names, in the order that is wanted.
+            The outputs by name, in the order of ``wanted``.
 
         Raises:
             UserError: the network fails, takes too long, or answers more than the limits allow.
@@ -137,7 +137,7 @@ class NetworkSession:
         return dict(zip(names, arrays, strict=True))
 
     def check_input(self, name: str, shape: Sequence[Any]) -> None:
-        """Check the size of an input, whose open axes are no numbers.
+        """Check the size of an input. Open axes are not checked.
 
         Raises:
             UserError: an axis has no elements, or all together have too many.
@@ -152,6 +152,7 @@ class NetworkSession:
             )
 
     def _check_tensors(self) -> None:
+        """Check number, names and types of the inputs and outputs."""
         outputs = self._session.get_outputs()
         for kind, nodes in (("input", self.inputs), ("output", outputs)):
             if not nodes:
@@ -175,6 +176,7 @@ class NetworkSession:
             self.check_input(node.name, node.shape)
 
     def _check_answer(self, names: Sequence[str], arrays: Sequence[Any]) -> None:
+        """Check the size of the outputs."""
         if sum(array.size for array in arrays) > MAX_OUTPUT_NUMBERS:
             shapes = listed((name, np.shape(array)) for name, array in zip(names, arrays, strict=True))
             raise UserError(
@@ -184,10 +186,10 @@ class NetworkSession:
 
 @contextmanager
 def reading(where: str) -> Iterator[None]:
-    """Read a network's answer, which may have any shape and any numbers.
+    """Convert errors while reading a network's answer, which may have any shape and any numbers.
 
     Raises:
-        UserError: the answer cannot be read, which a ValueError says in a sentence.
+        UserError: the answer cannot be read. The text of a ValueError is used as it is.
     """
     try:
         with np.errstate(all="ignore"):
@@ -202,7 +204,7 @@ def reading(where: str) -> Iterator[None]:
 
 
 def listed(tensors: Iterable[tuple[str, Any]]) -> str:
-    """List names and shapes of inputs or outputs for an error message, at a length that can be read.
+    """List names and shapes of inputs or outputs for an error message, with a limited length.
 
     >>> listed([("images", [1, 3, 640, 640]), ("scale", (1, 2))])
     'images [1, 3, 640, 640], scale [1, 2]'
@@ -213,26 +215,27 @@ def listed(tensors: Iterable[tuple[str, Any]]) -> str:
 
 
 def clip(value: object) -> str:
-    """Return the value as a text for an error message: a file may hold names of any length."""
+    """Return the value as a text for an error message. A file may hold names of any length."""
     text = str(value)
     return text if len(text) <= TEXT else f"{text[:TEXT]}..."
 
 
 class _LimitError(Exception):
-    """A network takes more than a limit allows."""
+    """Error of a network that takes more than a limit allows."""
 
 
 def _load(
     path: Path, providers: Sequence[str], options: ort.SessionOptions, where: str, seconds: float
 ) -> Any:
+    """Load a network within the limits."""
     _share_limited_memory()
     options.log_severity_level = SILENT
     options.add_session_config_entry("session.use_env_allocators", "1")
-    # Without this a name that ends with .ort has the file read in another format.
+    # Without this setting a name that ends with .ort has the file read in another format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
 
     def load() -> Any:
-        # Without onnxruntime's own fallback, which prints to standard output.
+        # onnxruntime's own fallback is disabled because it prints to standard output.
         names = [f"{name}{SUFFIX}" for name in providers]
         return ort.InferenceSession(path, options, names, enable_fallback=0)
 
@@ -266,7 +269,7 @@ def memory_limit() -> int:
 
 
 def _resident() -> int:
-    """Return the bytes of this process that are in memory; 0 where the system does not tell."""
+    """Return the resident bytes of this process; 0 if the system does not report them."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -275,9 +278,9 @@ def _resident() -> int:
 
 
 def _watch(work: Callable[[], T], end: Callable[[], None], seconds: float, verb: str = "answer") -> T:
-    """Do what may take any time and memory in a thread, and leave it when a limit is exceeded.
+    """Run work of unknown time and memory in a thread. Abandon the thread when a limit is exceeded.
 
-    ``end`` asks the work to stop. A network does so between two of its operations only.
+    ``end`` asks the work to stop. A network stops only between two of its operations.
 
     Raises:
         _LimitError: the work exceeds a limit.
@@ -309,7 +312,7 @@ def _watch(work: Callable[[], T], end: Callable[[], None], seconds: float, verb:
 
 
 def _run_in_time(work: Callable[[], T], end: Callable[[], None], seconds: float) -> T:
-    """Do the work in this thread, and ask it to stop after so many seconds."""
+    """Run the work in this thread, and ask it to stop after so many seconds."""
     timer = threading.Timer(seconds, end)
     timer.daemon = True
     timer.start()
@@ -320,15 +323,17 @@ def _run_in_time(work: Callable[[], T], end: Callable[[], None], seconds: float)
 
 
 def _overdue(verb: str, seconds: float) -> str:
+    """Return the message for work that took too long."""
     return f"does not {verb} within {seconds:g} s"
 
 
 def _too_large() -> str:
+    """Return the message for work that took too much memory."""
     return f"needs more than {memory_limit() / 2**30:.1f} GiB of memory"
 
 
 def _reason(error: Exception, otherwise: str) -> str:
-    """Say why onnxruntime failed, and what to do where that is known."""
+    """Return why onnxruntime failed, and how to fix it if that is known."""
     text = first_line(error)
     if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(text):
         return f"{_too_large()}; {SMALLER}"

@@ -1,4 +1,4 @@
-"""Greedy non-maximum suppression that keeps what torchvision keeps, and tells why the others went."""
+"""Greedy non-maximum suppression that keeps the same boxes as torchvision, and gives reasons."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from bevviz.support.kernel import kernel
 def nms(xyxy: F32, class_id: I32, threshold: float, class_offset: float = 0.0) -> tuple[I32, F32]:
     """Greedy class-wise non-maximum suppression (Neubeck and Van Gool 2006).
 
-    Keeps, bit for bit, what ``torchvision.ops.nms`` keeps of boxes that are moved by ``class_offset`` for
-    each class. Ultralytics keeps the classes apart so; in float32 that rounds the corners of boxes by up to
-    1/32 of a pixel, which now and then decides.
+    Keep exactly the boxes that ``torchvision.ops.nms`` keeps after boxes are shifted by ``class_offset`` for
+    each class. Ultralytics separates classes in this way. In float32 the shift rounds the corners of boxes by
+    up to 1/32 of a pixel, which occasionally changes the result.
 
     Args:
         xyxy: (N, 4) boxes, best score first.
-        class_id: (N,) classes; only boxes of the same one suppress each other.
-        threshold: IoU above which the weaker box goes.
+        class_id: (N,) classes. Only boxes of the same class suppress each other.
+        threshold: IoU above which the weaker box is suppressed.
         class_offset: pixels from one class to the next.
 
     Returns:
@@ -26,7 +26,7 @@ def nms(xyxy: F32, class_id: I32, threshold: float, class_offset: float = 0.0) -
         overlap: (N,) IoU with it, 0 for survivors.
     """
     moved = xyxy + class_id[:, None].astype(np.float32) * np.float32(class_offset)
-    rows = np.argsort(class_id, kind="stable")  # one class beside the other, each best first
+    rows = np.argsort(class_id, kind="stable")  # classes one after the other, each best first
     ends = np.flatnonzero(np.diff(class_id[rows])) + 1
     suppressor, overlap = np.full(len(xyxy), -1, np.int32), np.zeros(len(xyxy), np.float32)
     _suppress(moved, rows, np.append(ends, len(rows)), threshold, suppressor, overlap)
@@ -35,7 +35,10 @@ def nms(xyxy: F32, class_id: I32, threshold: float, class_offset: float = 0.0) -
 
 @kernel
 def _suppress(boxes: F32, rows: I64, ends: I64, threshold: float, suppressor: I32, overlap: F32) -> None:
-    """Within each class, whose rows end where ``ends`` says, in the order of operations of torchvision."""
+    """Suppress boxes within each class, in the order of operations of torchvision.
+
+    ``ends`` are the ends of the classes in ``rows``.
+    """
     zero = np.float32(0)
     begin = 0
     for end in ends:

@@ -1,4 +1,4 @@
-"""Points grouped into pillars, and what a network is shown of each point (Lang et al. 2019, PointPillars)."""
+"""Group points into pillars and compute the features of each point (Lang et al. 2019, PointPillars)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from bevviz.support.kernel import kernel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pillars:
-    """P pillars, in the order of each one's first point, with at most M points in each.
+    """Pillars in the order of their first points: P pillars with at most M points each.
 
     Attributes:
-        points: (P, M, F) float32 features of the points, zeros behind the last one.
-        counts: (P,) int32 points in each.
-        cells: (P, 2) int32 cell of each along x and y.
-        left_out_points: of pillars that are full.
-        left_out_pillars: of a cloud that is full.
+        points: (P, M, F) float32 features of the points, zeros after the last point.
+        counts: (P,) int32 points in each pillar.
+        cells: (P, 2) int32 cell of each pillar along x and y.
+        left_out_points: number of points dropped because their pillar was full.
+        left_out_pillars: number of pillars dropped because the maximum was reached.
     """
 
     points: F32
@@ -48,14 +48,14 @@ def group(
     """Group points as mmcv's and spconv's hard voxelization does: first come, first served.
 
     Args:
-        points: (N, 3) float32 finite points; those outside the range are in no pillar.
+        points: (N, 3) float32 finite points. Points outside the range are in no pillar.
         low: lowest x, y, z of the range, in metres.
-        size: edges of a pillar.
-        shape: pillars along x and y.
-        high_z: end of the range; a point there is outside.
-        max_points: of a pillar.
-        max_pillars: of the cloud.
-        features: in the order that the network wants.
+        size: edges of a pillar in metres.
+        shape: number of pillars along x and y.
+        high_z: metres, exclusive end of the range in z.
+        max_points: largest number of points in a pillar.
+        max_pillars: largest number of pillars.
+        features: features in the order of the network's input.
         intensity: (N,) of the points; None: 0.
     """
     start, edge = np.asarray(low, np.float32), np.asarray(size, np.float32)
@@ -93,7 +93,7 @@ def group(
 
 
 def scatter(features: F32, cells: I32, shape: tuple[int, int]) -> F32:
-    """(1, C, ny, nx) the (P, C) features of pillars, each in its cell, zeros elsewhere."""
+    """Return the (P, C) features of pillars as a (1, C, ny, nx) map, zeros in empty cells."""
     nx, ny = shape
     canvas = np.zeros((features.shape[1], ny * nx), np.float32)
     canvas[:, cells[:, 1].astype(np.int64) * nx + cells[:, 0]] = features.T
@@ -101,7 +101,7 @@ def scatter(features: F32, cells: I32, shape: tuple[int, int]) -> F32:
 
 
 def _means(points: F32, place: I32, counts: I32) -> F64:
-    """(P, 3) mean of each pillar's points."""
+    """Return the (P, 3) mean of each pillar's points."""
     sums = [np.bincount(place, points[:, axis], len(counts)) for axis in range(3)]
     return np.column_stack(sums) / np.maximum(counts, 1)[:, None]
 
@@ -110,7 +110,16 @@ def _means(points: F32, place: I32, counts: I32) -> F64:
 def _placed(
     points: F32, low: F32, size: F32, nx: int, ny: int, high_z: np.float32, max_points: int, max_pillars: int
 ) -> tuple[I32, I32, I32, I32, int, int]:
-    """Pillar and place in it of each point, -1: none; points and cell of each pillar; what was left out."""
+    """Assign each point to a pillar and a slot in it.
+
+    Returns:
+        Pillar of each point, -1 for none.
+        Slot of each point in its pillar.
+        Number of points of each pillar.
+        Cell of each pillar.
+        Number of points dropped from full pillars.
+        Number of pillars dropped.
+    """
     n = len(points)
     number = np.full(nx * ny, -1, np.int32)
     place = np.full(n, -1, np.int32)

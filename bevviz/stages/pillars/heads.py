@@ -1,8 +1,8 @@
-"""What a network's maps say: boxes about anchors (PointPillars) or about centres (CenterPoint).
+"""Decode a network's maps to boxes, relative to anchors (PointPillars) or to centres (CenterPoint).
 
-Which output is what comes from the names that exporters give, and from the number of channels that the
-parameters call for. What fits in no way or in two is refused: boxes read from the wrong channels look like a
-bad detector.
+The names that exporters use and the numbers of channels that follow from the parameters identify each output.
+A network that fits in no way or in two ways is refused, because boxes read from the wrong channels look like
+a bad detector.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from bevviz.config.pillars import PillarParams
 from bevviz.model.frame import F32, F64, I64
 from bevviz.stages.detector.session import listed
 
-MOST_LOG = 10.0  # of a size that is e to the power of this: what is more is no size
+MOST_LOG = 10.0  # largest logarithm of a size; larger values would overflow
 
 
 class Candidates(NamedTuple):
-    """Boxes before any is suppressed.
+    """Boxes before suppression.
 
     Attributes:
         boxes: (K, 7) x, y, z of the centre, length, width, height, yaw, in the network's frame.
         score: (K,).
         class_id: (K,) rows of the class names.
-        group: (K,) head that each is of.
+        group: (K,) head that each box comes from.
     """
 
     boxes: F64
@@ -38,28 +38,29 @@ class Candidates(NamedTuple):
 
 
 class Head(Protocol):
-    """Reads the answer to one cloud."""
+    """Reader of a network's outputs for one cloud."""
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the outputs that are read."""
+        """Names of the outputs to read."""
 
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
-        """What scores enough.
+        """Return the boxes with a sufficient score.
 
         Raises:
-            ValueError: the numbers cannot be what they are taken for.
+            ValueError: the numbers contradict the parameters.
         """
 
 
 def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
-    """How the outputs are to be read.
+    """Find out how to read the outputs.
 
     Args:
-        outputs: name -> array, of any cloud.
+        outputs: name -> array, for any cloud.
+        params: parameters of the network.
 
     Raises:
-        ValueError: they cannot be; why, and what was expected.
+        ValueError: the outputs cannot be read. The message says why and which outputs were expected.
     """
     try:
         return _anchors(outputs, params) if params.anchors else _centers(outputs, params)
@@ -72,13 +73,13 @@ def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
 
 
 class Map(NamedTuple):
-    """An output with C channels on a grid, and where its channels are."""
+    """Output with C channels on a grid."""
 
     name: str
-    last: bool  # channels are the last axis, else the second
+    last: bool  # the channels are the last axis, otherwise the second
 
     def at(self, outputs: Mapping[str, Any], cells: I64 | slice = slice(None)) -> F32:
-        """(K, C) the channels of these cells, which are counted along x first."""
+        """Return the (K, C) channels of these cells. Cells are counted along x first."""
         array = outputs[self.name][0]
         if self.last:
             return np.asarray(array.reshape(-1, array.shape[-1])[cells], np.float32)
@@ -86,7 +87,7 @@ class Map(NamedTuple):
 
 
 def _map(outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], params: PillarParams) -> Map:
-    """The output as a map of that many channels; several counts are alternatives."""
+    """Check that an output is a map with one of these numbers of channels."""
     shape = np.shape(outputs[name])
     wanted = " or ".join(map(str, channels))
     if len(shape) != 4 or shape[0] != 1:
@@ -108,7 +109,7 @@ def _map(outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], param
 
 
 def _stride(cells: tuple[int, ...], params: PillarParams) -> int:
-    """Pillars along the edge of a cell of a map with (y, x) cells; 0: they do not fit."""
+    """Return the number of pillars along the edge of a map's cell, 0 if the map does not fit the grid."""
     (nx, ny), (height, width) = params.grid, cells
     if height < 1 or width < 1 or nx % width or ny % height or nx // width != ny // height:
         return 0
@@ -116,12 +117,13 @@ def _stride(cells: tuple[int, ...], params: PillarParams) -> int:
 
 
 def _grid(outputs: Mapping[str, Any], found: Map) -> tuple[int, int]:
-    """Cells along y and x."""
+    """Return the number of cells along y and x."""
     shape = outputs[found.name].shape
     return (shape[1], shape[2]) if found.last else (shape[2], shape[3])
 
 
 def _same_grid(outputs: Mapping[str, Any], maps: list[Map]) -> tuple[int, int]:
+    """Return the grid of the maps, or raise a ValueError if they differ."""
     grids = {_grid(outputs, one) for one in maps}
     if len(grids) != 1:
         raise ValueError("its maps have different grids")
@@ -129,7 +131,7 @@ def _same_grid(outputs: Mapping[str, Any], maps: list[Map]) -> tuple[int, int]:
 
 
 def _scores(given: F32, params: PillarParams) -> F32:
-    """What a map of scores says, 0 to 1."""
+    """Return scores from 0 to 1 from a map of logits or probabilities."""
     if not given.size:
         return given
     low, high = float(given.min()), float(given.max())
@@ -150,12 +152,13 @@ def _scores(given: F32, params: PillarParams) -> F32:
 
 
 def _thresholds(params: PillarParams) -> F32:
+    """Return the score threshold of each class."""
     found = [params.score_thresholds.get(name, params.score_threshold) for name in params.classes]
     return np.array(found, np.float32)
 
 
 def _best(score: F32, count: int) -> I64:
-    """Rows of the ``count`` best, best first, of equals the first."""
+    """Return the rows of the ``count`` best scores, best first. Equal scores keep their order."""
     if len(score) > count:
         rows = np.flatnonzero(score >= np.partition(score, -count)[-count])
     else:
@@ -164,7 +167,10 @@ def _best(score: F32, count: int) -> I64:
 
 
 def _labelled(score: F32, params: PillarParams) -> tuple[I64, I64]:
-    """Rows and classes of (N, C) scores that are high enough, of the best ``nms_candidates`` places."""
+    """Return rows and classes of sufficient scores among the best ``nms_candidates`` rows.
+
+    ``score`` is (N, C).
+    """
     rows = _best(score.max(axis=1), params.nms_candidates)
     enough = score[rows] >= _thresholds(params)
     if params.labels == "best":
@@ -175,15 +181,15 @@ def _labelled(score: F32, params: PillarParams) -> tuple[I64, I64]:
     return rows[row], class_id
 
 
-# --- about anchors -----------------------------------------------------------------------------
+# --- boxes relative to anchors -----------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchors:
-    """Maps of scores, boxes and, where it tells front from back, directions about anchors.
+    """Reader of maps of scores, boxes and optional directions relative to anchors.
 
-    As ``DeltaXYZWLHRBBoxCoder`` and ``Anchor3DHead`` of mmdetection3d, ``ResidualCoder`` and
-    ``AnchorHeadSingle`` of OpenPCDet read them.
+    It follows ``DeltaXYZWLHRBBoxCoder`` and ``Anchor3DHead`` of mmdetection3d, and ``ResidualCoder`` and
+    ``AnchorHeadSingle`` of OpenPCDet.
     """
 
     score: Map
@@ -194,9 +200,11 @@ class Anchors:
 
     @property
     def wanted(self) -> tuple[str, ...]:
+        """Names of the outputs to read."""
         return tuple(one.name for one in (self.score, self.box, self.direction) if one is not None)
 
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
+        """Return the boxes with a sufficient score. See ``Head.candidates``."""
         params, each = self.params, len(self.params.anchors) * len(self.params.rotations)
         score = _scores(self.score.at(outputs).reshape(len(self.places), len(params.classes)), params)
         rows, class_id = _labelled(score, params)
@@ -211,7 +219,10 @@ class Anchors:
 
 
 def places(shape: tuple[int, int], params: PillarParams) -> F64:
-    """(ny * nx * anchors * rotations, 7) the anchors of a map with (ny, nx) cells, rotations fastest."""
+    """Return the anchors of a map with (ny, nx) cells as (ny * nx * anchors * rotations, 7).
+
+    Rotations vary fastest.
+    """
     low_x, low_y, high_x, high_y = params.anchor_range or (*params.point_range[:2], *params.point_range[3:5])
 
     def along(low: float, high: float, count: int) -> F64:
@@ -230,7 +241,7 @@ def places(shape: tuple[int, int], params: PillarParams) -> F64:
 
 
 def decoded(deltas: F64, anchors: F64) -> F64:
-    """(K, 7) boxes that lie so beside these anchors (Yan et al. 2018, SECOND)."""
+    """Return the (K, 7) boxes of offsets relative to these anchors (Yan et al. 2018, SECOND)."""
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     boxes = np.empty_like(anchors)
     boxes[:, :2] = deltas[:, :2] * diagonal + anchors[:, :2]
@@ -241,7 +252,7 @@ def decoded(deltas: F64, anchors: F64) -> F64:
 
 
 def turned(yaw: F64, facing: I64, params: PillarParams) -> F64:
-    """Yaw, which is known up to half a turn, with the half that the network chose."""
+    """Resolve a yaw that is known up to half a turn by the direction that the network chose."""
     offset = params.direction_offset or 0.0
     half = yaw - offset
     half = half - np.floor(half / np.pi + params.direction_limit_offset) * np.pi
@@ -256,7 +267,7 @@ ROLES: dict[str, Callable[[str], object]] = {
 
 
 def _roles(outputs: Mapping[str, Any], channels: Mapping[str, tuple[int, ...]]) -> dict[str, str]:
-    """role -> output, by names, else by the number of channels."""
+    """Return role -> output, by the names or else by the numbers of channels."""
     named = {role: [o for o in outputs if known(o.lower())] for role, known in ROLES.items()}
     if len(named["score"]) == 1 and len(named["box"]) == 1 and len(named["direction"]) <= 1:
         return {role: found[0] for role, found in named.items() if found}
@@ -271,6 +282,7 @@ def _roles(outputs: Mapping[str, Any], channels: Mapping[str, tuple[int, ...]]) 
 
 
 def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
+    """Make the reader of a network with anchors."""
     if params.anchor_places is None:
         raise ValueError(
             "it works with anchors, and objects.anchor_places is not set: cell_centers or edge_to_edge"
@@ -278,7 +290,7 @@ def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
     each = len(params.anchors) * len(params.rotations)
     channels = {
         "score": (each * len(params.classes),),
-        "box": (each * 7, each * 9),  # with a speed
+        "box": (each * 7, each * 9),  # 9 channels include a velocity
         "direction": (each * 2,),
     }
     roles = _roles(outputs, channels)
@@ -291,9 +303,9 @@ def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
     return Anchors(maps["score"], maps["box"], maps.get("direction"), places(shape, params), params)
 
 
-# --- about centres -----------------------------------------------------------------------------
+# --- boxes relative to centres -----------------------------------------------------------------
 
-PARTS = {  # of a box -> its number of channels, and the names that exporters give to it
+PARTS = {  # property of a box -> number of channels, and the names that exporters use
     "score": (0, ("heatmap", "hm")),
     "offset": (2, ("reg", "center")),
     "z": (1, ("height", "center_z", "z")),
@@ -304,32 +316,35 @@ PARTS = {  # of a box -> its number of channels, and the names that exporters gi
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Some channels of a map."""
+    """Range of channels of a map."""
 
     map: Map
     first: int
     count: int
 
     def at(self, outputs: Mapping[str, Any], cells: I64 | slice = slice(None)) -> F32:
+        """Return the (K, count) channels of these cells."""
         return self.map.at(outputs, cells)[:, self.first : self.first + self.count]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Centers:
-    """Maps of the scores of centres, and of the boxes there, of one head or several.
+    """Reader of maps of centre scores and boxes, of one or several heads.
 
-    As ``CenterHead`` of mmdetection3d and of OpenPCDet, and Autoware's ``generateBoxes3D_kernel`` read them.
+    It follows ``CenterHead`` of mmdetection3d and of OpenPCDet, and Autoware's ``generateBoxes3D_kernel``.
     """
 
-    parts: tuple[Mapping[str, Part], ...]  # of each head, by the keys of PARTS
+    parts: tuple[Mapping[str, Part], ...]  # for each head, by the keys of PARTS
     shape: tuple[int, int]  # cells along y and x
     params: PillarParams
 
     @property
     def wanted(self) -> tuple[str, ...]:
+        """Names of the outputs to read."""
         return tuple(dict.fromkeys(part.map.name for head in self.parts for part in head.values()))
 
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
+        """Return the boxes with a sufficient score. See ``Head.candidates``."""
         found, first = [], 0
         for number, head in enumerate(self.parts):
             found.append(self._of_head(outputs, head, number, first))
@@ -339,6 +354,7 @@ class Centers:
     def _of_head(
         self, outputs: Mapping[str, Any], head: Mapping[str, Part], number: int, first: int
     ) -> Candidates:
+        """Return the boxes of one head. ``first`` is the class of its first channel."""
         params = self.params
         score = _scores(head["score"].at(outputs), params)
         least = _thresholds(params)[first : first + score.shape[1]]
@@ -361,7 +377,7 @@ class Centers:
         )
 
     def _boxes(self, outputs: Mapping[str, Any], head: Mapping[str, Part], rows: I64) -> tuple[F64, F64]:
-        """(K, 7) boxes at these cells, and (K,) the lengths of their (sin, cos)."""
+        """Return (K, 7) boxes at these cells, and the (K,) lengths of their (sin, cos)."""
         params, (height, width) = self.params, self.shape
         offset, z, size, rotation = (
             head[key].at(outputs, rows).astype(np.float64) for key in ("offset", "z", "size", "rotation")
@@ -381,6 +397,7 @@ class Centers:
 
 
 def _centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
+    """Make the reader of a network with centres."""
     groups = params.groups or (params.classes,)
     counts = [len(group) for group in groups]
     heads = _joined(outputs, counts, params) or _separate(outputs, counts, params)
@@ -392,7 +409,7 @@ def _centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
 
 
 def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParams) -> list[dict[str, Part]]:
-    """A map for each part of each head, by name; a number behind it counts the heads."""
+    """Find a map for each property of each head by name. A number after the name is that of the head."""
     heads = []
     for number, classes in enumerate(counts):
         head = {}
@@ -405,7 +422,7 @@ def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParam
                     f"no output{several} is called {' or '.join(names)}, as a network of centres has it "
                     "(one of anchors needs objects.anchors)"
                 )
-            # Behind the values, some have as many of how sure they are.
+            # Some maps have as many uncertainties after the values.
             head[key] = Part(
                 _map(outputs, name, (count, 2 * count) if channels else (count,), params), 0, count
             )
@@ -414,7 +431,7 @@ def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParam
 
 
 def _named(outputs: Mapping[str, Any], names: tuple[str, ...], number: int, of: int) -> str | None:
-    """The output that has one of these names, after the name of a graph and before the number of the head."""
+    """Return the output with one of these names, between an optional graph name and head number."""
     found = []
     for output in outputs:
         match = re.fullmatch(r"(?:.*[./])?(.+?)(?:[_.]?(\d+))?", output)
@@ -432,7 +449,7 @@ def _named(outputs: Mapping[str, Any], names: tuple[str, ...], number: int, of: 
 def _joined(
     outputs: Mapping[str, Any], counts: list[int], params: PillarParams
 ) -> list[dict[str, Part]] | None:
-    """Three maps with the channels of all heads behind one another, as mmdeploy exports them."""
+    """Find three maps with the channels of all heads one after the other, as mmdeploy exports them."""
     names = {
         role: [o for o in outputs if re.fullmatch(rf"{role}\d*", o)]
         for role in ("cls_score", "bbox_pred", "dir_cls_pred")
@@ -443,7 +460,7 @@ def _joined(
     score = _map(outputs, names["cls_score"][0], (sum(counts),), params)
     box = _map(outputs, names["bbox_pred"][0], (6 * heads, 8 * heads), params)
     turn = _map(outputs, names["dir_cls_pred"][0], (2 * heads,), params)
-    each = np.shape(outputs[box.name])[3 if box.last else 1] // heads  # 8: with a speed
+    each = np.shape(outputs[box.name])[3 if box.last else 1] // heads  # 8 channels include a velocity
     found = []
     for number, count in enumerate(counts):
         first = number * each

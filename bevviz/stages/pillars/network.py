@@ -1,4 +1,4 @@
-"""A 3D detector on pillars: a cloud in, boxes out, by one ONNX file or two."""
+"""A 3D detector on pillars: a cloud in, boxes out, with one ONNX file or two."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from bevviz.stages.pillars.nms import survivors
 
 FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
-PROBED = 8  # points that it is shown at first
-LONGEST = 200.0  # metres: what is longer is no object
-FARTHEST = 10_000.0  # metres: no LiDAR reaches as far
+PROBED = 8  # points of the first test cloud
+LONGEST = 200.0  # metres: a longer box is no object
+FARTHEST = 10_000.0  # metres: no LiDAR reaches farther
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What a network said of a cloud, before any threshold.
+    """Output of a network for one cloud, before any threshold.
 
     Attributes:
         outputs: name -> array.
-        left_out_points: that found their pillar full.
-        left_out_pillars: that found the cloud full.
+        left_out_points: number of points dropped because their pillar was full.
+        left_out_pillars: number of pillars dropped because the maximum was reached.
     """
 
     outputs: Mapping[str, Any]
@@ -42,24 +42,24 @@ class Answer:
 
 
 class PillarNetwork:
-    """The files of a 3D detector, and what they are shown.
+    """ONNX files of a 3D detector, with the preparation of their inputs.
 
-    One file takes pillars (N, points, features), and as they are needed the number of points in each (N,)
-    and its cell (N, 4), batch z y x, or (N, 3). Of two files the encoder takes the pillars alone and answers
-    with (N, channels); these are laid out on the grid for the other, [1, channels, y, x].
+    One file takes pillars (N, points, features), and optionally the number of points in each (N,) and its
+    cell (N, 4), batch z y x, or (N, 3). With two files the encoder takes only the pillars and returns (N,
+    channels). These are laid out on the grid [1, channels, y, x] for the second file.
 
     Args:
-        path: ONNX file; with ``params.encoder`` that of the second part.
-        params: of these, those in ``FED`` and ``encoder``.
+        path: ONNX file; with ``params.encoder`` the file of the second part.
+        params: only the parameters in ``FED`` and ``encoder`` are used.
         provider: onnxruntime execution provider, as ``detector.provider``.
         threads: as ``detector.threads``.
 
     Attributes:
-        provider: in use, such as ``CPU``.
-        probe: what it answers to a few points.
+        provider: execution provider in use, such as ``CPU``.
+        probe: output for a few points.
 
     Raises:
-        UserError: no such file, no ONNX file, or it takes what does not fit the parameters.
+        UserError: the file is missing or no ONNX file, or its inputs do not fit the parameters.
     """
 
     def __init__(self, path: Path, params: PillarParams, provider: str, threads: int) -> None:
@@ -80,7 +80,7 @@ class PillarNetwork:
             raise UserError(
                 f"{at}: takes {self._fixed} pillars, no more and no less; export it with that axis dynamic"
             )
-        # Several pillars: OpenPCDet's encoder loses an axis where there is one.
+        # The probe has several pillars, because OpenPCDet's encoder loses an axis with a single one.
         across = np.linspace(params.point_range[:3], params.point_range[3:], PROBED + 2)[1:-1]
         self.probe = self.infer((across - [0, 0, params.z_offset]).astype(np.float32))
 
@@ -89,7 +89,7 @@ class PillarNetwork:
 
         Args:
             points: (N, 3) float32, upright, in metres.
-            intensity: (N,) of the points, None: there is none.
+            intensity: (N,) of the points, or None.
 
         Raises:
             UserError: the network fails.
@@ -114,6 +114,7 @@ class PillarNetwork:
         return Answer(outputs, pillars.left_out_points, pillars.left_out_pillars)
 
     def _run(self, pillars: Pillars) -> dict[str, Any]:
+        """Run the file or both files on pillars. Return the outputs by name."""
         given = {}
         for role, wanted in self._inputs.items():
             if role == "pillars":
@@ -145,7 +146,7 @@ class PillarNetwork:
         return self._session.run({self._canvas.name: canvas.astype(NUMBERS[self._canvas.type], copy=False)})
 
     def _fitting(self, pillars: Any, at: str) -> tuple[int, int]:
-        """Points of a pillar, and how many pillars it takes, 0: any number."""
+        """Return the number of points of a pillar and the number of pillars, 0 for any number."""
         count, points, features = pillars.shape
         params = self._params
         if isinstance(features, int) and features != len(params.features):
@@ -173,7 +174,7 @@ class PillarNetwork:
         return points, count if isinstance(count, int) else 0
 
     def _check_canvas(self) -> Any:
-        """The input of the second file."""
+        """Return the input of the second file."""
         inputs, (nx, ny) = self._session.inputs, self._params.grid
         shape = inputs[0].shape
         given = listed((i.name, i.shape) for i in inputs)
@@ -194,11 +195,11 @@ class PillarNetwork:
 
 
 class ObjectNetwork:
-    """What a network on pillars answers, read as boxes.
+    """Decoder of a pillar network's outputs to boxes.
 
     Args:
-        network: the files.
-        params: thresholds, and how the outputs are to be read.
+        network: the network.
+        params: thresholds, and how to read the outputs.
 
     Raises:
         UserError: the outputs do not fit the parameters.
@@ -209,27 +210,30 @@ class ObjectNetwork:
         self._params = params
         with reading(network.where):
             self._head = find_head(network.probe.outputs, params)
-        self.interpret(network.probe)  # compiles what the first cloud needs, too
+        self.interpret(network.probe)  # also compiles the kernels for the first cloud
 
     @property
     def names(self) -> tuple[str, ...]:
-        """That it knows."""
+        """Class names of the network."""
         return self._params.classes
 
     def __call__(self, points: F32, intensity: F32 | None = None) -> tuple[Boxes3D, F32, list[str]]:
-        """Boxes in the frame of the points, best first, their scores, and the names of their classes.
+        """Detect objects in a cloud.
 
         Args:
             points: (N, 3) float32, upright, in metres.
-            intensity: (N,) of the points, None: there is none.
+            intensity: (N,) of the points, or None.
+
+        Returns:
+            Boxes in the frame of the points, best first, their scores, and their class names.
 
         Raises:
-            UserError: the network fails, or answers with what it should not.
+            UserError: the network fails or returns impossible numbers.
         """
         return self.interpret(self.network.infer(points, intensity))
 
     def interpret(self, answer: Answer) -> tuple[Boxes3D, F32, list[str]]:
-        """What the thresholds make of the network's answer; ``__call__`` says what."""
+        """Apply the thresholds to the network's output. The result is that of ``__call__``."""
         params, where = self._params, self.network.where
         if answer.left_out_pillars:
             tell(
@@ -258,16 +262,17 @@ class ObjectNetwork:
 
 
 def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession:
+    """Open the session of one file."""
     if not path.is_file():
         raise UserError(f"{where}: no such file")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as the detector
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as in the 2D detector
     return open_session(path, provider, options, where)
 
 
 def _inputs(session: NetworkSession, where: str, *, alone: bool) -> dict[str, Any]:
-    """role -> input, by the number of its axes."""
+    """Return role -> input. The number of axes of an input determines its role."""
     inputs = session.inputs
     given = listed((i.name, i.shape) for i in inputs)
     found: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Greedy non-maximum suppression of boxes that are turned, seen from above."""
+"""Greedy non-maximum suppression of rotated boxes, seen from above."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from bevviz.support.kernel import kernel
 
 
 def survivors(boxes: F64, group: I64, iou: float, distance: float) -> Bool:
-    """Which boxes no better one of their group suppresses.
+    """Return which boxes survive greedy suppression within their group.
+
+    Suppression by distance comes first, as in Autoware. A box that it removes suppresses nothing more.
 
     Args:
         boxes: (K, 7) x, y, z, length, width, height, yaw, best score first.
         group: (K,) only boxes of the same group suppress each other.
-        iou: intersection over union, seen from above, that a weaker box goes above; 1: none goes.
-        distance: metres between the centres, seen from above, that a weaker box goes below; 0: none goes.
+        iou: intersection over union seen from above; a weaker box above it is suppressed. 1 disables this.
+        distance: metres between the centres seen from above; a weaker box below it is suppressed. 0 disables
+            this.
 
     Returns:
-        (K,) those that stay. By distance first, as Autoware does; what went so suppresses nothing more.
+        (K,) mask of survivors.
     """
     alive = np.ones(len(boxes), np.bool_)
     flat = np.ascontiguousarray(boxes[:, [0, 1, 3, 4, 6]], np.float64)
@@ -31,6 +34,7 @@ def survivors(boxes: F64, group: I64, iou: float, distance: float) -> Bool:
 
 @kernel
 def _by_distance(boxes: F64, group: I64, distance: float, alive: Bool) -> None:
+    """Suppress boxes whose centre is near that of a better box."""
     for i in range(len(boxes)):
         if not alive[i]:
             continue
@@ -43,6 +47,7 @@ def _by_distance(boxes: F64, group: I64, distance: float, alive: Bool) -> None:
 
 @kernel
 def _by_overlap(boxes: F64, group: I64, threshold: float, alive: Bool) -> None:
+    """Suppress boxes that overlap a better box."""
     n = len(boxes)
     outline = np.empty((n, 4, 2))
     reach = np.empty(n)
@@ -71,7 +76,10 @@ def _by_overlap(boxes: F64, group: I64, threshold: float, alive: Bool) -> None:
 
 @kernel
 def _shared(a: F64, b: F64) -> float:
-    """Area that two counter-clockwise quadrangles share (Sutherland and Hodgman 1974, shoelace formula)."""
+    """Return the common area of two counter-clockwise quadrangles.
+
+    Sutherland and Hodgman 1974 for the clipping, the shoelace formula for the area.
+    """
     polygon, clipped = np.empty((16, 2)), np.empty((16, 2))
     polygon[:4] = a
     count = 4
