@@ -1,4 +1,4 @@
-"""Synthetic drive: a street, its traffic, and sensors by ray casting. Imports `bags` and below."""
+"""Synthetic drive: a street, its traffic, and sensors by ray casting. It imports `bags` and below."""
 
 from bevviz.synthetic.bag import BagWriter, write_bag
 from bevviz.synthetic.drive import Snapshot, SyntheticSource

@@ -1,4 +1,4 @@
-"""The drive as a real MCAP bag, with the topics of the ROS 2 tutorial pipeline."""
+"""Write the drive as an MCAP bag with the topics of the ROS 2 tutorial pipeline."""
 
 from __future__ import annotations
 
@@ -50,10 +50,12 @@ ODOMETRY_PERIOD = 20_000_000  # nanoseconds
 
 
 class BagWriter:
-    """Context manager: ``write`` each frame of ``source`` in order; the file appears when all went well.
+    """Context manager that writes frames to a bag. The file appears only if there was no error.
+
+    Call ``write`` for each frame of ``source`` in order.
 
     Args:
-        source: whose poses and calibration are written beside the frames.
+        source: its poses and calibration are written beside the frames.
         path: the ``.mcap`` file to make.
 
     Raises:
@@ -80,17 +82,18 @@ class BagWriter:
         self._writer.__exit__(kind, error, trace)
 
     def write(self, frame: Frame) -> None:
-        """Append one frame, with odometry and transforms up to the next one."""
+        """Append one frame, with odometry and transforms up to the next frame."""
         for topic, received, message in messages(self._source, frame):
             self._put(topic, received, message)
 
     def _put(self, topic: str, received: int, message: Any) -> None:
+        """Append one message."""
         data = typestore().serialize_cdr(message, TOPICS[topic])
         self._writer.write(self._connections[topic], received, data)
 
 
 def mounting(source: SyntheticSource) -> Any:
-    """The message of /tf_static."""
+    """Return the message of /tf_static."""
     edges = [
         (drive.BASE, drive.LIDAR_FRAME, source.base_from_lidar),
         (drive.BASE, drive.CAMERA_FRAME, source.base_from_camera),
@@ -99,7 +102,7 @@ def mounting(source: SyntheticSource) -> Any:
 
 
 def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]]:
-    """Topic, time of receipt and message of all that belongs to a frame, up to the next one, in order."""
+    """Return topic, time of receipt and message of a frame and the time up to the next frame, in order."""
     cloud, camera, truth = frame.clouds[0], frame.cameras[0], frame.truth
     found = [(drive.LIDAR_TOPIC, cloud.received, encode_cloud(cloud))]
     for stamp in range(frame.stamp, frame.stamp + drive.PERIOD, ODOMETRY_PERIOD):
@@ -118,6 +121,7 @@ def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]
 
 
 def _poses(source: SyntheticSource, stamp: int) -> list[tuple[str, int, Any]]:
+    """Return the transforms and the odometry at a stamp."""
     odom_from_map = geometry.inverse(source.map_from_odom)
     pose = odom_from_map @ source.map_from_base(stamp)
     later = odom_from_map @ source.map_from_base(stamp + 1_000_000)
@@ -132,7 +136,7 @@ def write_bag(source: SyntheticSource, path: Path, frames: Iterable[Frame] | Non
     Args:
         source: the drive.
         path: the ``.mcap`` file to make.
-        frames: the source's frames, where the caller already iterates them (under a progress bar, say).
+        frames: the source's frames, if the caller already iterates over them, e.g. with a progress bar.
 
     Raises:
         UserError: ``path`` does not end in .mcap, exists already, or cannot be written.

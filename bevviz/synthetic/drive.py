@@ -1,4 +1,4 @@
-"""The drive as a source of frames."""
+"""Source of frames of the synthetic drive."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ IMAGE_DELAY = 12_000_000  # nanoseconds from a scan to its image
 LATENCY = 8_000_000  # nanoseconds from a stamp to its reception
 TRUTH_RANGE = 80.0  # metres
 GROUND = (Material.ROAD, Material.PAVEMENT, Material.KERB, Material.GRASS)
-# SemanticKITTI's numbers (Behley et al. 2019), in the field 'label' of the points.
+# SemanticKITTI's numbers (Behley et al. 2019), used in the field 'label' of the points.
 SCENERY_LABELS = {Material.ROAD: 40, Material.PAVEMENT: 48, Material.KERB: 49, Material.GRASS: 72}
 OBJECT_LABELS = {"car": 10, "person": 30, "cyclist": 31}
 OTHER_STRUCTURE, OTHER_OBJECT = 52, 99
@@ -53,33 +53,36 @@ OTHER_STRUCTURE, OTHER_OBJECT = 52, 99
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A frame, with what only a simulator knows. Object numbers are those of the world's actors."""
+    """A frame with ground truth of a simulator. Object numbers are those of the world's actors."""
 
     frame: Frame
     truth_object: I32  # (K,) number of the object of each box in Frame.truth
-    truth_hits: I32  # (K,) LiDAR points on that object: one with few or none is hidden
+    truth_hits: I32  # (K,) LiDAR points on that object; few or none mean that it is hidden
     point_object: I32  # (N,) object of each point in Frame.points, 0: scenery
     point_ground: Bool  # (N,) road, kerb, pavement or grass
     pixel_object: I32  # (H, W) object of each pixel, 0: scenery, -1: sky
 
 
 class SyntheticSource:
-    """A vehicle drives down a street, at 10 Hz: a source of frames with exact ground truth.
+    """Source of frames with exact ground truth: a vehicle drives down a street, with 10 Hz.
 
-    The scan is one instant (free of motion distortion); the image is taken ``IMAGE_DELAY`` later, so that
-    projection needs motion compensation. The same arguments give the same frames, each of them whatever
-    was asked for before and however long the drive is.
+    A scan is taken at one instant, without motion distortion. The image is taken ``IMAGE_DELAY`` later, so
+    that projection needs motion compensation. The same arguments give the same frames. A frame depends
+    neither on the frames requested before nor on the length of the drive.
 
     Args:
-        frames: length of the drive.
-        seed: of street, traffic, light and sensor noise.
+        frames: number of frames of the drive.
+        seed: seed of street, traffic, light and sensor noise.
         plant: names of faults to plant, see ``bevviz.synthetic.faults``.
-        weave: the vehicle swerves, brakes and speeds up, as to calibrate its sensors with.
-        camera_error: (4, 4) true_camera_from_stated_camera, how wrong the stated mounting of the camera is.
+        weave: whether the vehicle swerves, brakes and speeds up, as for the calibration of its sensors.
+        camera_error: (4, 4) true_camera_from_stated_camera, the error of the stated camera mounting.
         image_late: seconds by which the stamps of the images are late.
+        lidar: the LiDAR; None: a HDL-64E.
+        camera: the camera; None: a ZED 2.
 
     Raises:
-        UserError: ``frames`` below 1, ``seed`` below 0, no such fault, or a drive too short for it.
+        UserError: ``frames`` is below 1, ``seed`` below 0, a fault is unknown, or the drive is too short for
+        it.
     """
 
     def __init__(
@@ -111,7 +114,7 @@ class SyntheticSource:
         self.warnings: tuple[str, ...] = ()
         self.base_from_lidar = geometry.transform(np.array([0.2, 0.0, 1.9]), np.array([0, 0, 0, 1.0]))
         self._base_from_true_camera = optical((0.7, 0.06, 1.55), np.radians(3.0))
-        self.base_from_camera = self._base_from_true_camera  # as stated
+        self.base_from_camera = self._base_from_true_camera  # the stated mounting
         if camera_error is not None:
             self.base_from_camera = self.base_from_camera @ camera_error
         for fault in faults.find_sensors(plant):
@@ -124,24 +127,27 @@ class SyntheticSource:
 
     @cached_property
     def world(self) -> World:
+        """The world of this seed."""
         scenes = [(fault.time, fault.scene) for fault in self.faults]
         return World(self.seed, self.total * PERIOD * 1e-9, scenes, weave=self._weave)
 
     @cached_property
     def _static(self) -> Callable[[int], Caster]:
-        """The scenery around a section of the street; a scan and its image may be in two."""
+        """Caster of the scenery around a section. Two are cached: scan and image may be in two sections."""
         return lru_cache(maxsize=2)(lambda section: Caster(self.world.static(section)))
 
     @property
     def intrinsics(self) -> Intrinsics:
+        """Intrinsics of the camera."""
         return self._camera.intrinsics
 
     @cached_property
     def map_from_odom(self) -> F64:
-        """Odometry starts at zero where the drive starts."""
+        """Pose of the odometry's origin: the vehicle's pose at the start."""
         return self.world.ego(0.0)
 
     def map_from_base(self, stamp: int) -> F64:
+        """Return the (4, 4) pose of the vehicle at a stamp."""
         return self.world.ego((stamp - START) * 1e-9)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -150,14 +156,14 @@ class SyntheticSource:
 
     @property
     def scans(self) -> I64:
-        """(N,) when each scan is received, in nanoseconds."""
+        """(N,) time of receipt of each scan, in nanoseconds."""
         return START + LATENCY + PERIOD * np.arange(self.total, dtype=np.int64)
 
     def number_at(self, time: str | float) -> int:
-        """Number of the scan that is nearest to a time in seconds from the start.
+        """Return the number of the scan nearest to a time in seconds from the start.
 
         Raises:
-            UserError: no number, or outside the drive.
+            UserError: the time is no number or outside the drive.
         """
         try:
             number = round(float(time) * 1e9 / PERIOD)
@@ -170,20 +176,20 @@ class SyntheticSource:
         return number
 
     def frame(self, number: int) -> Frame:
-        """One frame, whatever was asked for before.
+        """Return one frame, in any order.
 
         Raises:
-            UserError: there is none of that number.
+            UserError: no frame has this number.
         """
         if not 0 <= number < self.total:
             raise UserError(f"frame {number}: the drive has {self.total} scans, counted from 0")
         return self.snapshot(number).frame
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file is open."""
 
     def snapshot(self, index: int) -> Snapshot:
-        """Frame ``index``, made anew."""
+        """Render frame ``index`` with its ground truth."""
         rng = np.random.default_rng((self.seed, index))
         stamp = START + index * PERIOD
         shot = stamp + IMAGE_DELAY
@@ -195,7 +201,9 @@ class SyntheticSource:
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
         scan = self._lidar.scan(View(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng)
-        ahead = map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]  # what is far behind casts no shadow here
+        ahead = (
+            map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]
+        )  # objects far behind cast no shadow into the image
         scenery = self._static(self.world.section(at_image))
         seen = View(scenery, self.world.moving(at_image, ahead, 70.0))
         picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
@@ -237,7 +245,7 @@ class SyntheticSource:
         return Snapshot(frame, numbers, hits.astype(np.int32), scan.object, ground, picture.object)
 
     def _labels(self, scan: Scan) -> NDArray[np.uint16]:
-        """(N,) what each point is of."""
+        """Return the (N,) semantic label of each point."""
         scenery = np.full(len(Material), OTHER_STRUCTURE, np.uint16)
         for material, number in SCENERY_LABELS.items():
             scenery[material] = number
@@ -248,7 +256,10 @@ class SyntheticSource:
         return np.where(scan.object > 0, of_object[scan.object], scenery[scan.material])
 
     def _truth(self, stamp: int, time: float, map_from_lidar: F64) -> tuple[LabelledBoxes3D, I32]:
-        """Tight boxes, upright in the LiDAR's frame, around every actor in range, hidden or not."""
+        """Return tight boxes around every actor in range, hidden or not, and the (K,) actor numbers.
+
+        The boxes are upright in the LiDAR's frame.
+        """
         lidar_from_map = geometry.inverse(map_from_lidar)
         objects = self.world.objects(time, map_from_lidar[:3, 3], TRUTH_RANGE)
         yaw = np.array([heading for _, _, heading in objects]) - geometry.yaw(map_from_lidar)

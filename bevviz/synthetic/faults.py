@@ -1,7 +1,7 @@
-"""What is wrong with a drive, planted on purpose: scenes that perception gets wrong, and sensors that lie.
+"""Faults planted in a drive: scenes that perception misjudges, and wrongly stated sensors.
 
-A scene is real geometry that both sensors see and that the ground truth holds; nothing is pretended. A faulty
-sensor sees the world as it is; what is stated of its mounting or of its time is wrong.
+A scene is real geometry that both sensors see and that the ground truth contains. A faulty sensor sees the
+world as it is, but its stated mounting or its stated time is wrong.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from bevviz.synthetic.world import Stage
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a drive.
+    """Scene that perception misjudges.
 
     Attributes:
-        description: what is there and who is fooled by it.
+        description: the scene, and the stage or preset that misjudges it.
         time: seconds into the drive at which it is seen best.
-        scene: puts it into the world; it is called with a stage that is clear of others at that time.
+        scene: function that adds it to the world. Its stage is clear of other actors at that time.
     """
 
     description: str
@@ -33,22 +33,24 @@ class Fault:
 
 
 def _hidden_person(stage: Stage) -> None:
-    """A van parked on the right; straight behind it, as seen from the sensors, somebody stands."""
+    """Add a van parked on the right, and a person directly behind it as seen from the sensors."""
     stage.add("car", models.car(stage.rng, "van"), 12.0, -5.0)
     stage.add("person", models.person(stage.rng, walking=False), 16.3, -5.2, turn=np.pi / 2)
 
 
 def _flat_car(stage: Stage) -> None:
+    """Add a car half a metre high."""
     stage.add("car", models.car(stage.rng, "saloon").scaled((0.7, 0.7, 0.33)), 10.0, -4.6)
 
 
 def _merged_people(stage: Stage) -> None:
+    """Add two people a hand's breadth apart."""
     for lateral in (-4.6, -3.75):
         stage.add("person", models.person(stage.rng, walking=False, child=False), 10.0, lateral, turn=np.pi)
 
 
 def _shared_box(stage: Stage) -> None:
-    """The cabinet is as tall as a person, and no object that anybody looks for."""
+    """Add a person beside a cabinet of the same height. The cabinet has no class."""
     stage.add("person", models.person(stage.rng, walking=False, child=False), 9.0, -4.2, turn=np.pi)
     stage.place(models.litter_bin(stage.rng).moved(np.diag([1.2, 1.2, 1.7, 1.0])), 10.5, -5.4)
 
@@ -75,10 +77,10 @@ FAULTS: Mapping[str, Fault] = {
 
 @dataclass(frozen=True, slots=True)
 class SensorFault:
-    """What is stated wrongly, in frames and bag alike.
+    """Wrong statement about a sensor, in frames and bag alike.
 
     Attributes:
-        description: what is wrong.
+        description: the error.
         camera_error: translation in metres and quaternion x y z w of true_camera_from_stated_camera.
         image_late: seconds by which the stamps of the images are late.
     """
@@ -101,19 +103,19 @@ SENSOR_FAULTS: Mapping[str, SensorFault] = {
 
 
 def find_sensors(names: Sequence[str]) -> list[SensorFault]:
-    """Those among the names that are keys of ``SENSOR_FAULTS``."""
+    """Return the sensor faults among these names."""
     return [SENSOR_FAULTS[name] for name in names if name in SENSOR_FAULTS]
 
 
 def find(names: Sequence[str], duration: float) -> list[Fault]:
-    """The scenes of these names.
+    """Return the scenes with these names.
 
     Args:
-        names: keys of ``FAULTS``; those of ``SENSOR_FAULTS`` are left out.
+        names: keys of ``FAULTS``; keys of ``SENSOR_FAULTS`` are skipped.
         duration: seconds of the drive.
 
     Raises:
-        UserError: unknown name, or the drive ends before the fault is seen.
+        UserError: a name is unknown, or the drive ends before the fault is seen.
     """
     found = []
     for name in names:

@@ -1,6 +1,6 @@
-"""Triangle meshes and the few primitives that the street is built from.
+"""Triangle meshes and the primitives that the street is built from.
 
-Every solid is a loft: closed rings of equally many vertices, joined one to the next and capped.
+Every solid is a loft: closed rings with equal numbers of vertices, joined one to the next and capped.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from bevviz.model.frame import F32, F64, I32, U8
 
 
 class Material(IntEnum):
+    """Surface material. It determines pattern, texture and reflectance."""
+
     ROAD = 0
     PAVEMENT = 1
     KERB = 2
@@ -36,17 +38,21 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
+    """Triangles with colours, materials and object numbers."""
+
     vertices: F32  # (V, 3)
-    uv: F32  # (V, 2) metres over the surface, where its material has a pattern
+    uv: F32  # (V, 2) metres over the surface, for materials with a pattern
     triangles: I32  # (T, 3)
     color: U8  # (T, 3) BGR
     material: U8  # (T,) Material
     object: I32  # (T,) number of the object, 0: scenery
 
     def moved(self, a_from_b: F64) -> Mesh:
+        """Return the mesh in another frame."""
         return replace(self, vertices=geometry.apply(a_from_b, self.vertices))
 
     def numbered(self, number: int) -> Mesh:
+        """Return the mesh with this object number."""
         return replace(self, object=np.full(len(self.triangles), number, np.int32))
 
 
@@ -57,6 +63,7 @@ def build(
     material: Material,
     uv: ArrayLike | None = None,
 ) -> Mesh:
+    """Make a mesh of one colour and material."""
     v, t = np.asarray(vertices, np.float32), np.asarray(triangles, np.int32)
     return Mesh(
         vertices=v,
@@ -69,6 +76,7 @@ def build(
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
+    """Merge meshes to one."""
     if not meshes:
         return build(np.zeros((0, 3)), np.zeros((0, 3)), (0, 0, 0), Material.ROAD)
     first = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -83,7 +91,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def loft(rings: ArrayLike, color: Sequence[int], material: Material, closed: bool = False) -> Mesh:
-    """Join (R, n, 3) rings; ``closed`` joins the last to the first, otherwise both ends are capped."""
+    """Join (R, n, 3) rings. ``closed`` joins the last to the first, otherwise both ends are capped."""
     r = np.asarray(rings, np.float32)
     count, n = r.shape[:2]
     ring = np.arange(count if closed else count - 1)[:, None]
@@ -102,7 +110,7 @@ def loft(rings: ArrayLike, color: Sequence[int], material: Material, closed: boo
 
 
 def grid(points: ArrayLike, uv: ArrayLike, color: Sequence[int], material: Material) -> Mesh:
-    """A surface over (R, n, 3) points, with (R, n, 2) texture coordinates."""
+    """Make a surface over (R, n, 3) points, with (R, n, 2) texture coordinates."""
     p = np.asarray(points, np.float32)
     rows, n = p.shape[:2]
     a = (np.arange(rows - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -118,7 +126,7 @@ def box(
     top: tuple[float, float] = (1.0, 1.0),
     shift: float = 0.0,
 ) -> Mesh:
-    """A box whose top is scaled by ``top`` in x and y, and moved ahead by ``shift``."""
+    """Make a box whose top is scaled by ``top`` in x and y, and moved ahead by ``shift``."""
     half = np.asarray(size, np.float64) / 2
     square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half[:2]
     low = np.column_stack([square, np.full(4, -half[2])])
@@ -134,7 +142,7 @@ def tube(
     material: Material,
     n: int = 8,
 ) -> Mesh:
-    """A cylinder or cone from ``start`` to ``end``."""
+    """Make a cylinder or cone from ``start`` to ``end``."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     axis = (b - a) / np.linalg.norm(b - a)
     side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
@@ -147,6 +155,7 @@ def tube(
 def ellipsoid(
     centre: ArrayLike, radii: ArrayLike, color: Sequence[int], material: Material, n: int = 8, rows: int = 6
 ) -> Mesh:
+    """Make an ellipsoid of ``rows`` rings with ``n`` vertices each."""
     polar = np.linspace(0.02, np.pi - 0.02, rows)[:, None]
     angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
     unit = np.stack(
@@ -158,7 +167,7 @@ def ellipsoid(
 def wheel_rim(
     centre: ArrayLike, radius: float, thickness: float, color: Sequence[int], material: Material
 ) -> Mesh:
-    """A torus about y."""
+    """Make a torus around y."""
     around, across = (
         np.linspace(0, 2 * np.pi, 16, endpoint=False)[:, None],
         np.linspace(0, 2 * np.pi, 4, endpoint=False),

@@ -1,6 +1,6 @@
-"""What stands and moves in the street: cars, people, cyclists, houses, trees, poles.
+"""Models of objects in the street: cars, people, cyclists, houses, trees, poles.
 
-A model stands on z = 0, looks along +x and is centred on the origin.
+A model stands on z = 0, faces +x and is centred on the origin.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ BLACK, DARK, GREY, STEEL, WHITE = (
 
 @dataclass(frozen=True, slots=True)
 class Limb:
-    """A part that swings about y through its pivot, in step with the distance walked."""
+    """A part that swings about y around its pivot, in step with the walked distance."""
 
     mesh: Mesh
     pivot: tuple[float, float, float]
@@ -70,22 +70,25 @@ class Limb:
 
 @dataclass(frozen=True, slots=True)
 class Model:
+    """A road user with moving limbs."""
+
     body: Mesh
     limbs: tuple[Limb, ...] = ()
-    stride: float = 1.4  # metres in which every limb swings once to and fro
+    stride: float = 1.4  # metres for one swing to and fro of every limb
 
     def at(self, distance: float) -> Mesh:
-        """The model after ``distance`` metres."""
+        """Return the mesh after ``distance`` metres."""
         return merge(
             [self.body, *(limb.mesh.moved(_swing(limb, distance / self.stride)) for limb in self.limbs)]
         )
 
     def scaled(self, factors: tuple[float, float, float]) -> Model:
-        """Stretched along x, y and z; for models without limbs."""
+        """Return the model stretched along x, y and z. It must not have limbs."""
         return replace(self, body=self.body.moved(np.diag([*factors, 1.0])))
 
 
 def _swing(limb: Limb, cycles: float) -> F64:
+    """Return the (4, 4) rotation of a limb after this number of cycles."""
     angle = limb.amplitude * np.sin(2 * np.pi * cycles + limb.phase)
     c, s = np.cos(angle), np.sin(angle)
     m = np.eye(4)
@@ -95,6 +98,7 @@ def _swing(limb: Limb, cycles: float) -> F64:
 
 
 def _pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
+    """Choose one of the colours and vary its brightness."""
     shade = rng.normal(0, 8)
     b, g, r = (int(np.clip(c + shade, 8, 245)) for c in colors[int(rng.integers(len(colors)))])
     return b, g, r
@@ -104,6 +108,7 @@ def _pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
 
 
 def car(rng: np.random.Generator, kind: str = "") -> Model:
+    """Make a car of a random or the given kind."""
     kind = kind or rng.choice(["hatchback", "saloon", "suv", "van"], p=[0.35, 0.3, 0.22, 0.13])
     length, width, height, rear, front = {
         "hatchback": (4.05, 1.76, 1.48, -0.47, 0.22),
@@ -157,6 +162,7 @@ def car(rng: np.random.Generator, kind: str = "") -> Model:
 
 
 def person(rng: np.random.Generator, walking: bool = True, child: bool | None = None) -> Model:
+    """Make an adult or a child."""
     child = rng.random() < 0.12 if child is None else child
     height = rng.normal(1.25, 0.1) if child else np.clip(rng.normal(1.73, 0.09), 1.5, 1.95)
     shirt, trousers, skin = _pick(rng, CLOTHES), _pick(rng, TROUSERS), _pick(rng, SKINS)
@@ -213,6 +219,7 @@ def person(rng: np.random.Generator, walking: bool = True, child: bool | None = 
 
 
 def cyclist(rng: np.random.Generator) -> Model:
+    """Make a cyclist with the bicycle."""
     frame, shirt, trousers = _pick(rng, PAINTS), _pick(rng, CLOTHES), _pick(rng, TROUSERS)
     skin, helmet = _pick(rng, SKINS), _pick(rng, PAINTS)
     saddle, bottom, head, hub_r, hub_f = (
@@ -291,7 +298,10 @@ def cyclist(rng: np.random.Generator) -> Model:
 
 
 def house(rng: np.random.Generator, length: float, depth: float, height: float) -> Mesh:
-    """A house with its front at y = 0 and its back at ``depth``; texture coordinates run along each wall."""
+    """Make a house with its front at y = 0 and its back at ``depth``.
+
+    Texture coordinates run along each wall.
+    """
     wall = _pick(rng, WALLS)
     corner = np.array([(-length / 2, 0.0), (length / 2, 0.0), (length / 2, depth), (-length / 2, depth)])
     parts = []
@@ -321,6 +331,7 @@ def house(rng: np.random.Generator, length: float, depth: float, height: float) 
 
 
 def tree(rng: np.random.Generator) -> Mesh:
+    """Make a tree."""
     height, spread = rng.uniform(4.5, 7.0), rng.uniform(1.2, 1.8)
     green = _pick(rng, ((45, 95, 60), (40, 110, 75), (50, 120, 100)))
     parts = [tube((0, 0, 0), (0, 0, height - spread), (0.16, 0.1), (50, 70, 90), Material.BARK, 7)]
@@ -332,12 +343,13 @@ def tree(rng: np.random.Generator) -> Mesh:
 
 
 def hedge(rng: np.random.Generator, length: float) -> Mesh:
+    """Make a hedge of this length."""
     height, green = rng.uniform(0.9, 1.6), _pick(rng, ((40, 85, 55), (45, 100, 70)))
     return box((0, 0, height / 2), (length, 0.8, height), green, Material.FOLIAGE, (0.98, 0.8))
 
 
 def lamp_post() -> Mesh:
-    """Its arm reaches out along +y."""
+    """Make a lamp post whose arm points along +y."""
     return merge(
         [
             tube((0, 0, 0), (0, 0, 6.5), (0.09, 0.06), GREY, Material.METAL),
@@ -348,6 +360,7 @@ def lamp_post() -> Mesh:
 
 
 def sign(rng: np.random.Generator) -> Mesh:
+    """Make a road sign."""
     color = _pick(rng, ((40, 40, 200), (190, 100, 30), (230, 230, 235)))
     disc = tube((-0.05, 0, 2.4), (-0.08, 0, 2.4), (0.33, 0.33), color, Material.SIGN, 12)
     inner = tube((-0.08, 0, 2.4), (-0.085, 0, 2.4), (0.22, 0.22), WHITE, Material.SIGN, 12)
@@ -355,6 +368,7 @@ def sign(rng: np.random.Generator) -> Mesh:
 
 
 def litter_bin(rng: np.random.Generator) -> Mesh:
+    """Make a litter bin."""
     color = _pick(rng, ((60, 90, 50), (60, 60, 62)))
     lid = box((0, 0, 1.04), (0.62, 0.62, 0.1), DARK, Material.RUBBER, (0.8, 0.9))
     return merge([box((0, 0, 0.5), (0.5, 0.5, 1.0), color, Material.RUBBER, (1.15, 1.15)), lid])

@@ -1,4 +1,4 @@
-"""A LiDAR and a camera that see the same triangles."""
+"""A LiDAR and a camera that see the same triangles by ray casting."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bevviz.support import open3d
 from bevviz.synthetic.mesh import Material, Mesh
 from bevviz.synthetic.world import Light
 
-# Share of the emitted light that comes back, and amplitude of the texture.
+# Share of the emitted light that is reflected, and amplitude of the texture.
 _SURFACE: Mapping[Material, tuple[float, float]] = {
     Material.ROAD: (0.12, 0.14), Material.PAVEMENT: (0.28, 0.2), Material.KERB: (0.35, 0.15),
     Material.GRASS: (0.4, 0.5), Material.FACADE: (0.42, 0.12), Material.ROOF: (0.3, 0.25),
@@ -22,12 +22,12 @@ _SURFACE: Mapping[Material, tuple[float, float]] = {
     Material.CLOTH: (0.33, 0.08), Material.SKIN: (0.45, 0.0), Material.METAL: (0.55, 0.0),
     Material.FOLIAGE: (0.45, 0.7), Material.BARK: (0.25, 0.4), Material.SIGN: (1.0, 0.0),
 }  # fmt: skip
-SIGHT = 130.0  # metres that a camera sees through the haze: less than there is of the street
+SIGHT = 130.0  # metres that a camera sees through the haze, less than the length of street around it
 REFLECTANCE, TEXTURE = np.array([_SURFACE[m] for m in Material], np.float32).T
 
 
 class Caster:
-    """Open3D's RaycastingScene (Embree; Wald et al. 2014) with what each triangle is made of."""
+    """Ray caster of one mesh: Open3D's RaycastingScene (Embree; Wald et al. 2014)."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._core = open3d.load().core
@@ -42,19 +42,21 @@ class Caster:
             )
 
     def cast(self, rays: F32) -> dict[str, NDArray[np.float32]]:
+        """Cast (R, 6) rays. Return Open3D's results by name."""
         return {
             name: value.numpy()
             for name, value in self._scene.cast_rays(self._core.Tensor.from_numpy(rays)).items()
         }
 
     def occluded(self, rays: F32) -> NDArray[np.bool_]:
+        """Return the (R,) mask of rays that hit the mesh."""
         hit: NDArray[np.bool_] = self._scene.test_occlusions(self._core.Tensor.from_numpy(rays)).numpy()
         return hit
 
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """One row for each of the H rays that met something."""
+    """Hits of rays on surfaces: one row for each of the H rays that hit something."""
 
     ray: NDArray[np.intp]  # (H,) row of the ray
     distance: F32  # (H,) metres
@@ -66,12 +68,13 @@ class Hits:
 
 
 class View:
-    """Scenery and moving objects at one time: two casters, so that only the small one is rebuilt."""
+    """Scenery and moving objects at one time. Only the caster of the small mesh is rebuilt."""
 
     def __init__(self, static: Caster, moving: Mesh) -> None:
         self._casters: Sequence[Caster] = (static, Caster(moving)) if len(moving.triangles) else (static,)
 
     def cast(self, rays: F32, reach: float = np.inf) -> Hits:
+        """Cast (R, 6) rays and return the nearest hits within ``reach`` metres."""
         answers = [caster.cast(rays) for caster in self._casters]
         distance = answers[0]["t_hit"]
         nearest = np.zeros(len(rays), np.uint8)
@@ -102,14 +105,16 @@ class View:
         return out
 
     def occluded(self, rays: F32) -> NDArray[np.bool_]:
+        """Return the (R,) mask of rays that hit something."""
         shadow: NDArray[np.bool_] = np.any([caster.occluded(rays) for caster in self._casters], axis=0)
         return shadow
 
 
 def _rays(map_from_sensor: F64, directions: F32) -> F32:
+    """Return (R, 6) origins and directions in the map frame."""
     rays = np.empty((len(directions), 6), np.float32)
     rays[:, :3] = map_from_sensor[:3, 3]
-    # Not a BLAS product: for three columns its threads cost ten times what they compute.
+    # This is no BLAS product: for three columns the threads of BLAS cost ten times the computation.
     np.einsum("ij,kj->ik", directions, map_from_sensor[:3, :3].astype(np.float32), out=rays[:, 3:])
     return rays
 
@@ -119,6 +124,8 @@ def _rays(map_from_sensor: F64, directions: F32) -> F32:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
+    """Points of one LiDAR scan."""
+
     xyz: F32  # (N, 3) in the LiDAR's frame, in firing order
     intensity: F32  # (N,) 0 to 255
     ring: NDArray[np.uint16]  # (N,) beam, 0 is the lowest
@@ -152,13 +159,14 @@ class Lidar:
         object.__setattr__(self, "_directions", np.stack(unit, -1).reshape(-1, 3).astype(np.float32))
 
     def scan(self, view: View, map_from_lidar: F64, rng: np.random.Generator) -> Scan:
+        """Scan the view from this pose."""
         rays = _rays(map_from_lidar, self._directions)
         hits = view.cast(rays, self.reach)
         facing = np.abs(np.einsum("ij,ij->i", hits.normal, rays[hits.ray, 3:]))
         strength = REFLECTANCE[hits.material] * (0.35 + 0.65 * facing)
         marking = (hits.material == Material.ROAD) & _markings(hits.uv)
         strength[marking] = 0.7
-        # A weak echo is lost the likelier the farther it comes from.
+        # The probability to lose a weak echo grows with its distance.
         noise = rng.standard_normal((3, len(hits.ray)), np.float32)
         kept = np.flatnonzero(strength * 255 * (1 + 0.25 * noise[0]) > (hits.distance / 40.0) ** 2)
         ray, material = hits.ray[kept], hits.material[kept]
@@ -182,17 +190,19 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
+    """Image of a camera with the object of each pixel."""
+
     bgr: U8  # (H, W, 3)
     object: I32  # (H, W) number of the object, 0: scenery, -1: sky
 
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
-    """One ray a pixel: Lambert shading, cast shadows, textures, haze and sensor noise."""
+    """A pinhole camera with one ray a pixel: Lambert shading, shadows, textures, haze and sensor noise."""
 
     width: int = 640
     height: int = 360
-    focal: float = 440.0  # pixels, as a ZED 2 with its 4 mm lens
+    focal: float = 440.0  # pixels, as for a ZED 2 with its 4 mm lens
     _directions: F32 = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -203,12 +213,14 @@ class PinholeCamera:
 
     @property
     def intrinsics(self) -> Intrinsics:
+        """Intrinsics without distortion."""
         f, cx, cy = self.focal, (self.width - 1) / 2, (self.height - 1) / 2
         return Intrinsics(
             self.width, self.height, np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), "plumb_bob", np.zeros(5)
         )
 
     def picture(self, view: View, map_from_camera: F64, light: Light, rng: np.random.Generator) -> Picture:
+        """Render the view from this pose."""
         import cv2
 
         rays = _rays(map_from_camera, self._directions)
@@ -240,7 +252,7 @@ class PinholeCamera:
 
 
 def _noise(seed: int) -> F32:
-    """A (256, 256) tile of smooth noise in -1 to 1 that repeats without a seam."""
+    """Return a (256, 256) tile of smooth noise in -1 to 1 that repeats without a seam."""
     spectrum = np.fft.fft2(np.random.default_rng(seed).standard_normal((256, 256)))
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
     tile = np.fft.ifft2(spectrum / (f + 0.02)).real
@@ -251,25 +263,29 @@ _TILE = _noise(7)
 
 
 def _texture(hits: Hits, point: F32) -> F32:
-    """Brightness around 1 from noise at two scales, laid on the plane that the surface faces most."""
+    """Return the brightness around 1 from noise at two scales, projected along the main axis."""
     flat = np.abs(hits.normal[:, 2]) > 0.7
     wide = np.abs(hits.normal[:, 0]) > np.abs(hits.normal[:, 1])
     p = np.where(flat | ~wide, point[:, 0], point[:, 1])
     q = np.where(flat, point[:, 1], point[:, 2])
-    fade = 1 / (1 + (hits.distance / 25) ** 2)  # finer than a pixel far away
+    fade = 1 / (1 + (hits.distance / 25) ** 2)  # fades patterns that are finer than a pixel
     fine = _TILE[(q * 40).astype(np.int32) & 255, (p * 40).astype(np.int32) & 255] * fade
     coarse = _TILE[(q * 5).astype(np.int32) & 255, (p * 5).astype(np.int32) & 255]
     return np.asarray(1 + TEXTURE[hits.material] * (fine + 0.6 * coarse), np.float32)
 
 
 def _markings(uv: F32) -> NDArray[np.bool_]:
-    """Dashed centre line and the lines of the parking lanes; uv is the way along and across the street."""
+    """Return the mask of the dashed centre line and the lines of the parking lanes.
+
+    ``uv`` is the way along and across the street.
+    """
     s, across = uv[:, 0], np.abs(uv[:, 1])
     dashed: NDArray[np.bool_] = ((across < 0.07) & (s % 6.0 < 3.0)) | (np.abs(across - 4.25) < 0.05)
     return dashed
 
 
 def _paint_road(albedo: F32, hits: Hits) -> None:
+    """Paint markings on the road and joints on the pavement."""
     road = np.flatnonzero(hits.material == Material.ROAD)
     albedo[road[_markings(hits.uv[road])]] = (205, 208, 210)
     slab = np.flatnonzero(hits.material == Material.PAVEMENT)
@@ -279,6 +295,7 @@ def _paint_road(albedo: F32, hits: Hits) -> None:
 
 
 def _paint_facades(albedo: F32, hits: Hits) -> None:
+    """Paint windows on facades."""
     wall = np.flatnonzero(hits.material == Material.FACADE)
     u, v = hits.uv[wall].T
     column, row = u % 2.6, (v - 0.3) % 3.0
@@ -287,12 +304,12 @@ def _paint_facades(albedo: F32, hits: Hits) -> None:
         (column > 0.7) & (column < 1.9) & (row > 0.85) & (row < 2.4) & (np.abs(column - 1.3) > 0.04) & frame
     )
     albedo[wall[frame]] = (215, 218, 220)
-    lot = np.floor(u / 2.6) * 31 + np.floor((v - 0.3) / 3.0) * 17  # each window its own brightness
+    lot = np.floor(u / 2.6) * 31 + np.floor((v - 0.3) / 3.0) * 17  # each window has its own brightness
     albedo[wall[pane]] = np.array([88, 76, 66], np.float32) * (0.7 + 0.6 * ((lot[pane, None] * 0.618) % 1.0))
 
 
 def _reflect(shade: F32, hits: Hits, direction: F32, light: Light) -> None:
-    """Glass and paint mirror the sky, the more so at a grazing angle (Schlick 1994)."""
+    """Mirror the sky in glass and paint, more at a grazing angle (Schlick 1994)."""
     shiny = np.flatnonzero((hits.material == Material.GLASS) | (hits.material == Material.PAINT))
     normal, ray = hits.normal[shiny], direction[shiny]
     facing = np.clip(-np.einsum("ij,ij->i", normal, ray), 0, 1)
@@ -304,6 +321,7 @@ def _reflect(shade: F32, hits: Hits, direction: F32, light: Light) -> None:
 
 
 def _sky(direction: F32, light: Light) -> F32:
+    """Return the (R, 3) colours of the sky in these directions."""
     up = np.clip(direction[:, 2], 0, 1)
     blend = np.sqrt(np.minimum(up * 2.2, 1))[:, None]
     scale = 20 / (up + 0.15)
@@ -314,7 +332,7 @@ def _sky(direction: F32, light: Light) -> F32:
 
 
 def optical(translation: Sequence[float], pitch: float) -> F64:
-    """(4, 4) base_from_optical of a camera that looks ahead, ``pitch`` radians below the horizon."""
+    """Return (4, 4) base_from_optical of a camera that looks ahead, ``pitch`` radians below the horizon."""
     c, s = np.cos(pitch), np.sin(pitch)
     m = geometry.transform(np.asarray(translation), np.array([0, 0, 0, 1.0]))
     m[:3, :3] = np.array([[0, -s, c], [-1, 0, 0], [0, -c, -s]])

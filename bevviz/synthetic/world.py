@@ -1,8 +1,8 @@
-"""The street, who is in it, and where everything is at a given time.
+"""The street, its actors, and the pose of everything at a given time.
 
-What is seen at a time depends on the seed alone, not on how long the drive is: every row of things along the
-street has its own random numbers and is drawn from its beginning on, so that a longer drive only adds to it;
-and the scenery is cut into sections, each of which is all that can be seen from it.
+The view at a time depends only on the seed, not on the length of the drive. Every row of objects along the
+street has its own random numbers and is drawn from its beginning, so that a longer drive only adds objects.
+The scenery is cut into sections. Each section holds everything that is visible from it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from bevviz.model.frame import F32, F64
 from bevviz.synthetic import models
 from bevviz.synthetic.mesh import Material, Mesh, grid, merge
 
-SPEED = 8.0  # metres per second, the ego vehicle's mean
-MARGIN = 140.0  # metres of street before and beyond a section: more than any sensor's range
-SECTION = 60.0  # metres along the street that are driven with the same scenery around
+SPEED = 8.0  # metres per second, mean speed of the ego vehicle
+MARGIN = 140.0  # metres of street before and after a section: more than the range of any sensor
+SECTION = 60.0  # metres along the street that are driven with the same scenery
 ROAD, PAVEMENT, KERB = (
     6.4,
     9.4,
@@ -32,16 +32,16 @@ _PACE = 2 * np.pi / 8.0  # radians per second at which a weaving vehicle brakes 
 
 
 class Street:
-    """A centre line that turns, climbs and falls. ``s`` is the way along it, ``lateral`` to its left.
+    """A centre line with curves and grades. ``s`` is the way along it, ``lateral`` the distance to its left.
 
     Args:
         rng: for its curves and grades.
-        length: metres that are driven from ``s`` = 0; there is more before and beyond.
+        length: metres that are driven from ``s`` = 0. The street begins before and ends after them.
     """
 
     def __init__(self, rng: np.random.Generator, length: float) -> None:
         self.start, self.end = -MARGIN, (length // SECTION + 1) * SECTION + MARGIN
-        beyond = 30.0  # the last house begins before the end
+        beyond = 30.0  # metres: the last house begins before the end
         self.s = np.arange(self.start, self.end + beyond, 0.5)
         wave, phase = rng.uniform((200, 150, 90), (300, 200, 120)), rng.uniform(0, 2 * np.pi, 3)
         grade = rng.uniform(0.035, 0.055) * np.sin(2 * np.pi * self.s / wave[1] + phase[1])
@@ -54,7 +54,7 @@ class Street:
         self.way, self.heading, self.grade = way, heading, grade
 
     def point(self, s: F64 | float, lateral: F64 | float, height: F64 | float = 0.0) -> F64:
-        """(..., 3) points of the map frame."""
+        """Return (..., 3) points in the map frame."""
         x, y, z = (np.interp(s, self.s, column) for column in self.way.T)
         heading = np.interp(s, self.s, self.heading)
         placed = (x - np.sin(heading) * lateral, y + np.cos(heading) * lateral, z + np.asarray(height))
@@ -63,7 +63,10 @@ class Street:
     def pose(
         self, s: float, lateral: float, height: float = 0.0, turn: float = 0.0, upright: bool = True
     ) -> F64:
-        """(4, 4) map_from_body, turned by ``turn``; not ``upright``: pitched with the road's grade."""
+        """Return (4, 4) map_from_body, rotated by ``turn``.
+
+        Unless ``upright``, the body is pitched with the grade of the road.
+        """
         heading, grade = (
             np.interp(s, self.s, self.heading),
             0.0 if upright else np.interp(s, self.s, self.grade),
@@ -79,27 +82,31 @@ class Street:
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """A road user: where it is at time 0, and how it goes along the street."""
+    """A road user: its place at time 0 and its motion along the street."""
 
-    number: int  # from 1, with gaps: the object in meshes and images
+    number: int  # from 1, with gaps: the object number in meshes and images
     label: str
     model: models.Model
     s: float
     lateral: float
     height: float
-    turn: float  # against the street's heading
-    speed: float  # along the street, negative: towards its start
+    turn: float  # relative to the heading of the street
+    speed: float  # along the street; negative towards its start
     upright: bool
 
     def pose(self, street: Street, time: float) -> F64:
+        """Return the (4, 4) pose at a time."""
         return street.pose(self.s + self.speed * time, self.lateral, self.height, self.turn, self.upright)
 
     def mesh(self, street: Street, time: float) -> Mesh:
+        """Return the mesh at a time, in the map frame."""
         return self.model.at(abs(self.speed) * time).moved(self.pose(street, time)).numbered(self.number)
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
+    """Sunlight and colours of the sky."""
+
     sun: F32  # (3,) unit vector to the sun
     direct: F32  # (3,) BGR strength of the sun
     ambient: F32  # (3,) BGR strength of the sky
@@ -108,14 +115,14 @@ class Light:
 
 
 class World:
-    """Everything of one seed: the street with its scenery, and its actors.
+    """The world of one seed: the street with its scenery, and its actors.
 
     Args:
-        seed: of everything that is drawn at random.
+        seed: seed of all random numbers.
         duration: seconds that the ego vehicle drives.
-        scenes: what else is put into it: seconds into the drive, and who puts it there. All else stays as
-            it is without, but for those who are in the way.
-        weave: it swerves, brakes and speeds up; where it is on average stays the same.
+        scenes: additional scenes: seconds into the drive, and the function that adds the scene. Other actors
+            stay the same, except those in the way.
+        weave: whether the ego vehicle swerves, brakes and speeds up. Its mean position stays the same.
     """
 
     def __init__(
@@ -139,7 +146,7 @@ class World:
         rows: list[list[Actor]] = [list(row) for row in _population(seed, self.street, duration)]
         rows.append([actor for stage in stages for actor in stage.actors])
         self.actors = [
-            # Who it is does not change with how many others there are.
+            # The number of an actor does not depend on the number of other actors.
             replace(actor, number=1 + i + k * len(rows))
             for i, row in enumerate(rows)
             for k, actor in enumerate(row)
@@ -156,17 +163,17 @@ class World:
         ]
 
     def section(self, time: float) -> int:
-        """Which section of the street the ego vehicle is in."""
+        """Return the section of the street that the ego vehicle is in."""
         return int(self._way(time) // SECTION)
 
     def static(self, section: int) -> Mesh:
-        """All that does not move, within ``MARGIN`` metres of a section."""
+        """Return the static scenery within ``MARGIN`` metres of a section."""
         start = max(section * SECTION - MARGIN, self.street.start)
         end = (section + 1) * SECTION + MARGIN
         return merge([_ground(self.street, start, end), *(m for s, m in self._scenery if start <= s < end)])
 
     def ego(self, time: float) -> F64:
-        """(4, 4) map_from_base_link: on the road below the middle of the vehicle."""
+        """Return (4, 4) map_from_base_link: on the road below the middle of the vehicle."""
         if self._weave:
             return self._weaving(time)
         s = self._way(time)
@@ -176,24 +183,30 @@ class World:
         return self.street.pose(s, lateral, turn=turn, upright=False)
 
     def _weaving(self, time: float) -> F64:
-        """Between 2 and 14 m/s in 8 s, 0.7 m to either side in 5 s: up to 12 degrees a second."""
+        """Return the pose of a weaving vehicle.
+
+        It varies between 2 and 14 m/s in 8 s, and by 0.7 m to either side in 5 s: up to 12 degrees a second.
+        """
         swing = 2 * np.pi / 5.0
         phase, pace = swing * time + self._sway[1], SPEED + 6.0 * np.cos(_PACE * time)
         turn = np.arctan2(0.7 * swing * np.cos(phase), pace)
         return self.street.pose(self._way(time), -1.7 + 0.7 * np.sin(phase), turn=turn, upright=False)
 
     def _way(self, time: float) -> float:
-        """Metres along the street that the ego vehicle is at."""
+        """Return the position of the ego vehicle in metres along the street."""
         if self._weave:
             return SPEED * time + 6.0 / _PACE * float(np.sin(_PACE * time))
         return SPEED * time + 1.5 * float(np.sin(0.5 * time + self._sway[0]) - np.sin(self._sway[0]))
 
     def moving(self, time: float, centre: F64, reach: float) -> Mesh:
-        """The moving actors within ``reach`` metres of ``centre``."""
+        """Return the meshes of the moving actors within ``reach`` metres of ``centre``."""
         return merge([a.mesh(self.street, time) for a in self._near(time, centre, reach) if a.speed != 0])
 
     def objects(self, time: float, centre: F64, reach: float) -> list[tuple[Actor, Mesh, float]]:
-        """Every actor within ``reach`` metres of ``centre``, its mesh and its heading in the map frame."""
+        """Return every actor within ``reach`` metres of ``centre``, its mesh and its heading.
+
+        Mesh and heading are in the map frame.
+        """
         return [
             (
                 a,
@@ -204,6 +217,7 @@ class World:
         ]
 
     def _near(self, time: float, centre: F64, reach: float) -> list[Actor]:
+        """Return the actors within ``reach`` metres of ``centre``."""
         s = np.array([a.s + a.speed * time for a in self.actors])
         place = self.street.point(s, np.array([a.lateral for a in self.actors]))
         near = (
@@ -215,13 +229,13 @@ class World:
 
 
 class Stage:
-    """The right half of the road ahead of the ego vehicle at one time, for what is to be seen there then.
+    """The right half of the road ahead of the ego vehicle at one time, where a scene is placed.
 
     Args:
         street: the street.
-        way: metres along it that the ego vehicle is at.
+        way: position of the ego vehicle in metres along the street.
         time: seconds into the drive.
-        rng: for what is put there.
+        rng: random numbers of the scene.
     """
 
     AHEAD, RIGHT, LEFT = (-4.0, 19.0), -6.4, 0.0  # metres from the ego vehicle, and from the centre line
@@ -232,17 +246,17 @@ class Stage:
         self.placed: list[Placed] = []
 
     def add(self, label: str, model: models.Model, ahead: float, lateral: float, turn: float = 0.0) -> None:
-        """Somebody who stands ``ahead`` metres in front of the ego vehicle, on the road."""
+        """Add a standing road user ``ahead`` metres in front of the ego vehicle."""
         s, upright = self._way + ahead, label == "person"
         self.actors.append(Actor(0, label, model, s, lateral, 0.0, turn, 0.0, upright))
 
     def place(self, mesh: Mesh, ahead: float, lateral: float) -> None:
-        """Something that nobody looks for."""
+        """Add an object without a class."""
         s = self._way + ahead
         self.placed.append((s, mesh.moved(self._street.pose(s, lateral))))
 
     def is_clear_of(self, actor: Actor) -> bool:
-        """Whether an actor of the street is elsewhere at that time; the others are not let on."""
+        """Return whether an actor of the street is elsewhere at that time. Other actors are removed."""
         ahead = actor.s + actor.speed * self._time - self._way
         return not (self.AHEAD[0] < ahead < self.AHEAD[1] and self.RIGHT < actor.lateral < self.LEFT)
 
@@ -250,18 +264,23 @@ class Stage:
 # --- population --------------------------------------------------------------------------------
 
 SIDES = (-1, 1)
-Placed = tuple[float, Mesh]  # metres along the street, and what begins there
-_TOWN = 1  # chosen so that each planted fault on the street of seed 0 fools those that it is said to fool
+Placed = tuple[float, Mesh]  # metres along the street, and the mesh that begins there
+_TOWN = (
+    1  # chosen so that each planted fault on the street of seed 0 fools the stages named in its description
+)
 
 
 def _stream(seed: int, kind: str, side: int = 0) -> np.random.Generator:
-    """Random numbers of one kind of things alone: what is drawn for others does not change them."""
+    """Return random numbers for one kind of objects. Draws for other kinds do not change them."""
     return np.random.default_rng((_TOWN, seed, zlib.crc32(kind.encode()), side + 1))
 
 
 def _population(seed: int, street: Street, duration: float) -> Iterator[Iterator[Actor]]:
-    """Rows of actors, each in order along the street. Those of a lane share one speed, so that none drives
-    through another; who comes towards the ego vehicle starts from beyond the street's end."""
+    """Yield rows of actors, each in order along the street.
+
+    The actors of a lane share one speed, so that none drives through another. Oncoming actors start from
+    beyond the end of the street.
+    """
 
     def until(speed: float) -> float:
         return street.end + max(0.0, -speed) * duration
@@ -281,6 +300,7 @@ def _population(seed: int, street: Street, duration: float) -> Iterator[Iterator
 
 
 def _spaced(rng: np.random.Generator, start: float, end: float, least: float, most: float) -> Iterator[float]:
+    """Yield positions along the street with random gaps between ``least`` and ``most`` metres."""
     s = start + rng.uniform(0.0, most - least)
     while s < end:
         yield s
@@ -290,10 +310,12 @@ def _spaced(rng: np.random.Generator, start: float, end: float, least: float, mo
 def _actor(
     label: str, model: models.Model, s: float, lateral: float, height: float, turn: float, speed: float = 0.0
 ) -> Actor:
+    """Make an actor without a number."""
     return Actor(0, label, model, s, lateral, height, turn, speed, upright=label == "person")
 
 
 def _parked(rng: np.random.Generator, street: Street, side: int) -> Iterator[Actor]:
+    """Yield parked cars, and people standing in gaps between them."""
     for s in _spaced(rng, street.start + 8, street.end, 5.9, 7.5):
         if rng.random() < 0.48:
             turn = rng.normal(0, 0.02) + (np.pi if (side > 0) ^ (rng.random() < 0.15) else 0)
@@ -310,6 +332,7 @@ def _cars(
     start: float,
     end: float,
 ) -> Iterator[Actor]:
+    """Yield the cars of a lane."""
     for s in chain(first, _spaced(rng, start, end, 20, 60)):
         yield _actor("car", models.car(rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
 
@@ -317,6 +340,7 @@ def _cars(
 def _cyclists(
     rng: np.random.Generator, lateral: float, speed: float, start: float, most: float, end: float
 ) -> Iterator[Actor]:
+    """Yield the cyclists of a lane."""
     for s in _spaced(rng, start, end, 18, most):
         yield _actor("cyclist", models.cyclist(rng), s, lateral, 0.0, 0.0 if speed > 0 else np.pi, speed)
 
@@ -324,6 +348,7 @@ def _cyclists(
 def _walkers(
     rng: np.random.Generator, lateral: float, speed: float, start: float, end: float
 ) -> Iterator[Actor]:
+    """Yield people who walk alone or in pairs."""
     for s in _spaced(rng, start, end, 5, 26):
         turn = 0.0 if speed > 0 else np.pi
         offsets = (0.0, 0.6) if rng.random() < 0.25 else (rng.normal(0, 0.1),)
@@ -334,6 +359,7 @@ def _walkers(
 
 
 def _standing(rng: np.random.Generator, street: Street, side: int) -> Iterator[Actor]:
+    """Yield people who stand on the pavement."""
     for s in _spaced(rng, street.start, street.end, 12, 50):
         turn = rng.uniform(0, 2 * np.pi)
         yield _actor("person", models.person(rng, walking=False), s, side * 7.3, KERB, turn)
@@ -343,6 +369,7 @@ def _standing(rng: np.random.Generator, street: Street, side: int) -> Iterator[A
 
 
 def _light(rng: np.random.Generator) -> Light:
+    """Return a random light of the day."""
     azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(28, 62))
     sun = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     cloudy = rng.random()
@@ -354,6 +381,7 @@ def _light(rng: np.random.Generator) -> Light:
 
 
 def _ground(street: Street, start: float, end: float) -> Mesh:
+    """Return road, kerbs, pavements and grass between two positions along the street."""
     s = np.arange(start, end + 1.0, 2.0)
     strips = (
         ((-60, -25, -PAVEMENT), KERB, (60, 115, 95), Material.GRASS),
@@ -374,6 +402,7 @@ def _ground(street: Street, start: float, end: float) -> Mesh:
 
 
 def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+    """Yield houses, and gaps with hedges and trees."""
     s = street.start
     while s < street.end:
         length = rng.uniform(8, 18)
@@ -390,6 +419,7 @@ def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[Pla
 
 
 def _furniture(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+    """Yield lamps, trees, signs and bins along the pavement."""
     turn = 0 if side < 0 else np.pi
     for s in _spaced(rng, street.start + 2, street.end, 7, 15):
         kind = rng.choice(["lamp", "tree", "sign", "bin"], p=[0.35, 0.35, 0.18, 0.12])
@@ -404,7 +434,10 @@ def _furniture(rng: np.random.Generator, street: Street, side: int) -> Iterator[
 
 
 def bounds(mesh: Mesh, frame_from_map: F64, heading: float) -> tuple[F32, F32]:
-    """Centre and size of the tight upright box, turned by ``heading``, around a mesh of the map frame."""
+    """Return centre and size of the tight upright box around a mesh, rotated by ``heading``.
+
+    The mesh is in the map frame, the box in the frame.
+    """
     points = geometry.apply(frame_from_map, mesh.vertices)
     c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
     turned = np.stack(
