@@ -144,26 +144,26 @@ def _raster(
     density, seen = np.zeros(cells if count else 0, np.int32), np.empty(len(cell), np.int32)
     height = np.full(cells if top else 0, np.nan, np.float32)
     occupancy = np.full(cells if state else 0, UNKNOWN, np.int8)
-    found = _count(cell, density, seen) if count else 0
+    occupied = _count(cell, density, seen) if count else 0
     if top:
         _highest(cell, points, height)
     if state:
         _occupy(cell, ground if len(ground) else np.zeros(len(cell), np.bool_), occupancy)
     shape = -1, columns
-    return density.reshape(shape), height.reshape(shape), occupancy.reshape(shape), seen[:found]
+    return density.reshape(shape), height.reshape(shape), occupancy.reshape(shape), seen[:occupied]
 
 
 @kernel
 def _count(cell: I32, density: I32, seen: I32) -> int:
     """Count the points of each cell. Write the occupied cells to ``seen`` and return their number."""
-    found = 0
+    occupied = 0
     for i in range(len(cell)):
         if cell[i] >= 0:
             # The cell is always written. There is no branch to mispredict.
-            seen[found] = cell[i]
-            found += density[cell[i]] == 0
+            seen[occupied] = cell[i]
+            occupied += density[cell[i]] == 0
             density[cell[i]] += 1
-    return found
+    return occupied
 
 
 @kernel
@@ -260,16 +260,16 @@ def _draw_rich(image: U8, objects: Objects | None, clusters: Clusters | None, co
 def _write_names(image: U8, objects: Objects, outlines: I32, colors: Sequence[Sequence[int]]) -> None:
     """Write each name at a corner of its box, nearest box first. Omit names without free space."""
     rows, columns = image.shape[:2]
-    taken = np.zeros((0, 4), np.int64)
+    occupied = np.zeros((0, 4), np.int64)
     for k in np.argsort(np.hypot(*objects.boxes.center[:, :2].T), kind="stable").tolist():
         text = f"{objects.names[k]} {objects.score[k]:.2f}"
         (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
         (left, top), (right, bottom) = outlines[k].min(axis=0).tolist(), outlines[k].max(axis=0).tolist()
         for u, v in product((right + 4, left - 4 - wide), (top + 4, bottom + high)):
-            place = np.array([u, v - high, u + wide, v + below])
-            inside = place.min() >= 0 and place[2] <= columns and place[3] <= rows
-            if inside and not ((place[:2] < taken[:, 2:]) & (taken[:, :2] < place[2:])).all(axis=1).any():
-                taken = np.vstack([taken, place])
+            area = np.array([u, v - high, u + wide, v + below])
+            inside = area.min() >= 0 and area[2] <= columns and area[3] <= rows
+            if inside and not ((area[:2] < occupied[:, 2:]) & (occupied[:, :2] < area[2:])).all(axis=1).any():
+                occupied = np.vstack([occupied, area])
                 _caption(image, text, (u, v), colors[k])
                 break
 

@@ -10,15 +10,15 @@ from bevviz.model.frame import F64, I64
 from bevviz.support.kernel import kernel
 
 HEADINGS = 36  # headings tried in a half turn; then every degree near the best
-TRIM = 0.02  # share of the points that may lie outside on each side
+STRAY_SHARE = 0.02  # share of the points that may lie outside on each side
 NEAR_SIDE = 0.1  # metres: unit of a point's distance from a side, and tolerance of the box for points outside
-STRAY = 3.0  # largest distance of a point from a side, in NEAR_SIDE
-WEIGHT = 10.0  # all points together count as this many, because points of one surface are not independent
-OUTSIDE = 2.0  # a point outside the box costs this many times the largest distance
+MAX_SIDE_DISTANCE = 3.0  # largest distance of a point from a side, in NEAR_SIDE
+TOTAL_WEIGHT = 10.0  # all points count as this many, because points of one surface are not independent
+OUTSIDE_COST = 2.0  # a point outside the box costs this many times the largest distance
 HIDDEN_SIDE = 0.3  # metres, one sigma: gap between a side that faces the sensor and the nearest point
 EDGE_TAIL = 3.0  # sigmas: beyond them an edge of the image box more likely belongs to an occluder
 MAX_SPREAD = 2.5  # sigmas by which an object may exceed the mean size of its class
-FEW = 128  # points used for a fit, evenly spread
+MAX_FIT_POINTS = 128  # points used for a fit, evenly spread
 
 NO_EDGE = np.inf  # sigma of an edge without information, such as the border of the image
 
@@ -56,7 +56,7 @@ def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about:
     most = np.full(2, longest)
     if known:
         most[0], most[1] = prior[0] + MAX_SPREAD * prior[1], prior[2] + MAX_SPREAD * prior[3]
-    step = (len(points) + FEW - 1) // FEW
+    step = (len(points) + MAX_FIT_POINTS - 1) // MAX_FIT_POINTS
     n = (len(points) + step - 1) // step
     x, y = np.empty(n), np.empty(n)
     for i in range(n):
@@ -75,11 +75,11 @@ def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about:
         _extent(v, most[1], seen[2:])
         sides[0] = _facing(seen[0], seen[1])
         sides[1] = _facing(seen[2], seen[3])
-        base = WEIGHT * _closeness(u, v, seen, sides)
+        base = TOTAL_WEIGHT * _closeness(u, v, seen, sides)
         if base < best:
             if known:
-                many = _sizes(seen[0], seen[1], sides[0], prior[0], prior[1], along)
-                wide = _sizes(seen[2], seen[3], sides[1], prior[2], prior[3], across)
+                many = _full_extents(seen[0], seen[1], sides[0], prior[0], prior[1], along)
+                wide = _full_extents(seen[2], seen[3], sides[1], prior[2], prior[3], across)
             else:
                 along[0], across[0] = (seen[0], seen[1], 0.0), (seen[2], seen[3], 0.0)
                 many = wide = 1
@@ -114,7 +114,7 @@ def _extent(values: F64, most: float, out: F64) -> None:
     If they are more than ``most`` apart, write the densest interval of that length.
     """
     n = len(values)
-    strays = int(TRIM * n)
+    strays = int(STRAY_SHARE * n)
     low, high = np.full(strays + 1, np.inf), np.full(strays + 1, -np.inf)
     for value in values:
         k = strays
@@ -133,12 +133,12 @@ def _extent(values: F64, most: float, out: F64) -> None:
     if out[1] - out[0] <= most:
         return
     ordered = np.sort(values)
-    held, end = 0, 0
+    largest, end = 0, 0
     for begin in range(n):
         while end < n and ordered[end] - ordered[begin] <= most:
             end += 1
-        if end - begin > held:
-            held = end - begin
+        if end - begin > largest:
+            largest = end - begin
             out[0], out[1] = ordered[begin], ordered[end - 1]
 
 
@@ -152,7 +152,7 @@ def _facing(low: float, high: float) -> int:
 def _closeness(u: F64, v: F64, seen: F64, sides: I64) -> float:
     """Return the mean distance of the points from the sides that face the sensor, in NEAR_SIDE.
 
-    The distance of a point is at most STRAY.
+    The distance of a point is at most MAX_SIDE_DISTANCE.
     """
     total = 0.0
     for i in range(len(u)):
@@ -162,9 +162,9 @@ def _closeness(u: F64, v: F64, seen: F64, sides: I64) -> float:
             or v[i] < seen[2] - NEAR_SIDE
             or v[i] > seen[3] + NEAR_SIDE
         ):
-            total += OUTSIDE * STRAY
+            total += OUTSIDE_COST * MAX_SIDE_DISTANCE
             continue
-        off = STRAY * NEAR_SIDE
+        off = MAX_SIDE_DISTANCE * NEAR_SIDE
         if sides[0] != 0:
             off = min(off, abs(u[i] - (seen[0] if sides[0] < 0 else seen[1])))
         if sides[1] != 0:
@@ -174,12 +174,12 @@ def _closeness(u: F64, v: F64, seen: F64, sides: I64) -> float:
 
 
 @kernel
-def _sizes(low: float, high: float, side: int, mean: float, spread: float, out: F64) -> int:
+def _full_extents(low: float, high: float, side: int, mean: float, spread: float, out: F64) -> int:
     """Write candidates for the full extent of an object seen from ``low`` to ``high``. Return their number.
 
     A candidate is a row of beginning, end and cost.
     """
-    found = 0
+    count = 0
     size = high - low
     for k in range(-2, 3):
         whole = mean + k * spread
@@ -193,7 +193,7 @@ def _sizes(low: float, high: float, side: int, mean: float, spread: float, out: 
             behind = hidden if way == 0 else (0.0 if way == 1 else hidden / 2)
             below = behind if side > 0 else hidden - behind
             towards = 0.0 if side == 0 else min((hidden - behind) / HIDDEN_SIDE, 3.0)
-            out[found, 0], out[found, 1] = low - below, high + hidden - below
-            out[found, 2] = 0.5 * z * z + 0.5 * towards * towards
-            found += 1
-    return found
+            out[count, 0], out[count, 1] = low - below, high + hidden - below
+            out[count, 2] = 0.5 * z * z + 0.5 * towards * towards
+            count += 1
+    return count

@@ -7,7 +7,7 @@ import numpy as np
 from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.support.kernel import kernel
 
-DIGIT = 11  # bits per pass of the radix sort; the counters of one pass fit into the first cache
+DIGIT_BITS = 11  # bits per pass of the radix sort; the counters of one pass fit into the first cache
 
 
 def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> tuple[I64, I64]:
@@ -26,7 +26,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
         strides: (3,) for x, y, z. ``keys + offset @ strides`` are the keys at an offset of up to ``reach``
             cells.
     """
-    keys, strides = _pack(points, size, shift, reach)
+    keys, strides = _pack_cells(points, size, shift, reach)
     if strides.any():
         return keys, strides
     # The points are too scattered for 64 bits. Shorten the gaps along each axis to just beyond the reach.
@@ -42,7 +42,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
 
 
 @kernel
-def _pack(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]:
+def _pack_cells(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]:
     """Return the keys and the strides. The strides are zero if the keys do not fit into 64 bits."""
     low, high = bounds(points)
     origin = low - shift * size
@@ -107,7 +107,7 @@ def group(keys: I64) -> tuple[I32, I32]:
     number = np.empty(n, np.int32)
     first = np.empty(n, np.int32)
     seen = np.empty(n, np.int64)
-    found = 0
+    count = 0
     for i in range(n):
         key = keys[i]
         if i > 0 and key == keys[i - 1]:
@@ -117,12 +117,12 @@ def group(keys: I64) -> tuple[I32, I32]:
         while table[slot] >= 0 and seen[table[slot]] != key:
             slot = (slot + 1) & ((1 << bits) - 1)
         if table[slot] < 0:
-            table[slot] = found
-            seen[found] = key
-            first[found] = i
-            found += 1
+            table[slot] = count
+            seen[count] = key
+            first[count] = i
+            count += 1
         number[i] = table[slot]
-    return number, first[:found].copy()
+    return number, first[:count].copy()
 
 
 @kernel
@@ -139,25 +139,25 @@ def sort_by_key(keys: I64) -> tuple[I32, I32]:
     for key in keys:
         highest = max(highest, key)
     while highest >> shift > 0:
-        end = np.zeros((1 << DIGIT) + 1, np.int32)
+        end = np.zeros((1 << DIGIT_BITS) + 1, np.int32)
         for i in range(n):
-            end[((keys[i] >> shift) & ((1 << DIGIT) - 1)) + 1] += 1
-        for k in range(1 << DIGIT):
+            end[((keys[i] >> shift) & ((1 << DIGIT_BITS) - 1)) + 1] += 1
+        for k in range(1 << DIGIT_BITS):
             end[k + 1] += end[k]
         for point in order:
-            digit = (keys[point] >> shift) & ((1 << DIGIT) - 1)
+            digit = (keys[point] >> shift) & ((1 << DIGIT_BITS) - 1)
             other[end[digit]] = point
             end[digit] += 1
         order, other = other, order
-        shift += DIGIT
+        shift += DIGIT_BITS
     start = np.empty(n + 1, np.int32)
-    found = 0
+    groups = 0
     for k in range(n):
         if k == 0 or keys[order[k]] != keys[order[k - 1]]:
-            start[found] = k
-            found += 1
-    start[found] = n
-    return order, start[: found + 1].copy()
+            start[groups] = k
+            groups += 1
+    start[groups] = n
+    return order, start[: groups + 1].copy()
 
 
 @kernel

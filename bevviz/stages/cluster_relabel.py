@@ -13,7 +13,7 @@ from bevviz.stages.clustering import redescribe
 
 
 @dataclass(slots=True)
-class Part:
+class ClaimedPoints:
     """Points that one detection claimed.
 
     Attributes:
@@ -27,8 +27,8 @@ class Part:
     rows: I64
 
 
-def relabelled(
-    points: F32, clusters: Clusters, parts: list[Part], cameras: list[str], config: ClusteringConfig
+def relabel_claimed(
+    points: F32, clusters: Clusters, parts: list[ClaimedPoints], cameras: list[str], config: ClusteringConfig
 ) -> tuple[Clusters, I32, Splits]:
     """Make each part a cluster of its own.
 
@@ -43,13 +43,13 @@ def relabelled(
         counts = np.bincount(clusters.labels[part.rows] + 1)
         sources = np.flatnonzero(counts)
         origins.append((sources - 1, counts[sources]))
-    left = clusters.count.astype(np.int64)
+    remaining = clusters.count.astype(np.int64)
     for sources, counts in origins:
         known = sources >= 0
-        left[sources[known]] -= counts[known]
-    unchanged, alive = left == clusters.count, left > 0
+        remaining[sources[known]] -= counts[known]
+    unchanged, alive = remaining == clusters.count, remaining > 0
     number = np.empty(len(parts), np.int64)
-    made: list[tuple[int, int, int]] = []  # part, source cluster, points
+    moves: list[tuple[int, int, int]] = []  # part, source cluster, points
     for j, (sources, counts) in enumerate(origins):
         pairs = list(zip(sources.tolist(), counts.tolist(), strict=True))
         whole = [(n, k) for k, n in pairs if k >= 0 and n == clusters.count[k]]
@@ -61,8 +61,8 @@ def relabelled(
             number[j] = before + fresh
             fresh += 1
         if not whole or len(pairs) > 1:
-            made += [(j, k, n) for k, n in pairs]
-    if not made:
+            moves += [(j, k, n) for k, n in pairs]
+    if not moves:
         return clusters, np.append(number, -1).astype(np.int32), Splits.none()
 
     labels = clusters.labels.copy()
@@ -75,7 +75,7 @@ def relabelled(
     kept = np.concatenate([np.where(unchanged, np.arange(before), -1), np.full(fresh, -1)])[alive]
     rows = np.append(row[number], -1).astype(np.int32)
     now = redescribe(points, labels, clusters, kept, rows[:-1], config)
-    part_of, source, taken = np.array(made, np.int32).T
+    part_of, source, moved_points = np.array(moves, np.int32).T
     was_noise = source < 0
     return (
         now,
@@ -84,9 +84,11 @@ def relabelled(
             camera=tuple(cameras[parts[j].camera] for j in part_of),
             detection=np.array([parts[j].detection for j in part_of], np.int32),
             cluster=rows[part_of],
-            rest=np.where(~was_noise & (np.append(left, 0)[source] > 0), row[source], -1).astype(np.int32),
+            rest=np.where(~was_noise & (np.append(remaining, 0)[source] > 0), row[source], -1).astype(
+                np.int32
+            ),
             is_noise=was_noise,
-            points=taken,
-            of=np.where(was_noise, taken, np.append(clusters.count, 0)[source]).astype(np.int32),
+            points=moved_points,
+            of=np.where(was_noise, moved_points, np.append(clusters.count, 0)[source]).astype(np.int32),
         ),
     )

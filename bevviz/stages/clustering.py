@@ -70,11 +70,11 @@ def redescribe(
     touched = np.flatnonzero(number[labels] >= 0)
     new = describe(points[touched], number[labels[touched]], config)
     old = np.flatnonzero(kept_rows >= 0)
-    place = np.empty(len(kept_rows), np.int64)
-    place[old], place[fresh] = np.arange(len(old)), len(old) + np.arange(len(fresh))
+    row = np.empty(len(kept_rows), np.int64)
+    row[old], row[fresh] = np.arange(len(old)), len(old) + np.arange(len(fresh))
 
     def joined(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-        return np.concatenate([a[kept_rows[old]], b])[place]
+        return np.concatenate([a[kept_rows[old]], b])[row]
 
     def boxes(a: Boxes3D, b: Boxes3D) -> Boxes3D:
         return Boxes3D(joined(a.center, b.center), joined(a.size, b.size), joined(a.yaw, b.yaw))
@@ -159,7 +159,7 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
     reach = 2 * strides[1] + 2
     begin = np.zeros(3, np.int64)
     near = np.zeros(cells + 1, np.int32)
-    found = np.empty(8 * cells, np.int32)  # the neighbours of cell c end at last[c]
+    pairs = np.empty(8 * cells, np.int32)  # the neighbours of cell c end at last[c]
     last = np.empty(cells, np.int32)
     used = 0
     for c in range(cells):
@@ -170,15 +170,15 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
                 o += 1
             begin[row] = o
             while o < cells and keys[o] <= middle + reach:
-                if used == len(found):
+                if used == len(pairs):
                     longer = np.empty(2 * used, np.int32)
-                    longer[:used] = found
-                    found = longer
+                    longer[:used] = pairs
+                    pairs = longer
                 dx = _gap(box[c, 0], box[c, 3], box[o, 0], box[o, 3])
                 dy = _gap(box[c, 1], box[c, 4], box[o, 1], box[o, 4])
                 dz = _gap(box[c, 2], box[c, 5], box[o, 2], box[o, 5])
                 # The value is always written and sometimes kept. There is no branch to mispredict.
-                found[used] = o
+                pairs[used] = o
                 used += dx * dx + dy * dy + dz * dz < eps2
                 o += 1
         last[c] = used
@@ -186,7 +186,7 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
     for c in range(cells):
         while k < last[c]:
             near[c + 1] += 1
-            near[found[k] + 1] += 1
+            near[pairs[k] + 1] += 1
             k += 1
     for c in range(cells):
         near[c + 1] += near[c]
@@ -194,7 +194,7 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
     k = 0
     for c in range(cells):
         while k < last[c]:
-            o = found[k]
+            o = pairs[k]
             neighbours[end[c]], neighbours[end[o]] = o, c
             end[c] += 1
             end[o] += 1
@@ -219,18 +219,18 @@ def _core_points(
     cells = len(start) - 1
     cores = np.zeros(cells, np.int32)
     for c in range(cells):
-        own = start[c + 1] - start[c]
-        if own >= min_points:
-            cores[c] = own
+        size = start[c + 1] - start[c]
+        if size >= min_points:
+            cores[c] = size
             continue
-        around = own
+        reachable = size
         for k in range(near[c], near[c + 1]):
-            around += start[neighbours[k] + 1] - start[neighbours[k]]
-        if around < min_points:
+            reachable += start[neighbours[k] + 1] - start[neighbours[k]]
+        if reachable < min_points:
             continue
         for i in range(start[c], start[c + 1]):
             px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            count = own
+            count = size
             for k in range(near[c], near[c + 1]):
                 o = neighbours[k]
                 dx = _gap(px, px, box[o, 0], box[o, 3])
@@ -326,12 +326,12 @@ def _label(
                         nearest = d2
                         root[order[i]] = _root(parent, o)
     number = np.full(len(cores), -1, np.int32)
-    found = 0
+    count = 0
     for i in range(len(root)):
         if root[i] >= 0:
             if number[root[i]] < 0:
-                number[root[i]] = found
-                found += 1
+                number[root[i]] = count
+                count += 1
             root[i] = number[root[i]]
     return root
 

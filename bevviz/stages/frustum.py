@@ -22,21 +22,21 @@ from bevviz.model.results import (
 )
 from bevviz.stages.box_fit import NO_EDGE
 from bevviz.stages.cells import sort_by
-from bevviz.stages.cluster_relabel import Part, relabelled
+from bevviz.stages.cluster_relabel import ClaimedPoints, relabel_claimed
 from bevviz.stages.clustering import MIN_SIZE
-from bevviz.stages.frustum_points import MARGIN, choose, fit_from, leftover, points_inside
+from bevviz.stages.frustum_points import MARGIN, choose_candidate, cluster_remainder, fit_from, points_inside
 from bevviz.stages.mask_lookup import cover
 
 EDGE_PIXELS = 2.0  # pixels, one sigma of the edges of an image box,
 EDGE_SHARE = 0.03  # or this share of the box's width if that is more
 TALL_SHARE = 0.08  # sigma of a height as a share of it; the object may stand anywhere in the box
-LOWEST = 2.0  # sigmas: a lower height costs no more than this, because the object may be partly hidden
-LOWEST_CUT = 1.0  # the same for a box that the image border cuts
+HIDDEN_SIGMAS = 2.0  # sigmas: a lower height costs no more than this, because the object may be partly hidden
+HIDDEN_SIGMAS_CUT = 1.0  # the same for a box that the image border cuts
 REACH_SPREAD = 2.0  # sigmas of its size by which an object may be deeper than its class
 BORDER = 2.0  # pixels: a box nearer to the image border than this is cut off by it
-SAME = 0.7  # IoU above which image boxes of two classes show one object, because NMS works by class
-KIN = 0.1  # share of an object's points above which a cluster counts as a part of the object
-NOBODY = -2  # value of ``taker`` for a point that no detection may claim
+SAME_OBJECT_IOU = 0.7  # above it boxes of two classes show one object, because NMS works by class
+MIN_CLUSTER_SHARE = 0.1  # share of an object's points above which a cluster counts as a part of the object
+UNAVAILABLE = -2  # value of ``taker`` for a point that no detection may claim
 
 
 def claim(
@@ -84,22 +84,22 @@ def claim(
         The claims of each camera.
         The splits and merges.
     """
-    work = _Work(points, height, clusters, fusion, objects.sizes, clustering.min_cluster_points)
-    taken = [work.look(result) for result in cameras]
-    now, row_of, splits = relabelled(
-        points, clusters, work.parts, [c.camera.name for c in cameras], clustering
+    state = _FrameClaims(points, height, clusters, fusion, objects.sizes, clustering.min_cluster_points)
+    claims_of_cameras = [state.claim(result) for result in cameras]
+    new_clusters, row_of, splits = relabel_claimed(
+        points, clusters, state.parts, [c.camera.name for c in cameras], clustering
     )
     claims = tuple(
         None if claims is None else Claims(row_of[claims.cluster], claims.fit, claims.boxes, claims.seen)
-        for claims in taken
+        for claims in claims_of_cameras
     )
-    return now, claims, splits
+    return new_clusters, claims, splits
 
 
-def _same(found: Detections, a: int, b: int) -> bool:
+def _is_same_object(detections: Detections, a: int, b: int) -> bool:
     """Return whether two boxes show one object under two names."""
-    overlap = geometry.iou(found.xyxy[[a]], found.xyxy[[b]])[0, 0]
-    return found.names[a] != found.names[b] and bool(overlap >= SAME)
+    overlap = geometry.iou(detections.xyxy[[a]], detections.xyxy[[b]])[0, 0]
+    return detections.names[a] != detections.names[b] and bool(overlap >= SAME_OBJECT_IOU)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class _Candidate:
     depth: float  # metres on the ground to its front
 
 
-class _Work:
+class _FrameClaims:
     """Claims of one frame: the points that are still free, and the parts already claimed."""
 
     def __init__(
@@ -126,7 +126,7 @@ class _Work:
         self.points, self.height, self.clusters, self.config = points, height, clusters, config
         self.sizes, self.smallest = sizes, smallest
         self.fewest = max(config.min_points, smallest)
-        self.parts: list[Part] = []
+        self.parts: list[ClaimedPoints] = []
         kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise has label -1, the last element
         self.usable = kept[clusters.labels]
         self.owner = np.full(len(points), -1, np.int64)
@@ -134,7 +134,7 @@ class _Work:
         order, self._start = sort_by(clusters.labels + np.int32(1), len(clusters) + 1)  # noise first
         self._order = order.astype(np.int64)
 
-    def look(self, result: CameraResult) -> Claims | None:
+    def claim(self, result: CameraResult) -> Claims | None:
         """Return the claims of one camera's detections. Their ``cluster`` is the number of a part."""
         camera, number = result.camera, self._cameras
         self._cameras += 1
@@ -146,14 +146,14 @@ class _Work:
             or camera.camera_from_points is None
         ):
             return None
-        view = _View(
+        view = _CameraFrustums(
             result.uv, result.depth, result.detections, camera.intrinsics, camera.camera_from_points, self
         )
-        found = result.detections
-        claims = Claims.none(len(found))
-        kept = np.flatnonzero(found.state == DetectionState.KEPT).tolist()
+        detections = result.detections
+        claims = Claims.none(len(detections))
+        kept = np.flatnonzero(detections.state == DetectionState.KEPT).tolist()
         waiting = {d: view.best(d) for d in kept}
-        scores = found.score.tolist()
+        scores = detections.score.tolist()
         while waiting:
             d = max(waiting, key=lambda d: waiting[d].fit * scores[d])
             candidate = waiting.pop(d)
@@ -162,22 +162,22 @@ class _Work:
                 continue
             takers = view.taker[candidate.rows]
             # A better detection has some of the points. Search again among the remaining points.
-            if (lost := takers.max(initial=-1)) >= 0:
-                if not _same(found, int(lost), d):
+            if (taker := takers.max(initial=-1)) >= 0:
+                if not _is_same_object(detections, int(taker), d):
                     waiting[d] = view.best(d)
                 continue
-            part = self._owned(candidate.rows)
+            part = self._earlier_part(candidate.rows)
             if part >= 0:
                 rows = self.parts[part].rows
-                _, box, seen = view.settled(d, replace(candidate, rows=rows), grow=False)
+                _, box, seen = view.settle(d, replace(candidate, rows=rows), grow=False)
             else:
                 rows = candidate.rows[self.unowned(candidate.rows)]
                 if len(rows) < self.fewest:
                     continue
                 candidate = replace(candidate, rows=rows)
-                rows, box, seen = view.settled(d, candidate, grow=True)
+                rows, box, seen = view.settle(d, candidate, grow=True)
                 part = len(self.parts)
-                self.parts.append(Part(number, d, rows))
+                self.parts.append(ClaimedPoints(number, d, rows))
                 self.owner[rows] = part
             claims.cluster[d] = part
             claims.boxes.center[d], claims.boxes.size[d], claims.boxes.yaw[d] = box[:3], box[3:6], box[6]
@@ -185,7 +185,7 @@ class _Work:
             view.taker[rows] = d
         return claims
 
-    def _owned(self, rows: I64) -> int:
+    def _earlier_part(self, rows: I64) -> int:
         """Return the part of an earlier camera that owns most of these points, -1 for none."""
         owners = self.owner[rows]
         owners = owners[owners >= 0]
@@ -201,7 +201,7 @@ class _Work:
         return rows[self.owner[rows] < 0]
 
 
-class _View:
+class _CameraFrustums:
     """Points as one camera sees them, on the ground plane with the camera at the origin."""
 
     def __init__(
@@ -211,12 +211,12 @@ class _View:
         detections: Detections,
         intrinsics: Intrinsics,
         camera_from_points: F64,
-        work: _Work,
+        work: _FrameClaims,
     ) -> None:
         self._work, self._uv, self._detections = work, uv, detections
         points_from_camera = geometry.inverse(camera_from_points)
         self._place = points_from_camera[:2, 3].copy()
-        self.taker = np.where(work.usable, np.int32(-1), np.int32(NOBODY))  # detection
+        self.taker = np.where(work.usable, np.int32(-1), np.int32(UNAVAILABLE))  # detection
         self._seen = np.flatnonzero((depth > 0) & (depth <= work.config.max_depth) & ~np.isnan(uv[:, 0]))
         # Rays go through the middles of the left, upper, right and lower edge of each box.
         x0, y0, x1, y1 = detections.xyxy.T.astype(np.float64)
@@ -245,10 +245,11 @@ class _View:
         # (D, 2) sigma of the left and right edge for each metre of distance
         self._edge = np.where(self._cut[:, [0, 2]], NO_EDGE, np.maximum(with_sigma, 1e-6)[:, None])
         self._boxes = detections.xyxy.astype(np.float64)
-        self._barred = {
+        self._beside_masks = {
             d: barred
             for d in np.flatnonzero(detections.kept).tolist()
-            if (barred := _beside_mask(uv, self._seen, detections, d, work.config, work.fewest)) is not None
+            if (barred := _points_beside_mask(uv, self._seen, detections, d, work.config, work.fewest))
+            is not None
         }
         sizes = [work.sizes.get(name.lower()) for name in detections.names]
         self._size = np.array([size or (np.nan,) * 6 for size in sizes], np.float64).reshape(-1, 6)
@@ -256,7 +257,7 @@ class _View:
     def best(self, d: int) -> _Candidate:
         """Return the best rated candidate among the free points in a detection's frustum."""
         config, (length, width, height, *spread) = self._work.config, self._size[d].tolist()
-        rows, rating, depth = choose(
+        rows, rating, depth = choose_candidate(
             self._work.points,
             self._place,
             self._uv,
@@ -269,7 +270,7 @@ class _View:
             self._tall[d],
             height,
             math.hypot(spread[2], TALL_SHARE * height),
-            LOWEST_CUT if self._cut[d, 1] or self._cut[d, 3] else LOWEST,
+            HIDDEN_SIGMAS_CUT if self._cut[d, 1] or self._cut[d, 3] else HIDDEN_SIGMAS,
             self._work.fewest,
             config.min_iou,
         )
@@ -277,25 +278,27 @@ class _View:
 
     def _allowed(self, d: int, rows: I64) -> I64:
         """Drop the points of the box that the detection's mask does not cover."""
-        return rows[~self._barred[d][rows]] if d in self._barred else rows
+        return rows[~self._beside_masks[d][rows]] if d in self._beside_masks else rows
 
-    def settled(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
+    def settle(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
         """Return the object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
         if not grow:
-            return rows, *self._upright(d, rows, *self._fitted(d, rows, candidate.depth))
+            return rows, *self._upright_box(d, rows, *self._fit(d, rows, candidate.depth))
         # The object's clusters may continue beyond the image border that cuts the box, and beside a tight
         # box.
         counts = np.bincount(work.clusters.labels[rows] + 1)
-        own = [work.free_of(k) for k in np.flatnonzero(counts[1:] > KIN * len(rows)).tolist()]
-        kin = self._allowed(d, np.concatenate([*own, np.zeros(0, np.int64)]))
+        free_rows = [
+            work.free_of(k) for k in np.flatnonzero(counts[1:] > MIN_CLUSTER_SHARE * len(rows)).tolist()
+        ]
+        kin = self._allowed(d, np.concatenate([*free_rows, np.zeros(0, np.int64)]))
         cut = self._cut[d]
         if cut[0] or cut[2]:
             beyond = kin[np.isnan(self._uv[kin, 0])]
             away = work.points[beyond, :2] - work.points[rows, :2].mean(axis=0)
             long = np.nan_to_num(self._size[d, 0], nan=candidate.depth * self._wide[d])
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
-        flat, _ = self._fitted(d, rows, candidate.depth)
+        flat, _ = self._fit(d, rows, candidate.depth)
         inside = points_inside(
             work.points,
             self._uv,
@@ -308,21 +311,21 @@ class _View:
             cut.any(),
         )
         rows = inside if len(inside) >= work.fewest else candidate.rows
-        flat, facing = self._fitted(d, rows, candidate.depth, about=flat[4])
-        box, seen = self._upright(d, rows, flat, facing)
-        for points in own:
-            rest = leftover(work.points, points, rows, flat, work.smallest)
+        flat, facing = self._fit(d, rows, candidate.depth, about=flat[4])
+        box, seen = self._upright_box(d, rows, flat, facing)
+        for points in free_rows:
+            rest = cluster_remainder(work.points, points, rows, flat, work.smallest)
             rows = np.concatenate([rows, rest]) if len(rest) else rows
         return rows, box, seen
 
-    def _fitted(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
+    def _fit(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
         """Return centre, length, width and heading on the ground, and the sides that face the camera."""
         prior = self._size[d, [0, 3, 1, 4]]
         longest = max(self._wide[d], self._tall[d]) * depth
         edge = self._edge[d] * depth
         return fit_from(self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about)
 
-    def _upright(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
+    def _upright_box(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
         """Return the box (centre, size, heading) and which sides are seen.
 
         The box of a detection without class size has length >= width.
@@ -345,7 +348,7 @@ class _View:
         return np.array([x, y, (low + high) / 2, length, width, tall, heading]), np.array(seen)
 
 
-def _beside_mask(
+def _points_beside_mask(
     uv: F32, seen: I64, detections: Detections, d: int, config: FusionConfig, fewest: int
 ) -> Bool | None:
     """Return the (P,) mask of points in a detection's box that its instance mask does not cover.

@@ -11,16 +11,16 @@ from bevviz.stages.box_fit import fit
 from bevviz.support.kernel import kernel
 
 MARGIN = 0.05  # share of a box's width that is searched on either side of it
-TIGHT = 0.15  # share of a box's sides by which the box may be too tight
-AROUND = 0.5  # share of a box's width on either side in which points show that an object continues
-TAIL = 4.0  # degrees of freedom of Student's t for the difference of a height from that of its class
-WINDOWS = 8  # a window in depth moves by its length divided by this
-SKIN = 0.1  # metres around a fitted box in which a point still belongs to it
-SLACK = 0.5  # metres around a box in which a remainder of a cluster, too small for a cluster, belongs to it
+TIGHT_SHARE = 0.15  # share of a box's sides by which the box may be too tight
+AROUND_SHARE = 0.5  # share of a box's width on either side in which points show that an object continues
+STUDENT_FREEDOM = 4.0  # degrees of freedom of Student's t for the deviation of a height from its class
+DEPTH_STEPS = 8  # a window in depth moves by its length divided by this
+OWN_MARGIN = 0.1  # metres around a fitted box in which a point still belongs to it
+REMAINDER_MARGIN = 0.5  # metres around a box in which the small remainder of a cluster belongs to it
 
 
 @kernel
-def choose(
+def choose_candidate(
     points: F32,
     place: F64,
     uv: F32,
@@ -59,26 +59,26 @@ def choose(
     Returns:
         The rows of the candidate's points, its rating without the score, and the distance of its front.
     """
-    margin, around = MARGIN * (box[2] - box[0]), AROUND * (box[2] - box[0])
-    there = np.empty(len(seen), np.int64)
+    margin, around = MARGIN * (box[2] - box[0]), AROUND_SHARE * (box[2] - box[0])
+    near = np.empty(len(seen), np.int64)
     n = 0
     for i in seen:
-        there[n] = i
+        near[n] = i
         beside = box[0] - around <= uv[i, 0] <= box[2] + around
         n += beside and box[1] <= uv[i, 1] <= box[3] and taker[i] == -1
-    there = there[:n]
+    near = near[:n]
     inside, far = np.empty(n, np.bool_), np.empty(n)
     xy = np.empty((n, 2))
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for i in range(n):
-        xy[i, 0], xy[i, 1] = points[there[i], 0] - place[0], points[there[i], 1] - place[1]
+        xy[i, 0], xy[i, 1] = points[near[i], 0] - place[0], points[near[i], 1] - place[1]
         far[i] = math.hypot(xy[i, 0], xy[i, 1])
-        inside[i] = box[0] - margin <= uv[there[i], 0] <= box[2] + margin
+        inside[i] = box[0] - margin <= uv[near[i], 0] <= box[2] + margin
         if inside[i]:
             low_x, high_x = min(low_x, xy[i, 0]), max(high_x, xy[i, 0])
             low_y, high_y = min(low_y, xy[i, 1]), max(high_y, xy[i, 1])
     if high_x < low_x:
-        return there[:0], 0.0, 0.0
+        return near[:0], 0.0, 0.0
 
     # Find connected points: cells half as wide as the gap are flooded two cells far. -1 waits, -2 is empty.
     cell = gap / 2
@@ -135,33 +135,33 @@ def choose(
             begin = far[by_body[first]]
             deep = ratio * begin if np.isnan(reach) else reach
             u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
-            held = 0
+            count = 0
             last = first
             while last < start[k + 1] and far[by_body[last]] <= begin + deep:
                 i = by_body[last]
                 if inside[i]:
-                    held += 1
-                    u, v = uv[there[i], 0], uv[there[i], 1]
+                    count += 1
+                    u, v = uv[near[i], 0], uv[near[i], 1]
                     u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
                 last += 1
-            if held >= fewest:
+            if count >= fewest:
                 covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
                     min(v1, box[3]) - max(v0, box[1]), 0.0
                 )
                 overlap = covered / area if area > 0 else 0.0
-                front = far[by_body[first + (last - 1 - first) // WINDOWS]]
-                rating = overlap * held / (last - first)
+                front = far[by_body[first + (last - 1 - first) // DEPTH_STEPS]]
+                rating = overlap * count / (last - first)
                 if not np.isnan(height):
                     z = max((tall * front - height) / sigma, -lowest)
-                    rating /= 1 + z * z / TAIL
+                    rating /= 1 + z * z / STUDENT_FREEDOM
                 if overlap >= least and rating > best:
                     best, best_first, best_last, best_far = rating, first, last, front
             if last == start[k + 1]:
                 break
-            while first < start[k + 1] and far[by_body[first]] < begin + deep / WINDOWS:
+            while first < start[k + 1] and far[by_body[first]] < begin + deep / DEPTH_STEPS:
                 first += 1
     chosen = by_body[best_first:best_last]
-    return there[chosen[inside[chosen]]], best, best_far
+    return near[chosen[inside[chosen]]], best, best_far
 
 
 @kernel
@@ -214,8 +214,12 @@ def points_inside(
         flat: (5,) centre, length, width and heading of the object's box.
         unseen: whether points of its clusters outside the image count, too.
     """
-    margin, across, along = MARGIN * (box[2] - box[0]), TIGHT * (box[2] - box[0]), TIGHT * (box[3] - box[1])
-    found = np.empty(len(seen) + len(kin), np.int64)
+    margin, across, along = (
+        MARGIN * (box[2] - box[0]),
+        TIGHT_SHARE * (box[2] - box[0]),
+        TIGHT_SHARE * (box[3] - box[1]),
+    )
+    inside = np.empty(len(seen) + len(kin), np.int64)
     known = np.zeros(len(points), np.bool_)
     n = 0
     for i in seen:
@@ -224,9 +228,9 @@ def points_inside(
             and box[1] <= uv[i, 1] <= box[3]
             and taker[i] == -1
             and owner[i] == -1
-            and _within(points, i, flat, SKIN)
+            and _within(points, i, flat, OWN_MARGIN)
         ):
-            found[n] = i
+            inside[n] = i
             known[i] = True
             n += 1
     for i in kin:
@@ -235,26 +239,26 @@ def points_inside(
         beside = (
             box[0] - across <= uv[i, 0] <= box[2] + across and box[1] - along <= uv[i, 1] <= box[3] + along
         )
-        if (beside or (unseen and np.isnan(uv[i, 0]))) and _within(points, i, flat, SKIN):
-            found[n] = i
+        if (beside or (unseen and np.isnan(uv[i, 0]))) and _within(points, i, flat, OWN_MARGIN):
+            inside[n] = i
             n += 1
-    return found[:n]
+    return inside[:n]
 
 
 @kernel
-def leftover(points: F32, own: I64, rows: I64, flat: F64, smallest: int) -> I64:
+def cluster_remainder(points: F32, cluster_rows: I64, rows: I64, flat: F64, smallest: int) -> I64:
     """Return the remainder of a cluster, or nothing.
 
     It is returned if it is beside the object and too small for a cluster of its own.
     """
-    taken = np.zeros(len(points), np.bool_)
+    is_claimed = np.zeros(len(points), np.bool_)
     for i in rows:
-        taken[i] = True
-    rest = np.empty(len(own), np.int64)
+        is_claimed[i] = True
+    rest = np.empty(len(cluster_rows), np.int64)
     n = 0
-    for i in own:
-        if not taken[i]:
-            if n + 1 >= smallest or not _within(points, i, flat, SLACK):
+    for i in cluster_rows:
+        if not is_claimed[i]:
+            if n + 1 >= smallest or not _within(points, i, flat, REMAINDER_MARGIN):
                 return rest[:0]
             rest[n] = i
             n += 1

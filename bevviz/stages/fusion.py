@@ -127,11 +127,11 @@ def fuse(
         pairs=pairs,
         cluster_uv=cluster_uv,
         claims=claims,
-        detection_covered=None if claims is None else _covered(uv, inside, detections, config),
+        detection_covered=None if claims is None else _count_in_masks(uv, inside, detections, config),
     )
 
 
-def _covered(uv: F32, inside: list[I64], detections: Detections, config: FusionConfig) -> I32 | None:
+def _count_in_masks(uv: F32, inside: list[I64], detections: Detections, config: FusionConfig) -> I32 | None:
     """Count the points of each box that its mask covers, -1 without a mask. Return None without any masks."""
     masks = detections.masks
     if masks is None or not config.masks:

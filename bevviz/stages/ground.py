@@ -16,13 +16,13 @@ from bevviz.support.kernel import kernel
 # far away, where the beams are sparse.
 RING_SCALE = 12.5
 RING_COUNT = 25.0
-NEAR = 20.0  # metres: radius around the sensor in which the first plane is searched
-TALL = 2.0  # metres: a higher point may hang over the ground, like a tree crown or a bridge
-MEMORY = 5.0  # metres over which the slope of the ground is remembered
-BANK = 0.7  # metres up for each metre outwards: the steepest bank, 35 degrees
-ACROSS = 0.5  # smallest share of a bin's depth that a bank spans; the side of a vehicle spans less
-ROUGH = 0.1  # metres: height of the grass on a bank
-WIDE = 4.0  # metres: a bank is at least this wide; a car's bonnet is narrower
+FIRST_PLANE_RADIUS = 20.0  # metres: radius around the sensor in which the first plane is searched
+OVERHANG_HEIGHT = 2.0  # metres: a higher point may hang over the ground, like a tree crown or a bridge
+SLOPE_MEMORY = 5.0  # metres over which the slope of the ground is remembered
+BANK_SLOPE = 0.7  # metres up for each metre outwards: the steepest bank, 35 degrees
+BANK_SPAN = 0.5  # smallest share of a bin's depth that a bank spans; the side of a vehicle spans less
+GRASS_HEIGHT = 0.1  # metres: height of the grass on a bank
+BANK_WIDTH = 4.0  # metres: a bank is at least this wide; a car's bonnet is narrower
 
 
 def segment_ground(points: F32, config: GroundConfig) -> Ground:
@@ -47,21 +47,21 @@ def segment_ground(points: F32, config: GroundConfig) -> Ground:
         three points, with all points on a line, or with no points near the height that ``sensor_height``
         predicts.
     """
-    return _plane(points, config) if config.method == "plane" else _polar(points, config)
+    return _segment_plane(points, config) if config.method == "plane" else _segment_polar(points, config)
 
 
 # --- one plane ---------------------------------------------------------------------------------
 
 
-def _plane(points: F32, config: GroundConfig) -> Ground:
+def _segment_plane(points: F32, config: GroundConfig) -> Ground:
     inliers = _largest_plane(points, config.distance_threshold, config)
     if not inliers.any():
-        return _unknown(len(points))
-    plane = _fit(points, inliers)
+        return _no_ground(len(points))
+    plane = _fit_plane(points, inliers)
     return Ground(inliers, _above(points, plane), plane)
 
 
-def _unknown(count: int) -> Ground:
+def _no_ground(count: int) -> Ground:
     return Ground(np.zeros(count, np.bool_), np.full(count, np.nan, np.float32))
 
 
@@ -117,7 +117,7 @@ def _best_support(points: F32, anchor: F32, normal: F32, threshold: np.float32) 
     return near
 
 
-def _fit(points: F32, inliers: Bool) -> F64:
+def _fit_plane(points: F32, inliers: Bool) -> F64:
     """Fit a plane by least squares along the axis nearest to its normal, as Open3D does.
 
     Returns:
@@ -159,12 +159,12 @@ def _moments(points: F32, chosen: Bool) -> tuple[F64, F64]:
 # --- a surface over rings and sectors ----------------------------------------------------------
 
 
-def _polar(points: F32, config: GroundConfig) -> Ground:
+def _segment_polar(points: F32, config: GroundConfig) -> Ground:
     rings = math.ceil(RING_COUNT * math.asinh(config.max_range / RING_SCALE))
     ring, sector, order, start = _place(points, rings, config.sectors)
     plane = _first_plane(points, order, start, config)
     if plane is None:
-        return _unknown(len(points))
+        return _no_ground(len(points))
     radius = RING_SCALE * np.sinh(np.arange(0.5, rings) / RING_COUNT)
     steepest = math.tan(math.radians(config.max_slope))
     height, below = _heights(
@@ -189,7 +189,7 @@ def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F
     expected = math.nan if config.sensor_height is None else -config.sensor_height
     low = _near_ground(points, _lowest(points, order, start), expected, config.max_step, math.tan(steepest))
     inliers = _largest_plane(low, config.distance_threshold, config, math.cos(steepest))
-    return _fit(low, inliers) if inliers.any() else None
+    return _fit_plane(low, inliers) if inliers.any() else None
 
 
 def _place(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
@@ -203,10 +203,10 @@ def _place(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
 def _range(points: F32) -> F32:
     """Return the (N,) horizontal distances from the sensor, in units of RING_SCALE."""
     scale = np.float32(1 / RING_SCALE)
-    found = np.empty(len(points), np.float32)
+    distance = np.empty(len(points), np.float32)
     for i in range(len(points)):
-        found[i] = scale * np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
-    return found
+        distance[i] = scale * np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+    return distance
 
 
 @kernel
@@ -234,7 +234,7 @@ def _bin(ring: F32, turn: F32, rings: int, sectors: int) -> tuple[F32, I32, I32]
 def _near_ground(points: F32, lowest: I32, expected: float, max_step: float, steepest: float) -> F32:
     """Return the lowest points to fit the first plane to.
 
-    Points within NEAR of the sensor are used if there are at least three of them.
+    Points within FIRST_PLANE_RADIUS of the sensor are used if there are at least three of them.
     ``expected`` is the height of the ground below the sensor, NaN if it is not known.
     """
     chosen = np.empty(len(lowest), np.int32)
@@ -245,12 +245,12 @@ def _near_ground(points: F32, lowest: I32, expected: float, max_step: float, ste
         if abs(points[i, 2] - expected) >= max_step + steepest * reach:
             continue
         chosen[count], distance[count] = i, reach
-        near += reach < NEAR
+        near += reach < FIRST_PLANE_RADIUS
         count += 1
     low = np.empty((near if near >= 3 else count, 3), np.float32)
     kept = 0
     for k in range(count):
-        if near < 3 or distance[k] < NEAR:
+        if near < 3 or distance[k] < FIRST_PLANE_RADIUS:
             low[kept] = points[chosen[k]]
             kept += 1
     return low
@@ -282,7 +282,7 @@ def _heights(
 def _lowest(points: F32, order: I32, start: I32) -> I32:
     """Return the index of the lowest point of each occupied bin."""
     lowest = np.empty(len(start) - 1, np.int32)
-    found = 0
+    count = 0
     for b in range(len(start) - 1):
         if start[b] == start[b + 1]:
             continue
@@ -290,9 +290,9 @@ def _lowest(points: F32, order: I32, start: I32) -> I32:
         for k in range(start[b] + 1, start[b + 1]):
             if points[order[k], 2] < points[low, 2]:
                 low = order[k]
-        lowest[found] = low
-        found += 1
-    return lowest[:found]
+        lowest[count] = low
+        count += 1
+    return lowest[:count]
 
 
 @kernel
@@ -310,22 +310,23 @@ def _follow(
     surface = np.zeros((len(radius), sectors))
     level = np.zeros(sectors)
     slope = np.zeros(sectors)
-    unseen = np.full(sectors, -NEAR)  # metres since the last offer; the first plane is valid for NEAR metres
+    # Metres since the last offer. The first plane is valid for FIRST_PLANE_RADIUS.
+    unseen = np.full(sectors, -FIRST_PLANE_RADIUS)
     offer, banked = np.empty(sectors), np.empty(sectors)
     for r in range(len(radius)):
         step = radius[r] - radius[r - 1] if r > 0 else radius[0]
-        keep = math.exp(-step / MEMORY)
+        keep = math.exp(-step / SLOPE_MEMORY)
         for s in range(sectors):
             level[s] += slope[s] * step
             # The longer the ground was hidden, the less certain its next height is.
-            gate = max_step * (1 + max(unseen[s], 0.0) / MEMORY)
+            gate = max_step * (1 + max(unseen[s], 0.0) / SLOPE_MEMORY)
             offer[s] = banked[s] = np.inf
             lowest, top, near, far = np.inf, -np.inf, np.inf, -np.inf
             for k in range(start[r * sectors + s], start[r * sectors + s + 1]):
                 above = rise[order[k]] - level[s]
                 if abs(above) <= gate:
                     offer[s] = min(offer[s], rise[order[k]])
-                if -gate <= above < TALL:
+                if -gate <= above < OVERHANG_HEIGHT:
                     lowest, top = min(lowest, above), max(top, above)
                     near, far = min(near, ring[order[k]]), max(far, ring[order[k]])
             if top <= gate:
@@ -333,11 +334,11 @@ def _follow(
             # Points that rise no steeper than a bank over most of the bin are a bank. Points that rise at
             # once are an object, and its lowest point need not be its foot.
             across = (far - near) * step
-            bank = across >= ACROSS * step and top - lowest <= BANK * across + ROUGH
-            banked[s] = level[s] + lowest if bank and lowest <= gate + BANK * step else np.inf
+            bank = across >= BANK_SPAN * step and top - lowest <= BANK_SLOPE * across + GRASS_HEIGHT
+            banked[s] = level[s] + lowest if bank and lowest <= gate + BANK_SLOPE * step else np.inf
             if offer[s] > level[s]:
                 offer[s] = np.inf
-        _widen(offer, banked, WIDE * sectors / (2 * math.pi * radius[r]))
+        _widen(offer, banked, BANK_WIDTH * sectors / (2 * math.pi * radius[r]))
         # The median is over the sectors within a metre to each side.
         reach = min(max(2, math.ceil(sectors / (2 * math.pi * radius[r]))), 8)
         around = np.empty(2 * reach + 1)

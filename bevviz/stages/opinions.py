@@ -24,15 +24,16 @@ from bevviz.model.results import (
 from bevviz.stages.visibility import image_boxes, in_view, visible
 
 MARGIN = 0.2  # metres around a box in which points still belong to it
-HELD = 0.5  # smallest share of a cluster's points in the box that it belongs to
-RIVAL = 0.7  # share relative to the box with the most of a cluster; with less, only that box has the cluster
-PARTLY = 0.2  # like HELD, for a cluster that has the most points in the box
-SAID = (Opinion.CONFIRMED, Opinion.NAMED_OTHERWISE)
-NEAR = 0.1  # IoU from which a nearby detection is reported for a box without detections
+MIN_SHARE = 0.5  # smallest share of a cluster's points in the box that it belongs to
+# Share of a cluster relative to the box with the most of it. With less, only that box has the cluster.
+MIN_RIVAL_SHARE = 0.7
+MIN_MAIN_SHARE = 0.2  # like MIN_SHARE, for a cluster that has the most points in the box
+DECIDED = (Opinion.CONFIRMED, Opinion.NAMED_OTHERWISE)
+MIN_NEARBY_IOU = 0.1  # IoU from which a nearby detection is reported for a box without detections
 
 
 @dataclass(frozen=True, slots=True)
-class _Sight:
+class _CameraOpinions:
     """Opinion of one camera on each box. The fields are those of ``Opinions``."""
 
     opinion: I32
@@ -82,26 +83,28 @@ def opinions(
         known: classes that the detector knows; empty if unknown.
     """
     boxes, count = objects.boxes, len(objects)
-    open_ = visible(ranges, boxes)
+    visible_share = visible(ranges, boxes)
     named = _named_clusters(fused, cameras, clusters)
-    held = _held(boxes, obstacles, clusters, named)
-    least = _least_iou(held, objects.cluster[:, None] == named[None], config)
-    best = _unseen(count, Opinion.NOT_ASKED)
+    share = _cluster_shares(boxes, obstacles, clusters, named)
+    least = _least_iou(share, objects.cluster[:, None] == named[None], config)
+    best = _initial_opinions(count, Opinion.NOT_ASKED)
     camera = [""] * count
     for result in cameras:
         if result.detections is None:
             continue
-        sight = _sight(result, result.detections, objects, open_, named, held, least, config, known)
-        better = (sight.opinion < best.opinion) | (
-            (sight.opinion == best.opinion) & (sight.shown > best.shown)
+        camera_opinions = _camera_opinions(
+            result, result.detections, objects, visible_share, named, share, least, config, known
+        )
+        better = (camera_opinions.opinion < best.opinion) | (
+            (camera_opinions.opinion == best.opinion) & (camera_opinions.shown > best.shown)
         )
         rows = np.flatnonzero(better)
-        for field in _Sight.__slots__:
-            getattr(best, field)[rows] = getattr(sight, field)[rows]
+        for field in _CameraOpinions.__slots__:
+            getattr(best, field)[rows] = getattr(camera_opinions, field)[rows]
         for k in rows.tolist():
             # An object can be named by its cluster although its box is beside the image.
-            there = sight.shown[k] > 0 or sight.opinion[k] in SAID
-            camera[k] = result.camera.name if there else ""
+            is_shown = camera_opinions.shown[k] > 0 or camera_opinions.opinion[k] in DECIDED
+            camera[k] = result.camera.name if is_shown else ""
     return Opinions(
         fused=fused,
         opinion=best.opinion,
@@ -110,9 +113,9 @@ def opinions(
         iou=best.iou,
         held=best.held,
         shown=best.shown,
-        visible=open_,
+        visible=visible_share,
         height=best.height,
-        partner=_partners(fused, named, held, least),
+        partner=_partners(fused, named, share, least),
     )
 
 
@@ -138,55 +141,55 @@ def _named_clusters(fused: Objects, cameras: Sequence[CameraResult], clusters: C
     return np.flatnonzero(matched)
 
 
-def _held(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: I64) -> F32:
+def _cluster_shares(boxes: Boxes3D, points: F32 | None, clusters: Clusters | None, named: I64) -> F32:
     """Return the (K, len(named)) share of the points of each named cluster that are in each box."""
-    held = np.zeros((len(boxes), len(named)), np.float32)
-    if points is None or clusters is None or held.size == 0:
-        return held
+    share = np.zeros((len(boxes), len(named)), np.float32)
+    if points is None or clusters is None or share.size == 0:
+        return share
     column = np.full(len(clusters) + 1, -1, np.int64)  # noise has label -1, the last element
     column[named] = np.arange(len(named))
-    own = column[clusters.labels]
-    rows = np.flatnonzero(own >= 0)
-    points, own = points[rows], own[rows]
+    column_of_point = column[clusters.labels]
+    rows = np.flatnonzero(column_of_point >= 0)
+    points, column_of_point = points[rows], column_of_point[rows]
     wide = Boxes3D(boxes.center, boxes.size + np.float32(2 * MARGIN), boxes.yaw)
     for k, inside in geometry.inside_each(points, wide):
-        held[k] = np.bincount(own[inside], minlength=len(named))
-    whole: F32 = np.maximum(np.bincount(own, minlength=len(named)), 1).astype(np.float32)
-    return held / whole
+        share[k] = np.bincount(column_of_point[inside], minlength=len(named))
+    whole: F32 = np.maximum(np.bincount(column_of_point, minlength=len(named)), 1).astype(np.float32)
+    return share / whole
 
 
-def _least_iou(held: F32, own: Bool, config: OpinionsConfig) -> F32:
+def _least_iou(share: F32, has_most: Bool, config: OpinionsConfig) -> F32:
     """Return the (K, C) IoU that a detection with that cluster needs to belong to each box, inf for never.
 
     Args:
-        held: (K, C) share of the cluster in the box.
-        own: (K, C) whether the cluster has the most points in the box.
+        share: (K, C) share of the cluster in the box.
+        has_most: (K, C) whether the cluster has the most points in the box.
         config: gives the IoU needed if another box has far more of the cluster.
     """
-    of_box = own & (held >= PARTLY)
-    first = held >= RIVAL * held.max(axis=0, initial=0)
-    of_box |= first & (held >= HELD)
+    of_box = has_most & (share >= MIN_MAIN_SHARE)
+    first = share >= MIN_RIVAL_SHARE * share.max(axis=0, initial=0)
+    of_box |= first & (share >= MIN_SHARE)
     return np.where(of_box, np.where(first, 0, config.min_iou), np.inf).astype(np.float32)
 
 
-def _partners(fused: Objects, named: I64, held: F32, least: F32) -> I32:
+def _partners(fused: Objects, named: I64, share: F32, least: F32) -> I32:
     """Return the (J,) box that holds most of the cluster of each of our objects, -1 for none."""
     partner = np.full(len(fused), -1, np.int32)
-    if len(held):
+    if len(share):
         columns = np.searchsorted(named, fused.cluster)
-        share = np.where(np.isfinite(least), held, 0)[:, columns]
-        found = share.max(axis=0) > 0
-        partner[found] = share.argmax(axis=0)[found]
+        clear_share = np.where(np.isfinite(least), share, 0)[:, columns]
+        has_partner = clear_share.max(axis=0) > 0
+        partner[has_partner] = clear_share.argmax(axis=0)[has_partner]
     return partner
 
 
 # --- one camera --------------------------------------------------------------------------------
 
 
-def _unseen(count: int, opinion: Opinion) -> _Sight:
+def _initial_opinions(count: int, opinion: Opinion) -> _CameraOpinions:
     """Return the initial opinions of a camera, to be filled in."""
     zero = np.zeros(count, np.float32)
-    return _Sight(
+    return _CameraOpinions(
         np.full(count, opinion, np.int32),
         np.full(count, -1, np.int32),
         zero,
@@ -196,23 +199,23 @@ def _unseen(count: int, opinion: Opinion) -> _Sight:
     )
 
 
-def _sight(
+def _camera_opinions(
     result: CameraResult,
     detections: Detections,
     objects: Objects,
-    open_: F32,
+    visible_share: F32,
     named: I64,
-    held: F32,
+    share: F32,
     least: F32,
     config: OpinionsConfig,
     known: Sequence[str],
-) -> _Sight:
+) -> _CameraOpinions:
     """Return the opinion of one camera on each box."""
     count, around = len(objects), image_boxes(objects.boxes, result.camera)
     overlap = geometry.iou(around, detections.xyxy)
-    by_cluster, has_cluster = _by_cluster(result, detections, overlap, named, held, least)
+    by_cluster, has_cluster = _by_cluster(result, detections, overlap, named, share, least)
     looks = ~np.isnan(by_cluster)
-    open_overlap = np.where(open_[:, None] >= config.min_visible, overlap, 0)
+    open_overlap = np.where(visible_share[:, None] >= config.min_visible, overlap, 0)
     free = np.flatnonzero(detections.kept & ~has_cluster)
     if count and len(free):
         most = open_overlap[:, free].argmax(axis=0)
@@ -227,31 +230,33 @@ def _sight(
     # Of the detections that belong to a box, the best has a matching class, a cluster, and the most overlap.
     rank = np.where(looks, 8 + 4 * fits + np.where(np.isnan(by_cluster), 0, 2 * by_cluster) + overlap, 0)
     # Without such a detection the nearest is reported, even a weak one. A matching class is preferred.
-    beside = (overlap >= NEAR) & (detections.state != DetectionState.SUPPRESSED)
+    beside = (overlap >= MIN_NEARBY_IOU) & (detections.state != DetectionState.SUPPRESSED)
     rank = np.maximum(rank, np.where(beside, 2 * fits + overlap, 0))
-    sight = _unseen(count, Opinion.CONTRADICTED)
-    sight.shown[:] = in_view(objects.boxes, result.camera)
-    sight.height[:] = np.nan_to_num(around[:, 3] - around[:, 1])
+    camera_opinions = _initial_opinions(count, Opinion.CONTRADICTED)
+    camera_opinions.shown[:] = in_view(objects.boxes, result.camera)
+    camera_opinions.height[:] = np.nan_to_num(around[:, 3] - around[:, 1])
     knows = np.array([not known or bool(right[label]) for label in objects.names], bool)
-    sight.opinion[~knows] = Opinion.NO_CLASS
-    sight.opinion[sight.height < config.min_height] = Opinion.TOO_SMALL
-    sight.opinion[open_ < config.min_visible] = Opinion.HIDDEN
-    sight.opinion[(sight.shown < config.min_shown) | (sight.shown == 0)] = Opinion.OUT_OF_VIEW
+    camera_opinions.opinion[~knows] = Opinion.NO_CLASS
+    camera_opinions.opinion[camera_opinions.height < config.min_height] = Opinion.TOO_SMALL
+    camera_opinions.opinion[visible_share < config.min_visible] = Opinion.HIDDEN
+    camera_opinions.opinion[(camera_opinions.shown < config.min_shown) | (camera_opinions.shown == 0)] = (
+        Opinion.OUT_OF_VIEW
+    )
     if len(detections):
-        every = np.arange(count)
+        all_boxes = np.arange(count)
         best = rank.argmax(axis=1)
-        there = rank[every, best] > 0
-        sight.detection[there] = best[there]
-        sight.iou[there] = overlap[every, best][there]
-        sight.held[there] = by_cluster[every, best][there]
-        seen = there & looks[every, best]
-        sight.opinion[seen] = Opinion.NAMED_OTHERWISE
-        sight.opinion[seen & fits[every, best]] = Opinion.CONFIRMED
-    return sight
+        has_detection = rank[all_boxes, best] > 0
+        camera_opinions.detection[has_detection] = best[has_detection]
+        camera_opinions.iou[has_detection] = overlap[all_boxes, best][has_detection]
+        camera_opinions.held[has_detection] = by_cluster[all_boxes, best][has_detection]
+        seen = has_detection & looks[all_boxes, best]
+        camera_opinions.opinion[seen] = Opinion.NAMED_OTHERWISE
+        camera_opinions.opinion[seen & fits[all_boxes, best]] = Opinion.CONFIRMED
+    return camera_opinions
 
 
 def _by_cluster(
-    result: CameraResult, detections: Detections, overlap: F32, named: I64, held: F32, least: F32
+    result: CameraResult, detections: Detections, overlap: F32, named: I64, share: F32, least: F32
 ) -> tuple[F32, Bool]:
     """Return how much of each detection's cluster is in each box.
 
@@ -259,15 +264,15 @@ def _by_cluster(
         (K, D) share of the cluster in a box that it belongs to, else NaN.
         (D,) whether the detection has a cluster.
     """
-    share = np.full((len(held), len(detections)), np.nan, np.float32)
+    box_share = np.full((len(share), len(detections)), np.nan, np.float32)
     has_cluster = np.zeros(len(detections), np.bool_)
     if result.fusion is None:
-        return share, has_cluster
+        return box_share, has_cluster
     matched = np.flatnonzero(result.fusion.cluster_decision == Decision.MATCHED)
     detection = result.fusion.cluster_detection[matched]
     has_cluster[detection] = True
     for d, column in zip(detection.tolist(), np.searchsorted(named, matched).tolist(), strict=True):
         looks = overlap[:, d] >= least[:, column]
-        mine = np.where(looks, held[:, column], np.nan)  # One box can name several clusters.
-        share[:, d] = np.fmax(share[:, d], mine)
-    return share, has_cluster
+        share_in_box = np.where(looks, share[:, column], np.nan)  # One box can name several clusters.
+        box_share[:, d] = np.fmax(box_share[:, d], share_in_box)
+    return box_share, has_cluster

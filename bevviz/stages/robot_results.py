@@ -28,7 +28,7 @@ from bevviz.model.results import (
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.user_stages import heights, placed
 
-NEAR = 0.05  # metres: a point of ours within this distance of a point of the robot's is the same point
+SAME_POINT_DISTANCE = 0.05  # metres: our point is the same as a point of the robot's within it
 
 
 def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
@@ -43,7 +43,7 @@ def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
     cloud = next((c for c in frame.robot_clouds if c.topic == topic), None)
     if cloud is None:
         raise _missing(topic, "cloud of obstacles")
-    reach = max(NEAR, voxel * 3**0.5)
+    reach = max(SAME_POINT_DISTANCE, voxel * 3**0.5)
     obstacle = _within(points, cloud.xyz, reach)
     return Ground(~obstacle, heights(points, ~obstacle))
 
@@ -63,8 +63,8 @@ def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
     for k in range(len(boxes)):
         inside = np.flatnonzero(geometry.inside(points, boxes, k))
         away = np.linalg.norm(points[inside] - boxes.center[k], axis=1)
-        mine = inside[away < nearest[inside]]
-        labels[mine], nearest[mine] = k, away[away < nearest[inside]]
+        nearer = inside[away < nearest[inside]]
+        labels[nearer], nearest[nearer] = k, away[away < nearest[inside]]
     count = np.bincount(labels[labels >= 0], minlength=len(boxes)).astype(np.int32)
     for axis in range(3):
         total = np.bincount(labels[labels >= 0], points[labels >= 0, axis], minlength=len(boxes))
@@ -83,14 +83,14 @@ def detect(frame: Frame, camera: Camera, topic: str) -> Detections:
         StageError: the robot published no detections at this time, or it is unknown which of several cameras
             they belong to.
     """
-    for found in frame.robot_detections:
-        if found.topic == topic and not found.camera and len(frame.cameras) > 1:
+    for boxes in frame.robot_detections:
+        if boxes.topic == topic and not boxes.camera and len(frame.cameras) > 1:
             raise StageError(
                 f"{topic} does not say which camera its boxes are of: no image is in the frame "
-                f"'{found.frame_id}' of its header; name the one camera: source.camera_topics"
+                f"'{boxes.frame_id}' of its header; name the one camera: source.camera_topics"
             )
-        if found.topic == topic and found.camera in ("", camera.name):
-            return detections_of(found)
+        if boxes.topic == topic and boxes.camera in ("", camera.name):
+            return detections_of(boxes)
     raise _missing(topic, "detections")
 
 
@@ -104,14 +104,14 @@ def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clus
     return placed(in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters)
 
 
-def detections_of(found: LabelledBoxes2D) -> Detections:
+def detections_of(labelled: LabelledBoxes2D) -> Detections:
     """Make detections from labelled image boxes, best score first. All are kept."""
-    order = np.argsort(-found.scores, kind="stable")
+    order = np.argsort(-labelled.scores, kind="stable")
     zero = np.zeros(len(order), np.int32)
     kept = np.full(len(order), DetectionState.KEPT, np.int32)
-    names = tuple(found.labels[d] for d in order)
-    nothing = np.zeros(len(order), np.float32)
-    return Detections(found.xyxy[order], found.scores[order], zero, names, kept, zero - 1, nothing)
+    names = tuple(labelled.labels[d] for d in order)
+    overlap = np.zeros(len(order), np.float32)
+    return Detections(labelled.xyxy[order], labelled.scores[order], zero, names, kept, zero - 1, overlap)
 
 
 def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
@@ -135,17 +135,17 @@ def _within(points: F32, others: F32, reach: float) -> Bool:
 
     A cell is ``reach`` wide.
     """
-    found = np.zeros(len(points), np.bool_)
+    is_near = np.zeros(len(points), np.bool_)
     if not len(points) or not len(others):
-        return found
+        return is_near
     keys, strides = cell_keys(np.concatenate([points, others]), reach, reach=1)
-    there = np.unique(keys[len(points) :])
+    occupied = np.unique(keys[len(points) :])
     for offset in sorted(itertools.product((0, -1, 1), repeat=3), key=np.count_nonzero):
-        rest = np.flatnonzero(~found)
-        wanted = keys[rest] + np.array(offset) @ strides
-        place = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
-        found[rest] = there[place] == wanted
-    return found
+        remaining = np.flatnonzero(~is_near)
+        wanted = keys[remaining] + np.array(offset) @ strides
+        place = np.minimum(np.searchsorted(occupied, wanted), len(occupied) - 1)
+        is_near[remaining] = occupied[place] == wanted
+    return is_near
 
 
 def _missing(topic: str, what: str) -> StageError:

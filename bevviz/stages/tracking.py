@@ -24,7 +24,7 @@ HEADING_SPEED = 1.0  # m/s above which the direction of motion distinguishes fro
 
 
 @dataclass(slots=True)
-class _State:
+class _TrackStates:
     """State of all tracks, one row for each. All fields are arrays, so that rows are selected together."""
 
     id: I64
@@ -41,20 +41,20 @@ class _State:
     trail: F32  # (T, L, 3) NaN before the birth
 
     @staticmethod
-    def empty() -> _State:
+    def empty() -> _TrackStates:
         """Return the state without tracks."""
-        nothing = np.zeros(0, np.bool_)
-        return _State.new(np.zeros(0, np.int64), Boxes3D.empty(), nothing, 0, 0, 0, TrackingConfig())
+        whole = np.zeros(0, np.bool_)
+        return _TrackStates.new(np.zeros(0, np.int64), Boxes3D.empty(), whole, 0, 0, 0, TrackingConfig())
 
     @staticmethod
     def new(
         ids: I64, boxes: Boxes3D, whole: Bool, stamp: int, classes: int, length: int, config: TrackingConfig
-    ) -> _State:
+    ) -> _TrackStates:
         """Return the state of new tracks, one for each box."""
         n = len(ids)
         mean = np.zeros((n, 2, 3))
         mean[:, 0] = boxes.center
-        return _State(
+        return _TrackStates(
             id=ids,
             mean=mean,
             covariance=np.tile(np.diag([config.position_noise**2, INITIAL_SPEED**2]), (n, 1, 1)),
@@ -72,13 +72,13 @@ class _State:
     def __len__(self) -> int:
         return len(self.id)
 
-    def chosen(self, rows: NDArray[Any]) -> _State:
+    def chosen(self, rows: NDArray[Any]) -> _TrackStates:
         """Return the state of some rows."""
-        return _State(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return _TrackStates(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def joined(self, other: _State) -> _State:
+    def joined(self, other: _TrackStates) -> _TrackStates:
         """Return the state with the rows of another appended."""
-        return _State(
+        return _TrackStates(
             *(np.concatenate([getattr(s, field.name) for s in (self, other)]) for field in fields(self))
         )
 
@@ -95,7 +95,7 @@ class Tracker:
     """
 
     def __init__(self) -> None:
-        self._state = _State.empty()
+        self._state = _TrackStates.empty()
         self._classes: list[str] = []
         self._stamps: list[int] = []  # stamps of the columns of the trails
         self._frame: tuple[str, bool] | None = None
@@ -127,18 +127,18 @@ class Tracker:
         place = (frame.world_frame if absolute else frame.points_frame, absolute)
         dt = (frame.stamp - self._stamps[-1]) * 1e-9 if self._stamps else 0.0
         if not 0 <= dt <= config.reset_after or place != self._frame:
-            self._state, self._stamps, self._frame, dt = _State.empty(), [], place, 0.0
+            self._state, self._stamps, self._frame, dt = _TrackStates.empty(), [], place, 0.0
             self._state.votes = np.zeros((0, len(self._classes)))
         kept = np.flatnonzero(clusters.kept)
         pose = frame.pose
-        seen = _placed(clusters.obb, kept, pose)
-        boxes, whole = _completed(seen, kept, objects, pose, config.gate)
+        seen = _move_boxes(clusters.obb, kept, pose)
+        boxes, whole = _complete_boxes(seen, kept, objects, pose, config.gate)
 
         self._predict(dt, config)
         column = self._assign(boxes, whole, seen, pose, config)
         old = np.flatnonzero(column >= 0)
         innovation = np.full(len(column), np.nan, np.float32)
-        measured = self._as_known(
+        measured = self._complete(
             old, boxes.chosen(column[old]), whole[column[old]], seen.chosen(column[old]), pose
         )
         innovation[old] = self._correct(old, measured, config)
@@ -154,7 +154,7 @@ class Tracker:
         ids = self._next + np.arange(len(fresh))
         self._next += len(fresh)
         length, classes = len(self._stamps), len(self._classes)
-        born = _State.new(ids, boxes.chosen(fresh), whole[fresh], frame.stamp, classes, length, config)
+        born = _TrackStates.new(ids, boxes.chosen(fresh), whole[fresh], frame.stamp, classes, length, config)
         self._state = self._state.joined(born)
         cluster = np.concatenate([cluster, kept[fresh]])
         innovation = np.concatenate([innovation, np.full(len(fresh), np.nan, np.float32)])
@@ -205,7 +205,7 @@ class Tracker:
         column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
         return column
 
-    def _as_known(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
+    def _complete(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
         """Complete the measured boxes with sizes from earlier frames. A whole track keeps its size.
 
         If only a part of a whole object is measured, its box is extended away from the sensor. If the whole
@@ -372,7 +372,7 @@ def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:
     return turn - quarters * (np.pi / 2), quarters
 
 
-def _completed(
+def _complete_boxes(
     seen: Boxes3D, kept: NDArray[Any], objects: Objects | None, pose: F64, gate: float
 ) -> tuple[Boxes3D, Bool]:
     """Replace boxes of clusters by whole boxes of objects where known.
@@ -386,16 +386,16 @@ def _completed(
     if objects is None or objects.seen is None or not len(objects) or not len(kept):
         return seen, whole
     place = np.searchsorted(kept, objects.cluster)
-    there = np.append(kept, -2)[place] == objects.cluster
-    there = np.flatnonzero(there & (objects.boxes.size[:, :2].max(axis=1) > gate))
-    named = _placed(objects.boxes, there, pose)
+    is_kept = np.append(kept, -2)[place] == objects.cluster
+    large = np.flatnonzero(is_kept & (objects.boxes.size[:, :2].max(axis=1) > gate))
+    named = _move_boxes(objects.boxes, large, pose)
     boxes = Boxes3D(seen.center.copy(), seen.size.copy(), seen.yaw.copy())
-    rows = place[there]
+    rows = place[large]
     boxes.center[rows], boxes.size[rows], boxes.yaw[rows] = named.center, named.size, named.yaw
     whole[rows] = True
     return boxes, whole
 
 
-def _placed(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
+def _move_boxes(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
     """Move upright boxes into another upright frame."""
     return geometry.moved(boxes.chosen(rows), pose)

@@ -55,14 +55,14 @@ def foreign(config: Config, section: str) -> Foreign | None:
     if not isinstance(plugin.target, type):
         return Foreign(plugin, lambda array: plugin.target(array, *params))
     try:
-        made = plugin.target(*params)
+        instance = plugin.target(*params)
     except Exception as error:  # A user's class may raise anything.
         raise UserError(
             f"{section}: {plugin.name} cannot be made: {type(error).__name__}: {error}"
         ) from error
-    if not callable(made):
-        raise UserError(f"{section}: {plugin.name} makes a {type(made).__name__} that cannot be called")
-    return Foreign(plugin, made)
+    if not callable(instance):
+        raise UserError(f"{section}: {plugin.name} makes a {type(instance).__name__} that cannot be called")
+    return Foreign(plugin, instance)
 
 
 # --- the stages --------------------------------------------------------------------------------
@@ -74,7 +74,7 @@ def ground_of(points: F32, returned: Any, name: str) -> Ground:
     Raises:
         StageError: the function returned something else.
     """
-    mask = _array(name, returned, "a mask", (len(points),), "b")
+    mask = _check_array(name, returned, "a mask", (len(points),), "b")
     return Ground(mask.astype(np.bool_), heights(points, mask))
 
 
@@ -84,10 +84,10 @@ def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str)
     Raises:
         StageError: the function returned something else.
     """
-    labels = _array(name, returned, "labels", (len(points),), "iu").astype(np.int64)
+    labels = _check_array(name, returned, "labels", (len(points),), "iu").astype(np.int64)
     if len(labels) and labels.min() < -1:
         raise StageError(f"{name} returned label {labels.min()}: -1 is noise, 0 the first")
-    return describe(points, _numbered(labels), config)
+    return describe(points, _renumber(labels), config)
 
 
 def detections_of(threshold: float, returned: Any, name: str) -> Detections:
@@ -98,9 +98,9 @@ def detections_of(threshold: float, returned: Any, name: str) -> Detections:
     Raises:
         StageError: the function returned something else.
     """
-    xyxy, score, names = _several(name, returned, "xyxy, score and class names")
-    xyxy = _array(name, xyxy, "boxes xyxy", (-1, 4), "fiu").astype(np.float32)
-    score, names = _scored(name, len(xyxy), score, names)
+    xyxy, score, names = _unpack_three(name, returned, "xyxy, score and class names")
+    xyxy = _check_array(name, xyxy, "boxes xyxy", (-1, 4), "fiu").astype(np.float32)
+    score, names = _check_scores(name, len(xyxy), score, names)
     order = np.argsort(-score, kind="stable")
     kept = score[order] >= threshold
     return Detections(
@@ -123,11 +123,11 @@ def objects_of(returned: Any, name: str, obstacles: F32 | None, clusters: Cluste
     Raises:
         StageError: the function returned something else.
     """
-    rows, score, names = _several(name, returned, "boxes, score and class names")
-    rows = _array(name, rows, "boxes", (-1, 7), "fiu").astype(np.float32)
+    rows, score, names = _unpack_three(name, returned, "boxes, score and class names")
+    rows = _check_array(name, rows, "boxes", (-1, 7), "fiu").astype(np.float32)
     if (rows[:, 3:6] <= 0).any():
         raise StageError(f"{name} returned a box without a volume: its columns are x y z l w h yaw")
-    score, names = _scored(name, len(rows), score, names)
+    score, names = _check_scores(name, len(rows), score, names)
     return placed(Boxes3D(rows[:, :3], rows[:, 3:6], rows[:, 6]), names, score, obstacles, clusters)
 
 
@@ -147,16 +147,16 @@ def placed(
 
     Only kept clusters count. An object without such a cluster gets -1.
     """
-    own = np.full(len(boxes), -1, np.int32)
+    cluster = np.full(len(boxes), -1, np.int32)
     if obstacles is not None and clusters is not None:
         kept = np.append(clusters.kept, False)
         candidates = np.flatnonzero(kept[clusters.labels])  # noise has label -1, the last element
         points, labels = obstacles[candidates], clusters.labels[candidates]
         for k, rows in geometry.inside_each(points, boxes):
             if len(rows):
-                own[k] = np.bincount(labels[rows]).argmax()
-    nobody = np.full(len(boxes), -1, np.int32)
-    return Objects(boxes, tuple(names), score, own, ("",) * len(boxes), nobody)
+                cluster[k] = np.bincount(labels[rows]).argmax()
+    detection = np.full(len(boxes), -1, np.int32)
+    return Objects(boxes, tuple(names), score, cluster, ("",) * len(boxes), detection)
 
 
 def heights(points: F32, ground: Bool) -> F32:
@@ -186,7 +186,7 @@ def heights(points: F32, ground: Bool) -> F32:
 # --- checks of returned values -----------------------------------------------------------------
 
 
-def _array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str) -> NDArray[Any]:
+def _check_array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str) -> NDArray[Any]:
     """Return the value as a finite array of that shape (-1: any length) and kind of dtype."""
     try:
         array = np.asarray(value)
@@ -207,7 +207,7 @@ def _array(name: str, value: Any, what: str, shape: tuple[int, ...], kinds: str)
     return array
 
 
-def _several(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
+def _unpack_three(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
     """Unpack a tuple or list of three values."""
     if not isinstance(value, tuple | list) or len(value) != 3:
         count = f"{len(value)} values" if isinstance(value, tuple | list) else f"a {type(value).__name__}"
@@ -215,9 +215,9 @@ def _several(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
     return value[0], value[1], value[2]
 
 
-def _scored(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[str]]:
+def _check_scores(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[str]]:
     """Check scores and names of boxes."""
-    scores = _array(name, score, "scores", (count,), "fiu").astype(np.float32)
+    scores = _check_array(name, score, "scores", (count,), "fiu").astype(np.float32)
     try:
         listed = [str(text) for text in names]
     except TypeError:
@@ -227,10 +227,10 @@ def _scored(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[st
     return scores, listed
 
 
-def _numbered(labels: NDArray[np.int64]) -> I32:
+def _renumber(labels: NDArray[np.int64]) -> I32:
     """Renumber the clusters in the order of their first points."""
-    found, first, number = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.empty(len(found), np.int32)
-    rank[np.argsort(np.where(found < 0, -1, first), kind="stable")] = np.arange(len(found))
-    noise = int(len(found) > 0 and found[0] < 0)
+    values, first, number = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(values), np.int32)
+    rank[np.argsort(np.where(values < 0, -1, first), kind="stable")] = np.arange(len(values))
+    noise = int(len(values) > 0 and values[0] < 0)
     return np.asarray(rank[number.ravel()] - noise, np.int32)

@@ -8,9 +8,9 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D, Camera
 from bevviz.support.kernel import kernel
 
-STEP = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
-NEARER = np.float32(0.7)  # metres: a return hides a box if it is at least this much nearer
-BELOW, ABOVE = np.float32(np.radians(-40)), np.float32(np.radians(20))
+CELL_ANGLE = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
+OCCLUSION_MARGIN = np.float32(0.7)  # metres: a return hides a box if it is at least this much nearer
+MIN_ELEVATION, MAX_ELEVATION = np.float32(np.radians(-40)), np.float32(np.radians(20))
 NEAR_PLANE = 0.1  # metres before the camera; only the part of a box beyond it is drawn
 
 _EDGES = np.array(
@@ -29,17 +29,17 @@ def image_boxes(boxes: Boxes3D, camera: Camera) -> F32:
         boxes: in the frame of the points.
         camera: without intrinsics and pose every row is NaN.
     """
-    around = np.full((len(boxes), 4), np.nan, np.float32)
+    visible_boxes = np.full((len(boxes), 4), np.nan, np.float32)
     if camera.intrinsics is None or (uv := image_points(boxes, camera)) is None:
-        return around
+        return visible_boxes
     known = np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
     low = np.where(known[..., None], uv, np.inf).min(axis=1)
     high = np.where(known[..., None], uv, -np.inf).max(axis=1)
     limit = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32) - 0.5
     low, high = np.clip(low, -0.5, limit), np.clip(high, -0.5, limit)
-    there = known.any(axis=1) & (high > low).all(axis=1)
-    around[there] = np.hstack([low, high])[there]
-    return around
+    is_visible = known.any(axis=1) & (high > low).all(axis=1)
+    visible_boxes[is_visible] = np.hstack([low, high])[is_visible]
+    return visible_boxes
 
 
 def image_points(boxes: Boxes3D, camera: Camera) -> F32 | None:
@@ -96,7 +96,7 @@ def range_image(points: F32) -> F32:
     away = np.sqrt(flat * flat + z * z)
     # This is outside the loop, because NumPy's vectorised arctan2 is four times as fast.
     elevation, azimuth = np.arctan2(z, flat), np.arctan2(y, x)
-    shape = round(float((ABOVE - BELOW) / STEP)), round(2 * np.pi / float(STEP))
+    shape = round(float((MAX_ELEVATION - MIN_ELEVATION) / CELL_ANGLE)), round(2 * np.pi / float(CELL_ANGLE))
     image = np.full(shape, np.inf, np.float32)
     _keep_nearest(image, elevation, azimuth, away)
     return image
@@ -124,7 +124,7 @@ def visible(image: F32, boxes: Boxes3D) -> F32:
     x, y, z = boxes.center.T
     local = np.column_stack([c * x + s * y, c * y - s * x, z])
     near = np.linalg.norm(np.maximum(np.abs(local) - boxes.size / 2, 0), axis=1)
-    return _open(
+    return _visible_share(
         image,
         np.column_stack([middle + azimuth.min(1), middle + azimuth.max(1)]).astype(np.float32),
         np.column_stack([elevation.min(1), elevation.max(1)]).astype(np.float32),
@@ -137,31 +137,33 @@ def _keep_nearest(image: F32, elevation: F32, azimuth: F32, away: F32) -> None:
     """Write the nearest distance of each cell."""
     rows, columns = image.shape
     for i in range(len(away)):
-        row = int(np.floor((elevation[i] - BELOW) / STEP))
+        row = int(np.floor((elevation[i] - MIN_ELEVATION) / CELL_ANGLE))
         if 0 <= row < rows:
-            column = int(np.floor((azimuth[i] + np.pi) / STEP)) % columns
+            column = int(np.floor((azimuth[i] + np.pi) / CELL_ANGLE)) % columns
             if away[i] < image[row, column]:
                 image[row, column] = away[i]
 
 
 @kernel
-def _open(image: F32, azimuth: F32, elevation: F32, near: F32) -> F32:
-    """Return the (K,) share of cells between the angles without a return nearer than ``near`` - NEARER."""
+def _visible_share(image: F32, azimuth: F32, elevation: F32, near: F32) -> F32:
+    """Return the (K,) share of cells between the angles without a return nearer than ``near``."""
     rows, columns = image.shape
-    found = np.ones(len(near), np.float32)
+    share = np.ones(len(near), np.float32)
     for k in range(len(near)):
         if azimuth[k, 1] - azimuth[k, 0] > np.pi:
             continue
-        first, last = _cells((azimuth[k, 0] + np.pi) / STEP, (azimuth[k, 1] + np.pi) / STEP)
-        low, high = _cells((elevation[k, 0] - BELOW) / STEP, (elevation[k, 1] - BELOW) / STEP)
-        all_of, hidden = 0, 0
+        first, last = _cells((azimuth[k, 0] + np.pi) / CELL_ANGLE, (azimuth[k, 1] + np.pi) / CELL_ANGLE)
+        low, high = _cells(
+            (elevation[k, 0] - MIN_ELEVATION) / CELL_ANGLE, (elevation[k, 1] - MIN_ELEVATION) / CELL_ANGLE
+        )
+        total, hidden = 0, 0
         for row in range(max(low, 0), min(high, rows)):
             for column in range(first, last):
-                all_of += 1
-                hidden += image[row, column % columns] < near[k] - NEARER
-        if all_of:
-            found[k] = np.float32(1 - hidden / all_of)
-    return found
+                total += 1
+                hidden += image[row, column % columns] < near[k] - OCCLUSION_MARGIN
+        if total:
+            share[k] = np.float32(1 - hidden / total)
+    return share
 
 
 @kernel

@@ -60,7 +60,7 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
 @kernel
 def of_points(values: NDArray[S], inverse: I32) -> NDArray[S]:
     """Return the (N,) values of the points, each copied from the voxel of the point."""
-    found = np.empty(len(inverse), values.dtype)
+    result = np.empty(len(inverse), values.dtype)
     for i in range(len(inverse)):
-        found[i] = values[inverse[i]]
-    return found
+        result[i] = values[inverse[i]]
+    return result

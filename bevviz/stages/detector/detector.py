@@ -16,7 +16,7 @@ from bevviz.errors import UserError
 from bevviz.model.frame import I32, U8
 from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector.image import Placement
-from bevviz.stages.detector.layouts import Facts, find_head
+from bevviz.stages.detector.layouts import ModelFacts, find_head
 from bevviz.stages.detector.masks import masks as make_masks
 from bevviz.stages.detector.metadata import DEFAULT_STRIDE, stated_size, stated_stride
 from bevviz.stages.detector.names import metadata_names, read_names
@@ -88,7 +88,7 @@ class Detector:
             size[1] if self._is_open[1] else width,
         )
         self._check_size()
-        facts = Facts(
+        facts = ModelFacts(
             metadata=metadata,
             inputs=tuple(i.name for i in (image, *others)),
             dtype=self._dtype,
@@ -142,24 +142,24 @@ class Detector:
         blob, where = self.prepare(bgr)
         return Inference(tuple(self._run(self._head.wanted, blob).values()), where)
 
-    def interpret(self, found: Inference) -> Detections:
+    def interpret(self, inference: Inference) -> Detections:
         """Apply the thresholds to the network's output. The result is that of ``__call__``.
 
         Raises:
             UserError: as in ``__call__``.
         """
-        config, where = self._config, found.where
+        config, where = self._config, inference.where
         with reading(self._where):
             xyxy, score, class_id, table_row = self._head.candidates(
-                found.outputs, where.input_size, config.explain_threshold
+                inference.outputs, where.input_size, config.explain_threshold
             )
-        sound = np.isfinite(xyxy).all(axis=1)
+        is_valid = np.isfinite(xyxy).all(axis=1)
         if self._wanted is not None:
-            sound &= np.isin(class_id, self._wanted)
-        order = np.flatnonzero(sound)
+            is_valid &= np.isin(class_id, self._wanted)
+        order = np.flatnonzero(is_valid)
         order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
         xyxy, score, class_id = xyxy[order], score[order], class_id[order]
-        inner = xyxy
+        input_xyxy = xyxy
 
         offset = self.layout.class_offset
         if offset is None:
@@ -170,20 +170,22 @@ class Detector:
         # too.
         xyxy = where.to_image(xyxy)
         np.clip(xyxy, 0, np.array(where.image_size[::-1] * 2, np.float32), out=xyxy)
-        seen = (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
-        seen &= (suppressor < 0) | seen[suppressor]
+        is_visible = (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1])
+        is_visible &= (suppressor < 0) | is_visible[suppressor]
         state = np.where(score >= config.conf_threshold, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD)
         state[suppressor >= 0] = DetectionState.SUPPRESSED
 
-        row = _best(np.flatnonzero(seen), state, config.max_candidates)
+        row = _best(np.flatnonzero(is_visible), state, config.max_candidates)
         suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
         masks = None
         if self._head.prototypes:
             kept = np.flatnonzero(state[row] == DetectionState.KEPT)
-            weighed = table_row[order[row[kept]]]
+            mask_rows = table_row[order[row[kept]]]
             with reading(self._where):
-                weights = self._head.coefficients(found.outputs, weighed)
-                masks = make_masks(weights, found.outputs[-1][0], inner[row[kept]], kept, len(row), where)
+                weights = self._head.coefficients(inference.outputs, mask_rows)
+                masks = make_masks(
+                    weights, inference.outputs[-1][0], input_xyxy[row[kept]], kept, len(row), where
+                )
         return Detections(
             xyxy=xyxy[row] - np.float32(0.5),  # networks count pixels from the corner of the first pixel
             score=score[row],
@@ -198,16 +200,16 @@ class Detector:
     def _check_inputs(self, image: Any, others: list[Any]) -> None:
         """Raise a UserError if the inputs are not those of a detector."""
         shape = image.shape
-        found = listed((i.name, i.shape) for i in (image, *others))
+        inputs = listed((i.name, i.shape) for i in (image, *others))
         batch = shape[0] if self._rank == 4 and isinstance(shape[0], int) else 1
         sizes = [i.type == "tensor(int64)" and len(i.shape) == 2 and i.shape[1] == 2 for i in others]
         if self._rank not in (3, 4) or shape[-3] != 3 or len(sizes) > 1 or not all(sizes):
             raise UserError(
-                f"{self._where}: no detector of one colour image [1, 3, height, width]; its inputs: {found}"
+                f"{self._where}: no detector of one colour image [1, 3, height, width]; its inputs: {inputs}"
             )
         if batch != 1:
             raise UserError(
-                f"{self._where}: takes {batch} images at a time ({found}); export it with a batch of 1"
+                f"{self._where}: takes {batch} images at a time ({inputs}); export it with a batch of 1"
             )
         if image.type not in TYPES:
             raise UserError(f"{self._where}: its input is {image.type}; supported: {', '.join(TYPES)}")
@@ -223,10 +225,10 @@ class Detector:
 
     def _run(self, outputs: list[str] | None, blob: Any) -> dict[str, Any]:
         """Run the network on one blob and return the outputs by name."""
-        given = {self._input: blob if self._rank == 4 else blob[0]}
+        feed = {self._input: blob if self._rank == 4 else blob[0]}
         if self._sized is not None:
-            given[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of it
-        return self._session.run(given, outputs)
+            feed[self._sized] = np.array([blob.shape[:1:-1]], np.int64)  # boxes come in pixels of it
+        return self._session.run(feed, outputs)
 
     def _probe(self) -> dict[str, Any]:
         """Run the network on grey patches without objects. The output helps to find the layout.

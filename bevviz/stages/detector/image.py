@@ -11,10 +11,10 @@ import numpy as np
 
 from bevviz.model.frame import F32, U8
 
-GREY = 114  # grey of the letterbox's border, the same in all these families
+BORDER_GREY = 114  # grey of the letterbox's border, the same in all these families
 
 
-class Fit(Enum):
+class ImageFit(Enum):
     """How an image is fitted into an input of another shape."""
 
     CENTRE = "letterbox, the image in its middle"
@@ -50,10 +50,10 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class Feed:
+class InputFormat:
     """Input that a family of networks was trained with, in float32."""
 
-    fit: Fit
+    fit: ImageFit
     rgb: bool = True
     divisor: float = 255.0  # 1 keeps values of 0..255
     resampling: Resampling = Resampling.FOUR
@@ -72,16 +72,18 @@ class Feed:
             is_open: for height and width, whether the axis may be smaller.
             stride: pixels; an open axis is a multiple of this.
         """
-        if self.fit is Fit.STRETCH:
+        if self.fit is ImageFit.STRETCH:
             return Placement(size, size, (0, 0), image_size)
-        if self.fit is Fit.NATIVE and all(is_open):
+        if self.fit is ImageFit.NATIVE and all(is_open):
             return Placement(image_size, image_size, (0, 0), image_size)
-        given, whole = np.array(image_size), np.array(size)
-        exact = given * float(np.min((whole - self.margin) / given))
+        original, available = np.array(image_size), np.array(size)
+        exact = original * float(np.min((available - self.margin) / original))
         # Megvii truncates the size of the resized image, the other families round it.
-        inner = np.maximum(exact.astype(int) if self.fit is Fit.CORNER else np.rint(exact).astype(int), 1)
-        outer = np.where(is_open, -(-inner // stride) * stride, whole)
-        corner = 0 * outer if self.fit is Fit.CORNER else (outer - inner) // 2
+        inner = np.maximum(
+            exact.astype(int) if self.fit is ImageFit.CORNER else np.rint(exact).astype(int), 1
+        )
+        outer = np.where(is_open, -(-inner // stride) * stride, available)
+        corner = 0 * outer if self.fit is ImageFit.CORNER else (outer - inner) // 2
         (h, w), (height, width), (top, left) = outer.tolist(), inner.tolist(), corner.tolist()
         return Placement((h, w), (height, width), (top, left), image_size)
 
@@ -101,7 +103,7 @@ class Feed:
                 inner = cv2.resize(inner, (width, height))
         canvas = inner
         if where.inner != where.input_size:
-            canvas = np.full((*where.input_size, 3), GREY, inner.dtype)
+            canvas = np.full((*where.input_size, 3), BORDER_GREY, inner.dtype)
             canvas[top : top + height, left : left + width] = inner
         blob = cv2.dnn.blobFromImage(canvas, swapRB=self.rgb)
         if canvas.dtype == np.uint8 and self.divisor != 1:

@@ -15,15 +15,15 @@ import numpy as np
 
 from bevviz.model.frame import I64
 from bevviz.stages.detector import outputs as read
-from bevviz.stages.detector.image import Feed, Fit, Resampling
+from bevviz.stages.detector.image import ImageFit, InputFormat, Resampling
 from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, default_names
-from bevviz.stages.detector.outputs import Boxes, Candidates, Listed, Scored
+from bevviz.stages.detector.outputs import BoxFormat, Candidates, ListedBoxes, ScoredBoxes
 from bevviz.stages.detector.session import clip, listed
 
 CLASS_OFFSET = 7680.0  # pixels by which Ultralytics shifts the boxes of each class in its NMS
 
 
-class Found(NamedTuple):
+class LayoutMatch(NamedTuple):
     """Outputs to read with a layout."""
 
     outputs: tuple[str, ...]
@@ -31,7 +31,7 @@ class Found(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class ModelFacts:
     """Facts that a model file shows without documentation."""
 
     metadata: Mapping[str, str]
@@ -65,20 +65,20 @@ class Facts:
 
     def named(self, *names: str) -> tuple[str, ...] | None:
         """Return the outputs with these names, also after a graph's name. Return None if one is missing."""
-        found = [[o for o in self.outputs if o == name or o.endswith(f"_{name}")] for name in names]
-        return tuple(o[0] for o in found) if all(len(o) == 1 for o in found) else None
+        matches = [[o for o in self.outputs if o == name or o.endswith(f"_{name}")] for name in names]
+        return tuple(o[0] for o in matches) if all(len(o) == 1 for o in matches) else None
 
     def classes(self, columns: int) -> int | str:
         """Return how many of the columns after the boxes are classes, or why that is impossible."""
         if self.names is None:
             return columns - self.masks if columns > self.masks else "it has no scores of classes"
-        more = columns - len(self.names)
-        if more in (0, self.masks) or (more > 0 and self.task in ("segment", "pose")):
+        extra = columns - len(self.names)
+        if extra in (0, self.masks) or (extra > 0 and self.task in ("segment", "pose")):
             return len(self.names)
         return f"it scores {columns} classes, but has {len(self.names)} class names"
 
 
-Finder = Callable[[Facts], Found | str | None]
+Finder = Callable[[ModelFacts], LayoutMatch | str | None]
 """Which outputs to read; None: it is another layout; a sentence: it is this one, but cannot be read."""
 
 
@@ -88,9 +88,9 @@ class Layout:
 
     name: str
     find: Finder
-    split: Callable[..., Scored | Listed]
-    boxes: Boxes
-    feed: Feed
+    split: Callable[..., ScoredBoxes | ListedBoxes]
+    boxes: BoxFormat
+    feed: InputFormat
     class_offset: float | None = None  # pixels, for the NMS; None: the network does its own NMS
     batch: bool = True  # the first axis of the outputs is the batch
     background: bool = False  # class 0 is the background
@@ -114,7 +114,7 @@ class Head:
         """Names of all outputs to read."""
         return [*self.outputs, *filter(None, [self.prototypes])]
 
-    def split(self, outputs: Sequence[Any]) -> Scored | Listed:
+    def split(self, outputs: Sequence[Any]) -> ScoredBoxes | ListedBoxes:
         """Split the outputs into boxes, scores and classes."""
         batch = self.layout.batch
         return self.layout.split(self.classes, *(output[0] if batch else output for output in outputs))
@@ -131,65 +131,65 @@ class Head:
             ValueError: the numbers contradict the layout.
         """
         split = self.split(outputs[: len(self.outputs)])
-        found = read.candidates(split, self.layout.boxes, size, least)
-        class_id = split.class_id[split.score >= least] if isinstance(split, Listed) else found.class_id
-        wrong = read.wrong_list(found.score, class_id, self.names)
+        best = read.candidates(split, self.layout.boxes, size, least)
+        class_id = split.class_id[split.score >= least] if isinstance(split, ListedBoxes) else best.class_id
+        wrong = read.wrong_list(best.score, class_id, self.names)
         if wrong:
             raise ValueError(f"read as {self.layout}, {wrong}")
-        return found
+        return best
 
     def coefficients(self, outputs: Sequence[Any], rows: I64) -> Any:
         """Return the (K, C) weights of the prototypes in these rows. They are the last columns."""
         table = outputs[0][0].T if self.layout.split is read.columns else outputs[0][0]
         return table[rows, -outputs[-1].shape[1] :]
 
-    def doubt(self, facts: Facts) -> str:
+    def doubt(self, facts: ModelFacts) -> str:
         """Return why the outputs for an image without objects contradict the layout, empty if they do not."""
-        found = self.split([facts.outputs[name] for name in self.outputs])
-        if isinstance(found, Listed):
-            real = found.score > 0
-            found = Listed(*(column[real] for column in found))
-            wrong = read.wrong_list(found.score, found.class_id, self.names)
+        split = self.split([facts.outputs[name] for name in self.outputs])
+        if isinstance(split, ListedBoxes):
+            is_real = split.score > 0
+            split = ListedBoxes(*(column[is_real] for column in split))
+            wrong = read.wrong_list(split.score, split.class_id, self.names)
         else:
             counted = facts.ultralytics or facts.names is not None or self.classes == len(COCO)
-            wrong = read.wrong_scores(found, counted)
-        return wrong or read.wrong_boxes(found.boxes, self.layout.boxes, facts.ultralytics)
+            wrong = read.wrong_scores(split, counted)
+        return wrong or read.wrong_boxes(split.boxes, self.layout.boxes, facts.ultralytics)
 
 
 # --- rules that distinguish layouts ------------------------------------------------------------
 
 
-def _in_a_table(find: Callable[[Facts, str, Any], Found | str | None]) -> Finder:
+def _in_a_table(find: Callable[[ModelFacts, str, Any], LayoutMatch | str | None]) -> Finder:
     """Apply ``find`` to each table until one matches.
 
     There is no match if the boxes have a table of their own.
     """
 
-    def find_in_any(facts: Facts) -> Found | str | None:
+    def find_in_any(facts: ModelFacts) -> LayoutMatch | str | None:
         if any(table.shape[1] == 4 for table in facts.tables.values()):
             return None
         reason = None
         for name, table in facts.tables.items():
-            answer = find(facts, name, table)
-            if isinstance(answer, Found):
-                return answer
-            reason = reason or answer
+            match = find(facts, name, table)
+            if isinstance(match, LayoutMatch):
+                return match
+            reason = reason or match
         return reason
 
     return find_in_any
 
 
-def _found(outputs: tuple[str, ...], classes: int | str) -> Found | str:
+def _match(outputs: tuple[str, ...], classes: int | str) -> LayoutMatch | str:
     """Return the match, or the reason why it cannot be read."""
-    return classes if isinstance(classes, str) else Found(outputs, classes)
+    return classes if isinstance(classes, str) else LayoutMatch(outputs, classes)
 
 
-def _whole(values: Any) -> bool:
+def _are_whole_numbers(values: Any) -> bool:
     """Return whether all values are whole numbers."""
     return bool((values == np.rint(values)).all())
 
 
-def _is_rtdetr(facts: Facts) -> bool:
+def _is_rtdetr(facts: ModelFacts) -> bool:
     """Return whether it is an RT-DETR of Ultralytics. Older files do not name the head."""
     head = facts.metadata.get("head")
     described = "rtdetr" in facts.metadata.get("description", "").lower()
@@ -197,25 +197,25 @@ def _is_rtdetr(facts: Facts) -> bool:
 
 
 @_in_a_table
-def _rtdetr_list(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _rtdetr_list(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find an RT-DETR of Ultralytics with a list of boxes."""
-    listed = table.shape[1] == 6 and _whole(table[:, 5])
-    return Found((name,)) if listed and _is_rtdetr(facts) else None
+    listed = table.shape[1] == 6 and _are_whole_numbers(table[:, 5])
+    return LayoutMatch((name,)) if listed and _is_rtdetr(facts) else None
 
 
 @_in_a_table
-def _rtdetr_scores(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _rtdetr_scores(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find an RT-DETR of Ultralytics with a score of each class."""
-    return _found((name,), facts.classes(table.shape[1] - 4)) if _is_rtdetr(facts) else None
+    return _match((name,), facts.classes(table.shape[1] - 4)) if _is_rtdetr(facts) else None
 
 
-def _rtdetr_repository(facts: Facts) -> Found | str | None:
+def _rtdetr_repository(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find an RT-DETR or D-FINE of the authors' repositories."""
     names = facts.named("boxes", "scores", "labels")
-    return Found(names) if names and "orig_target_sizes" in facts.inputs else None
+    return LayoutMatch(names) if names and "orig_target_sizes" in facts.inputs else None
 
 
-def _rfdetr(facts: Facts) -> Found | str | None:
+def _rfdetr(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find an RF-DETR."""
     names = facts.named("dets", "labels")
     if names is None or any(name not in facts.tables for name in names):
@@ -225,32 +225,32 @@ def _rfdetr(facts: Facts) -> Found | str | None:
     classes = columns if columns == len(COCO_CATEGORIES) else columns - 1
     if facts.names is not None and len(facts.names) != classes:
         return f"it scores {classes} classes, but has {len(facts.names)} class names"
-    return Found(names, classes)
+    return LayoutMatch(names, classes)
 
 
 def _supergradients(*names: str) -> Finder:
     """Return a finder of YOLO-NAS with these outputs."""
 
-    def find(facts: Facts) -> Found | str | None:
-        found = facts.named(*names)
-        if found and facts.dtype is not np.uint8:
+    def find(facts: ModelFacts) -> LayoutMatch | str | None:
+        outputs = facts.named(*names)
+        if outputs and facts.dtype is not np.uint8:
             return "nothing tells how YOLO-NAS wants its pixels: export it with preprocessing=True"
-        return Found(found) if found else None
+        return LayoutMatch(outputs) if outputs else None
 
     return find
 
 
-def _torchvision(facts: Facts) -> Found | str | None:
+def _torchvision(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find a torchvision detector."""
     if facts.rank != 3:
         return None
     boxes = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 4]
     score = [name for name, o in facts.outputs.items() if o.ndim == 1 and o.dtype.kind == "f"]
     label = [name for name, o in facts.outputs.items() if o.ndim == 1 and o.dtype.kind == "i"]
-    return Found((boxes[0], score[0], label[0])) if boxes and score and label else None
+    return LayoutMatch((boxes[0], score[0], label[0])) if boxes and score and label else None
 
 
-def _two_tables(facts: Facts) -> Found | str | None:
+def _two_tables(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find a model with one table of boxes and one of scores."""
     shapes = {name: table.shape for name, table in facts.tables.items()}
     boxes = next((name for name, shape in shapes.items() if shape[1] == 4), None)
@@ -261,165 +261,167 @@ def _two_tables(facts: Facts) -> Found | str | None:
         return None
     if not facts.ultralytics:
         return "nothing tells how it wants its image; export YOLO-NAS with its pre- and postprocessing"
-    return _found((boxes, scores[0]), facts.classes(shapes[scores[0]][1]))
+    return _match((boxes, scores[0]), facts.classes(shapes[scores[0]][1]))
 
 
-def _yolov7_list(facts: Facts) -> Found | str | None:
+def _yolov7_list(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find a YOLOv7 with NMS."""
     lists = [name for name, o in facts.outputs.items() if o.ndim == 2 and o.shape[1] == 7]
-    return Found((lists[0],)) if lists else None
+    return LayoutMatch((lists[0],)) if lists else None
 
 
 @_in_a_table
-def _yolov8(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _yolov8(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a YOLOv8 or one of its relatives."""
     rows, columns = table.shape
     # These boxes are decoded already, so the right number of classes is sufficient.
     known = columns in read.cells(facts.size) or (facts.names is not None and rows - 4 == len(facts.names))
-    return _found((name,), facts.classes(rows - 4)) if known and columns > rows > 4 else None
+    return _match((name,), facts.classes(rows - 4)) if known and columns > rows > 4 else None
 
 
-def _with_objectness(facts: Facts, name: str, table: Any, anchors: int) -> Found | str | None:
+def _with_objectness(facts: ModelFacts, name: str, table: Any, anchors: int) -> LayoutMatch | str | None:
     """Find a table with a row for each anchor of each cell: box, objectness, classes."""
     rows, columns = table.shape
     # The rows could also be a list, usually of 300. Therefore only complete pyramids count.
     pyramids = [count for count, strides in read.cells(facts.size).items() if {8, 16, 32} <= set(strides)]
     if rows % anchors or rows // anchors not in pyramids or columns < 6:
         return None
-    if facts.ultralytics or (columns == 6 and table[:, 5].any() and _whole(table[:, 5])):
+    if facts.ultralytics or (columns == 6 and table[:, 5].any() and _are_whole_numbers(table[:, 5])):
         return None  # no head of Ultralytics has an objectness, and whole numbers are the classes of a list
-    return _found((name,), facts.classes(columns - 5))
+    return _match((name,), facts.classes(columns - 5))
 
 
 @_in_a_table
-def _yolov5(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _yolov5(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a YOLOv5."""
     return _with_objectness(facts, name, table, anchors=3)
 
 
 @_in_a_table
-def _yolox(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _yolox(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a YOLOX."""
-    found = _with_objectness(facts, name, table, anchors=1)
+    match = _with_objectness(facts, name, table, anchors=1)
     # The coordinates are in strides. Pixels would be distributed over the whole input.
-    return found if found is not None and np.median(np.abs(table[:, :2])) <= 8 else None
+    return match if match is not None and np.median(np.abs(table[:, :2])) <= 8 else None
 
 
 @_in_a_table
-def _yolov6(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _yolov6(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a YOLOv6. Its objectness is constant."""
     constant = table.shape[1] > 4 and (table[:, 4] == 1).all()
     return _with_objectness(facts, name, table, anchors=1) if constant else None
 
 
 @_in_a_table
-def _yolox_decoded(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _yolox_decoded(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a YOLOX with decoded boxes."""
-    found = _with_objectness(facts, name, table, anchors=1)
-    if isinstance(found, Found) and facts.names is None and found.classes != len(COCO):
+    match = _with_objectness(facts, name, table, anchors=1)
+    if isinstance(match, LayoutMatch) and facts.names is None and match.classes != len(COCO):
         return "its fifth column may be an objectness or a class: set detector.names"
-    return found
+    return match
 
 
 @_in_a_table
-def _end_to_end(facts: Facts, name: str, table: Any) -> Found | str | None:
+def _end_to_end(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find a list of boxes after NMS inside the network."""
-    said = facts.metadata.get("end2end") == "True" or "'nms': True" in facts.metadata.get("args", "")
-    more = table.shape[1] - 6
-    known = more in (0, facts.masks) or (more > 0 and facts.ultralytics and said)
-    return Found((name,)) if known else None
+    has_nms = facts.metadata.get("end2end") == "True" or "'nms': True" in facts.metadata.get("args", "")
+    extra = table.shape[1] - 6
+    known = extra in (0, facts.masks) or (extra > 0 and facts.ultralytics and has_nms)
+    return LayoutMatch((name,)) if known else None
 
 
 # --- the table ---------------------------------------------------------------------------------
 
-LETTERBOX = Feed(Fit.CENTRE)
-SQUARE = Feed(Fit.STRETCH)
-MEGVII = Feed(Fit.CORNER, rgb=False, divisor=1)
-DETR = Feed(Fit.STRETCH, resampling=Resampling.ALL)
-ROBOFLOW = Feed(
-    Fit.STRETCH, resampling=Resampling.UNROUNDED, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
+LETTERBOX = InputFormat(ImageFit.CENTRE)
+SQUARE = InputFormat(ImageFit.STRETCH)
+MEGVII = InputFormat(ImageFit.CORNER, rgb=False, divisor=1)
+DETR = InputFormat(ImageFit.STRETCH, resampling=Resampling.ALL)
+ROBOFLOW = InputFormat(
+    ImageFit.STRETCH, resampling=Resampling.UNROUNDED, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
 )
-DECI = Feed(Fit.CENTRE, divisor=1, margin=4)  # the network divides the pixels itself
-NATIVE = Feed(Fit.NATIVE)
+DECI = InputFormat(ImageFit.CENTRE, divisor=1, margin=4)  # the network divides the pixels itself
+NATIVE = InputFormat(ImageFit.NATIVE)
 
 NAS_LISTS = _supergradients("pred_boxes", "pred_scores", "pred_classes")
 NAS_LIST = _supergradients("flat_predictions")
 
 # The first match counts. Layouts with typical names or metadata come before layouts with only a shape.
 LAYOUTS = (
-    Layout("RT-DETR", _rtdetr_list, read.one_list(0, 4, 5), Boxes.FRACTIONS, SQUARE),
-    Layout("RT-DETR", _rtdetr_scores, read.rows, Boxes.FRACTIONS, SQUARE),
-    Layout("RT-DETR or D-FINE", _rtdetr_repository, read.three_lists, Boxes.CORNERS, DETR),
-    Layout("RF-DETR", _rfdetr, read.queries, Boxes.FRACTIONS, ROBOFLOW),
-    Layout("YOLO-NAS", NAS_LISTS, read.three_lists, Boxes.CORNERS, DECI),
-    Layout("YOLO-NAS", NAS_LIST, read.one_list(1, 5, 6), Boxes.CORNERS, DECI, batch=False),
-    Layout("YOLO-NAS", _two_tables, read.two_tables, Boxes.CORNERS, LETTERBOX, CLASS_OFFSET),
+    Layout("RT-DETR", _rtdetr_list, read.one_list(0, 4, 5), BoxFormat.FRACTIONS, SQUARE),
+    Layout("RT-DETR", _rtdetr_scores, read.rows, BoxFormat.FRACTIONS, SQUARE),
+    Layout("RT-DETR or D-FINE", _rtdetr_repository, read.three_lists, BoxFormat.CORNERS, DETR),
+    Layout("RF-DETR", _rfdetr, read.queries, BoxFormat.FRACTIONS, ROBOFLOW),
+    Layout("YOLO-NAS", NAS_LISTS, read.three_lists, BoxFormat.CORNERS, DECI),
+    Layout("YOLO-NAS", NAS_LIST, read.one_list(1, 5, 6), BoxFormat.CORNERS, DECI, batch=False),
+    Layout("YOLO-NAS", _two_tables, read.two_tables, BoxFormat.CORNERS, LETTERBOX, CLASS_OFFSET),
     Layout(
-        "torchvision", _torchvision, read.three_lists, Boxes.CORNERS, NATIVE, batch=False, background=True
+        "torchvision", _torchvision, read.three_lists, BoxFormat.CORNERS, NATIVE, batch=False, background=True
     ),
-    Layout("YOLOv7 with NMS", _yolov7_list, read.one_list(1, 6, 5), Boxes.CORNERS, LETTERBOX, batch=False),
-    Layout("YOLOv8", _yolov8, read.columns, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
-    Layout("YOLOv5", _yolov5, read.rows_with_objectness, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
-    Layout("YOLOv6", _yolov6, read.rows_with_objectness, Boxes.CENTRE, LETTERBOX, CLASS_OFFSET),
-    Layout("YOLOX", _yolox, read.rows_with_objectness, Boxes.CELLS, MEGVII, 0.0),
-    Layout("YOLOX decoded", _yolox_decoded, read.rows_with_objectness, Boxes.CENTRE, MEGVII, 0.0),
-    Layout("end-to-end", _end_to_end, read.one_list(0, 4, 5), Boxes.CORNERS, LETTERBOX),
+    Layout(
+        "YOLOv7 with NMS", _yolov7_list, read.one_list(1, 6, 5), BoxFormat.CORNERS, LETTERBOX, batch=False
+    ),
+    Layout("YOLOv8", _yolov8, read.columns, BoxFormat.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOv5", _yolov5, read.rows_with_objectness, BoxFormat.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOv6", _yolov6, read.rows_with_objectness, BoxFormat.CENTRE, LETTERBOX, CLASS_OFFSET),
+    Layout("YOLOX", _yolox, read.rows_with_objectness, BoxFormat.CELLS, MEGVII, 0.0),
+    Layout("YOLOX decoded", _yolox_decoded, read.rows_with_objectness, BoxFormat.CENTRE, MEGVII, 0.0),
+    Layout("end-to-end", _end_to_end, read.one_list(0, 4, 5), BoxFormat.CORNERS, LETTERBOX),
 )
 SUPPORTED = ", ".join(dict.fromkeys(map(str, LAYOUTS)))
 
 
-def find_head(facts: Facts) -> Head:
+def find_head(facts: ModelFacts) -> Head:
     """Find out how to read a model.
 
     Raises:
         ValueError: the model cannot be read. The message says why, and how to fix it.
     """
-    stranger = _stranger(facts)
-    if stranger:
-        raise ValueError(stranger)
+    unsupported = _unsupported_family(facts)
+    if unsupported:
+        raise ValueError(unsupported)
     reason = "no detector that is known here"
     for layout in LAYOUTS:
-        found = layout.find(facts)
-        if isinstance(found, Found):
-            names = _names(layout, found, facts)
-            head = Head(layout, found.outputs, found.classes, names, _prototypes(layout, found, facts))
-            doubt = _bytes(layout, facts) or head.doubt(facts)
+        match = layout.find(facts)
+        if isinstance(match, LayoutMatch):
+            names = _names(layout, match, facts)
+            head = Head(layout, match.outputs, match.classes, names, _prototypes(layout, match, facts))
+            doubt = _byte_input_problem(layout, facts) or head.doubt(facts)
             if not doubt:
                 return head
-            found = f"read as {layout}, {doubt}"
-        if found is not None:
-            reason = found
+            match = f"read as {layout}, {doubt}"
+        if match is not None:
+            reason = match
             break
     shapes = listed((name, np.shape(output)) for name, output in facts.outputs.items())
     raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
 
 
-def _prototypes(layout: Layout, found: Found, facts: Facts) -> str:
+def _prototypes(layout: Layout, match: LayoutMatch, facts: ModelFacts) -> str:
     """Return the output with mask prototypes if the table has weights for it, else an empty name."""
-    by_columns, listed = layout.split is read.columns, found.classes is None
-    if len(found.outputs) > 1 or found.outputs[0] not in facts.tables or not facts.masks:
+    by_columns, listed = layout.split is read.columns, match.classes is None
+    if len(match.outputs) > 1 or match.outputs[0] not in facts.tables or not facts.masks:
         return ""
-    table = facts.tables[found.outputs[0]]
-    known = 6 if listed else (4 if by_columns else 5) + (found.classes or 0)
+    table = facts.tables[match.outputs[0]]
+    known = 6 if listed else (4 if by_columns else 5) + (match.classes or 0)
     if table.shape[0 if by_columns else 1] - known != facts.masks:
         return ""
     return next(name for name, o in facts.outputs.items() if o.ndim == 4 and o.shape[1] == facts.masks)
 
 
-def _names(layout: Layout, found: Found, facts: Facts) -> tuple[str, ...]:
+def _names(layout: Layout, match: LayoutMatch, facts: ModelFacts) -> tuple[str, ...]:
     """Return the class names, with a background class if the layout has one."""
-    if (found.classes or 0) > MAX_CLASSES:
+    if (match.classes or 0) > MAX_CLASSES:
         raise ValueError(
-            f"read as {layout}, it scores {found.classes:,} classes, "
+            f"read as {layout}, it scores {match.classes:,} classes, "
             f"and no more than {MAX_CLASSES:,} are read"
         )
-    names = facts.names or default_names(found.classes)
+    names = facts.names or default_names(match.classes)
     if names and layout.background and names[0].strip("_").lower() != "background":
         return ("background", *names)
     return names
 
 
-def _bytes(layout: Layout, facts: Facts) -> str:
+def _byte_input_problem(layout: Layout, facts: ModelFacts) -> str:
     """Return why an input of bytes cannot be used, else empty.
 
     The colour order of such an input is known only for networks that divide the pixels themselves.
@@ -429,7 +431,7 @@ def _bytes(layout: Layout, facts: Facts) -> str:
     return ""
 
 
-def _stranger(facts: Facts) -> str:
+def _unsupported_family(facts: ModelFacts) -> str:
     """Return why a known family cannot be read and how to fix it, else empty."""
     names, maps = set(facts.outputs), [o for o in facts.outputs.values() if o.ndim in (4, 5)]
     if facts.ultralytics and facts.task not in ("", "detect", "segment", "pose"):

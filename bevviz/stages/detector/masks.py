@@ -31,10 +31,10 @@ def masks(coefficients: F32, prototypes: F32, xyxy: F32, rows: I64, count: int, 
     edges = np.ceil(np.clip(xyxy, 0, np.array([width, height] * 2, np.float32))).astype(int)
     place, cells = np.zeros((count, 4), np.int32), [np.zeros(0, bool)] * count
     for values, (x0, y0, x1, y1), row in zip(logits, edges.tolist(), rows.tolist(), strict=True):
-        found = _enlarged(values, (height, width), x0, y0, x1, y1) > 0
-        if found.any():
+        mask = _enlarged(values, (height, width), x0, y0, x1, y1) > 0
+        if mask.any():
             place[row] = x0, y0, x1 - x0, y1 - y0
-            cells[row] = found.ravel()
+            cells[row] = mask.ravel()
     scale = [inner / image for inner, image in zip(where.inner[::-1], where.image_size[::-1], strict=True)]
     grid = np.array([*scale, *where.corner[::-1]], np.float32)
     return Masks(np.packbits(np.concatenate([*cells, np.zeros(0, bool)])), place, grid)
@@ -48,5 +48,5 @@ def _enlarged(values: F32, size: tuple[int, int], x0: int, y0: int, x1: int, y1:
     left, top = max(x0 // fx - 1, 0), max(y0 // fy - 1, 0)
     part = values[top : -(-y1 // fy) + 1, left : -(-x1 // fx) + 1]
     large = cv2.resize(part, (part.shape[1] * fx, part.shape[0] * fy), interpolation=cv2.INTER_LINEAR)
-    found: F32 = large[y0 - top * fy : y1 - top * fy, x0 - left * fx : x1 - left * fx]
-    return found
+    crop: F32 = large[y0 - top * fy : y1 - top * fy, x0 - left * fx : x1 - left * fx]
+    return crop

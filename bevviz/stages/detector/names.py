@@ -27,11 +27,11 @@ COCO = (
 )  # fmt: skip
 # COCO's annotations number 80 categories up to 90. These ids are unused, and 0 is the background.
 COCO_GAPS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-_found = iter(COCO)
+_coco_names = iter(COCO)
 COCO_CATEGORIES = tuple(
-    "background" if i == 0 else f"unused_{i}" if i in COCO_GAPS else next(_found) for i in range(91)
+    "background" if i == 0 else f"unused_{i}" if i in COCO_GAPS else next(_coco_names) for i in range(91)
 )
-GIVEN = dict(zip(CLASS_LISTS, (COCO, COCO_CATEGORIES), strict=True))
+NAME_LISTS = dict(zip(CLASS_LISTS, (COCO, COCO_CATEGORIES), strict=True))
 
 
 def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
@@ -44,7 +44,7 @@ def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     """
     stated = literal(metadata, "names")
     if isinstance(stated, list):
-        return _sound("its metadata", [str(name) for name in stated]) or None
+        return _check_names("its metadata", [str(name) for name in stated]) or None
     if not isinstance(stated, dict) or not stated:
         return None
     wrong = next((key for key in stated if not isinstance(key, int) or not 0 <= key < MAX_CLASSES), None)
@@ -53,10 +53,10 @@ def metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
             f"its metadata give a name to class {clip(repr(wrong))}, and classes are numbers from 0 to "
             f"{MAX_CLASSES - 1}; name them by detector.names"
         )
-    return _sound("its metadata", [str(stated.get(i, f"class_{i}")) for i in range(max(stated) + 1)])
+    return _check_names("its metadata", [str(stated.get(i, f"class_{i}")) for i in range(max(stated) + 1)])
 
 
-def _sound(where: str, names: Sequence[str]) -> tuple[str, ...]:
+def _check_names(where: str, names: Sequence[str]) -> tuple[str, ...]:
     """Return the names as a tuple, or raise a ValueError if they are too many or too long."""
     if len(names) > MAX_CLASSES:
         raise ValueError(
@@ -77,19 +77,19 @@ def read_names(value: str) -> tuple[str, ...]:
     Raises:
         UserError: the file is missing or has no names.
     """
-    if value in GIVEN:
-        return GIVEN[value]
+    if value in NAME_LISTS:
+        return NAME_LISTS[value]
     text = read_text(Path(value), CONFIG_LIMIT, problem=f"detector.names {value}: cannot be read")
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not names:
         raise UserError(f"detector.names {value}: holds no class name; expected one a line")
     try:
-        return _sound("its lines", names)
+        return _check_names("its lines", names)
     except ValueError as error:
         raise UserError(f"detector.names {value}: {error}") from None
 
 
 def default_names(count: int | None) -> tuple[str, ...]:
     """Return the names of COCO if the count fits, otherwise numbered names. No count gives no names."""
-    known = {len(names): names for names in GIVEN.values()}
+    known = {len(names): names for names in NAME_LISTS.values()}
     return known.get(count or 0) or tuple(f"class_{i}" for i in range(count or 0))

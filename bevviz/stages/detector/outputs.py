@@ -11,13 +11,13 @@ import numpy as np
 from bevviz.model.frame import F32, I32, I64
 from bevviz.stages.detector.names import MAX_CLASSES
 
-SLACK = 0.01  # tolerance above 1 of scores in half precision or after quantisation
-NEGATIVE = -1e-3  # the same below 0
-PIXELS = 2.0  # boxes that all lie within this many pixels are not in pixels
-EVERYWHERE = 0.2  # for an image without objects, no class has a higher median score over all positions
+SCORE_TOLERANCE = 0.01  # tolerance above 1 of scores in half precision or after quantisation
+MIN_SCORE = -1e-3  # the same below 0
+MAX_FRACTION_BOX = 2.0  # boxes that all lie within this many pixels are not in pixels
+MAX_MEDIAN_SCORE = 0.2  # for an image without objects, no class has a higher median score over all positions
 
 
-class Boxes(Enum):
+class BoxFormat(Enum):
     """Format of the four numbers of a box."""
 
     CENTRE = "centre and size in pixels of the input"
@@ -26,7 +26,7 @@ class Boxes(Enum):
     CELLS = "centre relative to the grid cell, logarithm of the size, both in strides"
 
 
-class Scored(NamedTuple):
+class ScoredBoxes(NamedTuple):
     """Boxes with a score of each class."""
 
     boxes: Any  # (N, 4)
@@ -34,7 +34,7 @@ class Scored(NamedTuple):
     objectness: Any = None  # (N,) factor of the scores
 
 
-class Listed(NamedTuple):
+class ListedBoxes(NamedTuple):
     """Boxes with one class each. Padding rows have a score of 0 or less."""
 
     boxes: Any  # (N, 4)
@@ -55,42 +55,42 @@ class Candidates(NamedTuple):
 # Each function takes the number of classes and the outputs for one image.
 
 
-def columns(classes: int | None, table: Any) -> Scored:
+def columns(classes: int | None, table: Any) -> ScoredBoxes:
     """Split a table with one column for each candidate."""
-    return Scored(table[:4].T, table[4:].T[:, :classes])
+    return ScoredBoxes(table[:4].T, table[4:].T[:, :classes])
 
 
-def rows(classes: int | None, table: Any) -> Scored:
+def rows(classes: int | None, table: Any) -> ScoredBoxes:
     """Split a table with one row for each candidate."""
-    return Scored(table[:, :4], table[:, 4:][:, :classes])
+    return ScoredBoxes(table[:, :4], table[:, 4:][:, :classes])
 
 
-def rows_with_objectness(classes: int | None, table: Any) -> Scored:
+def rows_with_objectness(classes: int | None, table: Any) -> ScoredBoxes:
     """Split a table with box, objectness and class scores in each row."""
-    return Scored(table[:, :4], table[:, 5:][:, :classes], table[:, 4])
+    return ScoredBoxes(table[:, :4], table[:, 5:][:, :classes], table[:, 4])
 
 
-def two_tables(classes: int | None, boxes: Any, scores: Any) -> Scored:
+def two_tables(classes: int | None, boxes: Any, scores: Any) -> ScoredBoxes:
     """Split a table of boxes and a table of class scores."""
-    return Scored(boxes, scores[:, :classes])
+    return ScoredBoxes(boxes, scores[:, :classes])
 
 
-def three_lists(_: int | None, boxes: Any, score: Any, class_id: Any) -> Listed:
+def three_lists(_: int | None, boxes: Any, score: Any, class_id: Any) -> ListedBoxes:
     """Combine lists of boxes, scores and classes."""
-    return Listed(boxes, score, class_id)
+    return ListedBoxes(boxes, score, class_id)
 
 
-def one_list(box: int, score: int, class_id: int) -> Callable[[int | None, Any], Listed]:
+def one_list(box: int, score: int, class_id: int) -> Callable[[int | None, Any], ListedBoxes]:
     """Return a function that reads a list with these columns. ``box`` is the first of four columns."""
-    return lambda _, table: Listed(table[:, box : box + 4], table[:, score], table[:, class_id])
+    return lambda _, table: ListedBoxes(table[:, box : box + 4], table[:, score], table[:, class_id])
 
 
-def queries(classes: int | None, boxes: Any, logits: Any) -> Listed:
+def queries(classes: int | None, boxes: Any, logits: Any) -> ListedBoxes:
     """Return the best pairs of query and class, as many as there are queries (RF-DETR's ``PostProcess``)."""
     score = 1 / (1 + np.exp(-logits[:, :classes].astype(np.float32)))
     best = np.argsort(-score, axis=None, kind="stable")[: len(boxes)]
     query, class_id = np.divmod(best, score.shape[1])
-    return Listed(boxes[query], score[query, class_id], class_id)
+    return ListedBoxes(boxes[query], score[query, class_id], class_id)
 
 
 # --- decoding ----------------------------------------------------------------------------------
@@ -104,44 +104,46 @@ def cells(size: tuple[int, int]) -> dict[int, tuple[int, ...]]:
     return {sum((height // s) * (width // s) for s in run): run for run in runs}
 
 
-def candidates(found: Scored | Listed, boxes: Boxes, size: tuple[int, int], least: float) -> Candidates:
+def candidates(
+    split: ScoredBoxes | ListedBoxes, boxes: BoxFormat, size: tuple[int, int], least: float
+) -> Candidates:
     """Return all candidates with a score of ``least`` or more, for an input of this height and width."""
-    if isinstance(found, Listed):
-        row = np.flatnonzero(found.score >= least)
-        score, class_id = found.score[row], found.class_id[row]
+    if isinstance(split, ListedBoxes):
+        row = np.flatnonzero(split.score >= least)
+        score, class_id = split.score[row], split.class_id[row]
     else:
-        row, score, class_id = _best_classes(found, least)
-    xyxy = _corners(boxes, found.boxes[row], row, len(found.boxes), size)
+        row, score, class_id = _best_classes(split, least)
+    xyxy = _corners(boxes, split.boxes[row], row, len(split.boxes), size)
     return Candidates(xyxy, score.astype(np.float32), class_id.astype(np.int32), row)
 
 
-def _best_classes(found: Scored, least: float) -> tuple[Any, Any, Any]:
+def _best_classes(split: ScoredBoxes, least: float) -> tuple[Any, Any, Any]:
     """Return the rows whose best class has at least that score, with the score and the class."""
-    if found.objectness is None:
-        row = np.flatnonzero(found.scores.max(axis=1) >= least)
-        scores = found.scores[row]
+    if split.objectness is None:
+        row = np.flatnonzero(split.scores.max(axis=1) >= least)
+        scores = split.scores[row]
     else:  # the product with a class score is never higher than the objectness
-        row = np.flatnonzero(found.objectness >= least)
-        scores = found.scores[row] * found.objectness[row, None]
+        row = np.flatnonzero(split.objectness >= least)
+        scores = split.scores[row] * split.objectness[row, None]
     class_id = scores.argmax(axis=1)
     score = np.take_along_axis(scores, class_id[:, None], axis=1)[:, 0]
     strong = score >= least
     return row[strong], score[strong], class_id[strong]
 
 
-def _corners(kind: Boxes, boxes: Any, row: Any, count: int, size: tuple[int, int]) -> F32:
+def _corners(kind: BoxFormat, boxes: Any, row: Any, count: int, size: tuple[int, int]) -> F32:
     """Convert boxes to corners in pixels. Half precision is added in half precision, as the exporters do."""
     xyxy: F32
-    if kind is Boxes.CORNERS:
+    if kind is BoxFormat.CORNERS:
         xyxy = boxes.astype(np.float32)
         return xyxy
     center, extent = boxes[:, :2], boxes[:, 2:]
-    if kind is Boxes.CELLS:
+    if kind is BoxFormat.CELLS:
         cell, stride = _grid(size, cells(size)[count])
         center, extent = (center + cell[row]) * stride[row], np.exp(extent) * stride[row]
     half = extent / 2
     xyxy = np.hstack([center - half, center + half]).astype(np.float32)
-    if kind is Boxes.FRACTIONS:
+    if kind is BoxFormat.FRACTIONS:
         xyxy *= np.array(size[::-1] * 2, np.float32)
     return xyxy
 
@@ -161,7 +163,7 @@ def _grid(size: tuple[int, int], strides: tuple[int, ...]) -> tuple[F32, F32]:
 
 def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
     """Return why these numbers cannot be scores and classes, empty if they can."""
-    if score.size and score.max() > 1 + SLACK:
+    if score.size and score.max() > 1 + SCORE_TOLERANCE:
         return f"it has scores up to {score.max():.3g}"
     if class_id.size and class_id.max() > MAX_CLASSES:
         return f"it has class {class_id.max():.3g}, and no more than {MAX_CLASSES:,} are read"
@@ -173,36 +175,36 @@ def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
     return ""
 
 
-def wrong_scores(found: Scored, counted: bool) -> str:
+def wrong_scores(split: ScoredBoxes, counted: bool) -> str:
     """Return why these numbers cannot be scores for an image without objects, empty if they can.
 
     ``counted``: whether another source confirms the number of classes.
     """
-    tables = [found.scores] if found.objectness is None else [found.scores, found.objectness]
+    tables = [split.scores] if split.objectness is None else [split.scores, split.objectness]
     if not all(table.size for table in tables):
         return "it has no boxes, or no scores"
     low, high = np.min([t.min() for t in tables]), np.max([t.max() for t in tables])
     if np.isnan(low):
         return "some of its scores are no numbers (NaN)"
-    if low < NEGATIVE or high > 1 + SLACK:
+    if low < MIN_SCORE or high > 1 + SCORE_TOLERANCE:
         return f"it has scores from {low:.3g} to {high:.3g}"
-    if found.objectness is None and not counted and np.median(found.scores[:, -1]) > EVERYWHERE:
+    if split.objectness is None and not counted and np.median(split.scores[:, -1]) > MAX_MEDIAN_SCORE:
         return (
             "its last class is everywhere, like angles of oriented boxes; where it is one, set detector.names"
         )
     return ""
 
 
-def wrong_boxes(boxes: Any, kind: Boxes, trusted: bool) -> str:
+def wrong_boxes(boxes: Any, kind: BoxFormat, trusted: bool) -> str:
     """Return why these numbers cannot be boxes, empty if they can."""
     if boxes.size and not np.isfinite(boxes).any():
         return "none of its boxes has numbers that are finite"
     largest = np.abs(boxes).max() if boxes.size else 0.0
-    if kind in (Boxes.CENTRE, Boxes.CORNERS) and 0 < largest <= PIXELS:
+    if kind in (BoxFormat.CENTRE, BoxFormat.CORNERS) and 0 < largest <= MAX_FRACTION_BOX:
         return f"its boxes are not in pixels, but numbers up to {largest:.3g}"
-    if kind is Boxes.FRACTIONS and largest > 10:
+    if kind is BoxFormat.FRACTIONS and largest > 10:
         return f"its boxes are not fractions of the image, but numbers up to {largest:.3g}"
     inverted = boxes.size and (boxes[:, 2:] < boxes[:, :2]).any(axis=1).mean() > 0.1
-    if kind is Boxes.CORNERS and inverted and not trusted:
+    if kind is BoxFormat.CORNERS and inverted and not trusted:
         return "its boxes are not corners: the second lies to the left of the first, or above"
     return ""

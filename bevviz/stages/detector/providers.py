@@ -15,11 +15,11 @@ from bevviz.stages.detector.session import SUFFIX, NetworkSession
 from bevviz.support import progress
 
 # TensorRT compiles each network for minutes before its first frame. So it is used only on request.
-PREFERRED = ("CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
+PROVIDERS = ("CUDA", "MIGraphX", "ROCM", "OpenVINO", "CoreML", "CPU")
 # Libraries of onnxruntime-gpu. onnxruntime prints many lines if one of their dependencies is missing.
-SHARED = "libonnxruntime_providers_shared.so"
+SHARED_LIBRARY = "libonnxruntime_providers_shared.so"
 LIBRARIES = {"CUDA": "libonnxruntime_providers_cuda.so", "Tensorrt": "libonnxruntime_providers_tensorrt.so"}
-HELP = {
+INSTALL_HELP = {
     "CUDA": "pip install 'onnxruntime-gpu[cuda,cudnn]', and NVIDIA's driver",
     "Tensorrt": "TensorRT's libraries",
 }
@@ -39,7 +39,7 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str
     Raises:
         UserError: the provider is not installed or does not work, or the file is no network.
     """
-    session, failed = _opened(path, asked, options, where or f"detector.model {path}")
+    session, failed = _open_with_reasons(path, asked, options, where or f"detector.model {path}")
     for name, reason in failed.items():
         tell(f"the network runs on {session.provider}: {name} is installed, but {reason}")
     return session
@@ -48,7 +48,7 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str
 def network(path: Path, asked: str) -> str:
     """Describe the provider that would run a network here, or why the network cannot run."""
     try:
-        session, failed = _opened(path, asked, ort.SessionOptions(), f"detector.model {path}")
+        session, failed = _open_with_reasons(path, asked, ort.SessionOptions(), f"detector.model {path}")
     except UserError as error:
         return str(error)
     return "; ".join(
@@ -56,7 +56,7 @@ def network(path: Path, asked: str) -> str:
     )
 
 
-def _opened(
+def _open_with_reasons(
     path: Path, asked: str, options: ort.SessionOptions, where: str
 ) -> tuple[NetworkSession, dict[str, str]]:
     """Open the session. Also return why each better provider does not work."""
@@ -78,7 +78,7 @@ def _opened(
             )
         return session, {}
     failed: dict[str, str] = {}
-    for name in [name for name in PREFERRED if name in available]:
+    for name in [name for name in PROVIDERS if name in available]:
         if name == "CPU":
             session = NetworkSession(path, [name], options, where)
         elif reason := obstacle(name):
@@ -93,7 +93,7 @@ def _opened(
         if session.provider != name:
             failed[name] = "onnxruntime does not start it"
         return session, failed
-    raise UserError(f"{where}: onnxruntime has none of {', '.join(PREFERRED)}")
+    raise UserError(f"{where}: onnxruntime has none of {', '.join(PROVIDERS)}")
 
 
 @lru_cache
@@ -106,12 +106,12 @@ def obstacle(name: str) -> str:
         with contextlib.redirect_stdout(io.StringIO()):
             ort.preload_dlls()
     try:
-        ctypes.CDLL(str(folder / SHARED), ctypes.RTLD_GLOBAL)
+        ctypes.CDLL(str(folder / SHARED_LIBRARY), ctypes.RTLD_GLOBAL)
         ctypes.CDLL(str(folder / LIBRARIES[name]))
     except OSError as error:
         missing, _, rest = str(error).partition(": ")
         if "cannot open shared object" in rest:
-            return f"{missing} is missing ({HELP[name]})"
+            return f"{missing} is missing ({INSTALL_HELP[name]})"
     return ""
 
 

@@ -40,17 +40,18 @@ MAX_OUTPUT_NUMBERS = 100_000_000
 MAX_TENSORS = 100
 MAX_NAME = 1000  # characters in the name of an input or output, which stands in error messages
 
-CHECK = 0.05  # seconds between two checks of the memory; up to 100 MB are filled in this time
-GRACE = 1.0  # seconds that a network has to end after a stop request
+CHECK_SECONDS = 0.05  # seconds between two checks of the memory; up to 100 MB are filled in this time
+STOP_SECONDS = 1.0  # seconds that a network has to end after a stop request
 SUFFIX = "ExecutionProvider"
-SILENT = 4  # onnxruntime's severity "fatal", so that it does not print errors that we report ourselves
-LISTED, TEXT = 8, 200  # inputs or outputs in an error message, and characters of each text in it
-SMALLER = "use a smaller network, or export it with a smaller input"
+LOG_FATAL = 4  # onnxruntime's severity "fatal", so that it does not print errors that we report ourselves
+MAX_LISTED = 8  # inputs or outputs in an error message
+MAX_LISTED_TEXT = 200  # characters of each text in an error message
+SIZE_HINT = "use a smaller network, or export it with a smaller input"
 
 NUMBERS = re.compile(r"tensor\((u?int(8|16|32|64)|float|float16|double|bool)\)")
 # Beginnings of onnxruntime's messages that do not help users: error codes, and positions in its source.
-CODE = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
-SOURCE = re.compile(r"\S*/onnxruntime/core/\S+:\d+ .*\) (?=\S)")
+ERROR_CODE = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
+SOURCE_POSITION = re.compile(r"\S*/onnxruntime/core/\S+:\d+ .*\) (?=\S)")
 OUT_OF_MEMORY = re.compile(r"Failed to allocate memory|Available memory of|bad_alloc|bad allocation")
 
 T = TypeVar("T")
@@ -110,11 +111,11 @@ class NetworkSession:
         names = self.outputs if wanted is None else list(wanted)
         shapes = ", ".join(str(list(np.shape(value))) for value in feed.values())
         options = ort.RunOptions()
-        options.log_severity_level = SILENT
+        options.log_severity_level = LOG_FATAL
 
         def answer() -> list[Any]:
-            found: list[Any] = self._session.run(names, dict(feed), options)
-            return found
+            outputs: list[Any] = self._session.run(names, dict(feed), options)
+            return outputs
 
         def end() -> None:
             options.terminate = True
@@ -125,11 +126,11 @@ class NetworkSession:
             else:
                 arrays = _watch(answer, end, self._seconds)
         except _LimitError as error:
-            raise UserError(f"{self.where}: {error} on an input of {shapes}; {SMALLER}") from None
+            raise UserError(f"{self.where}: {error} on an input of {shapes}; {SIZE_HINT}") from None
         except Exception as error:  # onnxruntime's errors have no common base class
             if options.terminate:
                 raise UserError(
-                    f"{self.where}: {_overdue('answer', self._seconds)} on an input of {shapes}; {SMALLER}"
+                    f"{self.where}: {_overdue('answer', self._seconds)} on an input of {shapes}; {SIZE_HINT}"
                 ) from None
             raise UserError(f"{self.where}: {_reason(error, f'fails on an input of {shapes}')}") from None
         self._has_answered = True
@@ -180,7 +181,7 @@ class NetworkSession:
         if sum(array.size for array in arrays) > MAX_OUTPUT_NUMBERS:
             shapes = listed((name, np.shape(array)) for name, array in zip(names, arrays, strict=True))
             raise UserError(
-                f"{self.where}: answers more than {MAX_OUTPUT_NUMBERS:,} numbers: {shapes}; {SMALLER}"
+                f"{self.where}: answers more than {MAX_OUTPUT_NUMBERS:,} numbers: {shapes}; {SIZE_HINT}"
             )
 
 
@@ -210,14 +211,14 @@ def listed(tensors: Iterable[tuple[str, Any]]) -> str:
     'images [1, 3, 640, 640], scale [1, 2]'
     """
     texts = [f"{clip(name)} {clip(list(shape))}" for name, shape in tensors]
-    more = len(texts) - LISTED
-    return ", ".join([*texts[:LISTED], *([f"and {more} more"] if more > 0 else [])])
+    more = len(texts) - MAX_LISTED
+    return ", ".join([*texts[:MAX_LISTED], *([f"and {more} more"] if more > 0 else [])])
 
 
 def clip(value: object) -> str:
     """Return the value as a text for an error message. A file may hold names of any length."""
     text = str(value)
-    return text if len(text) <= TEXT else f"{text[:TEXT]}..."
+    return text if len(text) <= MAX_LISTED_TEXT else f"{text[:MAX_LISTED_TEXT]}..."
 
 
 class _LimitError(Exception):
@@ -229,7 +230,7 @@ def _load(
 ) -> Any:
     """Load a network within the limits."""
     _share_limited_memory()
-    options.log_severity_level = SILENT
+    options.log_severity_level = LOG_FATAL
     options.add_session_config_entry("session.use_env_allocators", "1")
     # Without this setting a name that ends with .ort has the file read in another format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
@@ -246,7 +247,7 @@ def _load(
     try:
         return _watch(load, end, seconds, "load")
     except _LimitError as error:
-        raise UserError(f"{where}: {error}; {SMALLER}") from None
+        raise UserError(f"{where}: {error}; {SIZE_HINT}") from None
     except Exception as error:  # onnxruntime's errors have no common base class
         raise UserError(f"{where}: {_reason(error, 'onnxruntime cannot load it')}") from None
 
@@ -297,7 +298,7 @@ def _watch(work: Callable[[], T], end: Callable[[], None], seconds: float, verb:
     threading.Thread(target=thread, daemon=True, name=ENDLESS_THREAD).start()
     start, before, reason = time.monotonic(), _resident(), ""
     try:
-        while not (reason or wait([result], CHECK).done):
+        while not (reason or wait([result], CHECK_SECONDS).done):
             if time.monotonic() - start > seconds:
                 reason = _overdue(verb, seconds)
             elif _resident() - before > memory_limit():
@@ -307,7 +308,7 @@ def _watch(work: Callable[[], T], end: Callable[[], None], seconds: float, verb:
             end()
     if not reason:
         return result.result()
-    wait([result], GRACE)
+    wait([result], STOP_SECONDS)
     raise _LimitError(reason)
 
 
@@ -336,5 +337,5 @@ def _reason(error: Exception, otherwise: str) -> str:
     """Return why onnxruntime failed, and how to fix it if that is known."""
     text = first_line(error)
     if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(text):
-        return f"{_too_large()}; {SMALLER}"
-    return f"{otherwise}: {clip(SOURCE.sub('', CODE.sub('', text)))}"
+        return f"{_too_large()}; {SIZE_HINT}"
+    return f"{otherwise}: {clip(SOURCE_POSITION.sub('', ERROR_CODE.sub('', text)))}"

@@ -59,36 +59,36 @@ def group(
         intensity: (N,) of the points; None: 0.
     """
     start, edge = np.asarray(low, np.float32), np.asarray(size, np.float32)
-    place, slot, counts, cells, full, more = _placed(
+    place, slot, counts, cells, full, more = _assign_pillars(
         points, start, edge, shape[0], shape[1], np.float32(high_z), max_points, max_pillars
     )
     kept = np.flatnonzero(place >= 0)
     place, slot, xyz = place[kept], slot[kept], points[kept]
-    made = np.empty((len(kept), len(features)), np.float32)
+    values = np.empty((len(kept), len(features)), np.float32)
     mean: F64 | None = None
     center: F32 | None = None
     for k, feature in enumerate(features):
         axis = "xyz".find(feature[-1])
         if feature in ("x", "y", "z"):
-            made[:, k] = xyz[:, axis]
+            values[:, k] = xyz[:, axis]
         elif feature == "intensity":
-            made[:, k] = 0 if intensity is None else intensity[kept]
+            values[:, k] = 0 if intensity is None else intensity[kept]
         elif feature == "time":
-            made[:, k] = 0
+            values[:, k] = 0
         elif feature == "distance":
-            made[:, k] = np.sqrt((xyz**2).sum(axis=1))
+            values[:, k] = np.sqrt((xyz**2).sum(axis=1))
         elif feature.startswith("mean"):
             mean = _means(xyz, place, counts) if mean is None else mean
-            made[:, k] = xyz[:, axis] - mean[place, axis].astype(np.float32)
+            values[:, k] = xyz[:, axis] - mean[place, axis].astype(np.float32)
         else:
             if center is None:
                 center = np.zeros((len(counts), 3), np.float32)
                 center[:, :2] = cells
                 center *= edge
                 center += edge / 2 + start
-            made[:, k] = xyz[:, axis] - center[place, axis]
+            values[:, k] = xyz[:, axis] - center[place, axis]
     shown = np.zeros((len(counts), max_points, len(features)), np.float32)
-    shown[place, slot] = made
+    shown[place, slot] = values
     return Pillars(shown, counts, cells, int(full), int(more))
 
 
@@ -107,7 +107,7 @@ def _means(points: F32, place: I32, counts: I32) -> F64:
 
 
 @kernel
-def _placed(
+def _assign_pillars(
     points: F32, low: F32, size: F32, nx: int, ny: int, high_z: np.float32, max_points: int, max_pillars: int
 ) -> tuple[I32, I32, I32, I32, int, int]:
     """Assign each point to a pillar and a slot in it.
@@ -126,7 +126,7 @@ def _placed(
     slot = np.zeros(n, np.int32)
     counts = np.zeros(min(max_pillars, n), np.int32)
     cells = np.empty((len(counts), 2), np.int32)
-    found, full, more = 0, 0, 0
+    pillars, full, more = 0, 0, 0
     for i in range(n):
         x = np.floor((points[i, 0] - low[0]) / size[0])
         y = np.floor((points[i, 1] - low[1]) / size[1])
@@ -136,14 +136,14 @@ def _placed(
         cell = np.int64(y) * nx + np.int64(x)
         k = number[cell]
         if k == -1:
-            if found == max_pillars:
+            if pillars == max_pillars:
                 number[cell] = -2
                 more += 1
                 continue
-            k = np.int32(found)
+            k = np.int32(pillars)
             number[cell] = k
             cells[k, 0], cells[k, 1] = np.int32(x), np.int32(y)
-            found += 1
+            pillars += 1
         if k < 0:
             continue
         if counts[k] == max_points:
@@ -151,4 +151,4 @@ def _placed(
             continue
         place[i], slot[i] = k, counts[k]
         counts[k] += 1
-    return place, slot, counts[:found], cells[:found], full, more
+    return place, slot, counts[:pillars], cells[:pillars], full, more

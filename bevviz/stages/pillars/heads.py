@@ -18,7 +18,7 @@ from bevviz.config.pillars import PillarParams
 from bevviz.model.frame import F32, F64, I64
 from bevviz.stages.detector.session import listed
 
-MOST_LOG = 10.0  # largest logarithm of a size; larger values would overflow
+MAX_LOG_SIZE = 10.0  # largest logarithm of a size; larger values would overflow
 
 
 class Candidates(NamedTuple):
@@ -63,7 +63,7 @@ def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
         ValueError: the outputs cannot be read. The message says why and which outputs were expected.
     """
     try:
-        return _anchors(outputs, params) if params.anchors else _centers(outputs, params)
+        return _find_anchors(outputs, params) if params.anchors else _find_centers(outputs, params)
     except ValueError as error:
         shapes = listed((name, np.shape(output)) for name, output in outputs.items())
         raise ValueError(f"{error}; its outputs: {shapes}") from None
@@ -72,7 +72,7 @@ def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
 # --- maps --------------------------------------------------------------------------------------
 
 
-class Map(NamedTuple):
+class OutputMap(NamedTuple):
     """Output with C channels on a grid."""
 
     name: str
@@ -86,7 +86,9 @@ class Map(NamedTuple):
         return np.ascontiguousarray(array.reshape(len(array), -1)[:, cells].T, np.float32)
 
 
-def _map(outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], params: PillarParams) -> Map:
+def _check_map(
+    outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], params: PillarParams
+) -> OutputMap:
     """Check that an output is a map with one of these numbers of channels."""
     shape = np.shape(outputs[name])
     wanted = " or ".join(map(str, channels))
@@ -105,7 +107,7 @@ def _map(outputs: Mapping[str, Any], name: str, channels: tuple[int, ...], param
         )
     if len(fits) == 2:
         raise ValueError(f"output {name} can be read with its channels second or last")
-    return Map(name, fits[0])
+    return OutputMap(name, fits[0])
 
 
 def _stride(cells: tuple[int, ...], params: PillarParams) -> int:
@@ -116,25 +118,25 @@ def _stride(cells: tuple[int, ...], params: PillarParams) -> int:
     return nx // width
 
 
-def _grid(outputs: Mapping[str, Any], found: Map) -> tuple[int, int]:
+def _grid(outputs: Mapping[str, Any], output_map: OutputMap) -> tuple[int, int]:
     """Return the number of cells along y and x."""
-    shape = outputs[found.name].shape
-    return (shape[1], shape[2]) if found.last else (shape[2], shape[3])
+    shape = outputs[output_map.name].shape
+    return (shape[1], shape[2]) if output_map.last else (shape[2], shape[3])
 
 
-def _same_grid(outputs: Mapping[str, Any], maps: list[Map]) -> tuple[int, int]:
+def _same_grid(outputs: Mapping[str, Any], maps: list[OutputMap]) -> tuple[int, int]:
     """Return the grid of the maps, or raise a ValueError if they differ."""
-    grids = {_grid(outputs, one) for one in maps}
+    grids = {_grid(outputs, output_map) for output_map in maps}
     if len(grids) != 1:
         raise ValueError("its maps have different grids")
     return grids.pop()
 
 
-def _scores(given: F32, params: PillarParams) -> F32:
+def _scores(values: F32, params: PillarParams) -> F32:
     """Return scores from 0 to 1 from a map of logits or probabilities."""
-    if not given.size:
-        return given
-    low, high = float(given.min()), float(given.max())
+    if not values.size:
+        return values
+    low, high = float(values.min()), float(values.max())
     if not np.isfinite([low, high]).all():
         raise ValueError("its scores are not finite")
     if params.scores == "logits":
@@ -143,18 +145,18 @@ def _scores(given: F32, params: PillarParams) -> F32:
                 "its scores all are from 0 to 1, which logits are not: set objects.scores to probabilities"
             )
         with np.errstate(over="ignore"):
-            return np.asarray(1 / (1 + np.exp(-given)), np.float32)
+            return np.asarray(1 / (1 + np.exp(-values)), np.float32)
     if low < 0 or high > 1:
         raise ValueError(
             f"it scores {low:.3g} to {high:.3g}, which are no probabilities: set objects.scores to logits"
         )
-    return given
+    return values
 
 
 def _thresholds(params: PillarParams) -> F32:
     """Return the score threshold of each class."""
-    found = [params.score_thresholds.get(name, params.score_threshold) for name in params.classes]
-    return np.array(found, np.float32)
+    thresholds = [params.score_thresholds.get(name, params.score_threshold) for name in params.classes]
+    return np.array(thresholds, np.float32)
 
 
 def _best(score: F32, count: int) -> I64:
@@ -166,7 +168,7 @@ def _best(score: F32, count: int) -> I64:
     return rows[np.argsort(-score[rows], kind="stable")][:count]
 
 
-def _labelled(score: F32, params: PillarParams) -> tuple[I64, I64]:
+def _select_scores(score: F32, params: PillarParams) -> tuple[I64, I64]:
     """Return rows and classes of sufficient scores among the best ``nms_candidates`` rows.
 
     ``score`` is (N, C).
@@ -192,29 +194,31 @@ class Anchors:
     ``AnchorHeadSingle`` of OpenPCDet.
     """
 
-    score: Map
-    box: Map
-    direction: Map | None
+    score: OutputMap
+    box: OutputMap
+    direction: OutputMap | None
     places: F64  # (A, 7) x, y, z of the centre, length, width, height, yaw
     params: PillarParams
 
     @property
     def wanted(self) -> tuple[str, ...]:
         """Names of the outputs to read."""
-        return tuple(one.name for one in (self.score, self.box, self.direction) if one is not None)
+        return tuple(
+            output_map.name for output_map in (self.score, self.box, self.direction) if output_map is not None
+        )
 
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
         """Return the boxes with a sufficient score. See ``Head.candidates``."""
         params, each = self.params, len(self.params.anchors) * len(self.params.rotations)
         score = _scores(self.score.at(outputs).reshape(len(self.places), len(params.classes)), params)
-        rows, class_id = _labelled(score, params)
+        rows, class_id = _select_scores(score, params)
         cells, which = rows // each, (np.arange(len(rows)), rows % each)
         columns = self.box.at(outputs, cells)
         deltas = columns.reshape(len(rows), each, columns.shape[1] // each)[which][:, :7]
         boxes = decoded(deltas.astype(np.float64), self.places[rows])
         if self.direction is not None:
             facing = self.direction.at(outputs, cells).reshape(len(rows), each, 2)[which].argmax(axis=1)
-            boxes[:, 6] = turned(boxes[:, 6], facing, params)
+            boxes[:, 6] = resolve_direction(boxes[:, 6], facing, params)
         return Candidates(boxes, score[rows, class_id], class_id, np.zeros(len(rows), np.int64))
 
 
@@ -246,12 +250,12 @@ def decoded(deltas: F64, anchors: F64) -> F64:
     boxes = np.empty_like(anchors)
     boxes[:, :2] = deltas[:, :2] * diagonal + anchors[:, :2]
     boxes[:, 2] = deltas[:, 2] * anchors[:, 5] + anchors[:, 2]
-    boxes[:, 3:6] = np.exp(np.minimum(deltas[:, 3:6], MOST_LOG)) * anchors[:, 3:6]
+    boxes[:, 3:6] = np.exp(np.minimum(deltas[:, 3:6], MAX_LOG_SIZE)) * anchors[:, 3:6]
     boxes[:, 6] = deltas[:, 6] + anchors[:, 6]
     return boxes
 
 
-def turned(yaw: F64, facing: I64, params: PillarParams) -> F64:
+def resolve_direction(yaw: F64, facing: I64, params: PillarParams) -> F64:
     """Resolve a yaw that is known up to half a turn by the direction that the network chose."""
     offset = params.direction_offset or 0.0
     half = yaw - offset
@@ -268,20 +272,20 @@ ROLES: dict[str, Callable[[str], object]] = {
 
 def _roles(outputs: Mapping[str, Any], channels: Mapping[str, tuple[int, ...]]) -> dict[str, str]:
     """Return role -> output, by the names or else by the numbers of channels."""
-    named = {role: [o for o in outputs if known(o.lower())] for role, known in ROLES.items()}
+    named = {role: [o for o in outputs if matches_role(o.lower())] for role, matches_role in ROLES.items()}
     if len(named["score"]) == 1 and len(named["box"]) == 1 and len(named["direction"]) <= 1:
-        return {role: found[0] for role, found in named.items() if found}
-    found: dict[str, str] = {}
+        return {role: matches[0] for role, matches in named.items() if matches}
+    matches: dict[str, str] = {}
     for role, counts in channels.items():
         fits = [o for o, a in outputs.items() if np.ndim(a) == 4 and set(np.shape(a)[1:]) & set(counts)]
-        if len(fits) == 1 and fits[0] not in found.values():
-            found[role] = fits[0]
-    if {"score", "box"} <= set(found) and len(found) == len(outputs):
-        return found
+        if len(fits) == 1 and fits[0] not in matches.values():
+            matches[role] = fits[0]
+    if {"score", "box"} <= set(matches) and len(matches) == len(outputs):
+        return matches
     raise ValueError("neither names nor shapes tell which output has scores, boxes and directions")
 
 
-def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
+def _find_anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
     """Make the reader of a network with anchors."""
     if params.anchor_places is None:
         raise ValueError(
@@ -294,7 +298,7 @@ def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
         "direction": (each * 2,),
     }
     roles = _roles(outputs, channels)
-    maps = {role: _map(outputs, name, channels[role], params) for role, name in roles.items()}
+    maps = {role: _check_map(outputs, name, channels[role], params) for role, name in roles.items()}
     shape = _same_grid(outputs, list(maps.values()))
     if "direction" in maps and params.direction_offset is None:
         raise ValueError(
@@ -305,7 +309,7 @@ def _anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
 
 # --- boxes relative to centres -----------------------------------------------------------------
 
-PARTS = {  # property of a box -> number of channels, and the names that exporters use
+BOX_CHANNELS = {  # property of a box -> number of channels, and the names that exporters use
     "score": (0, ("heatmap", "hm")),
     "offset": (2, ("reg", "center")),
     "z": (1, ("height", "center_z", "z")),
@@ -315,10 +319,10 @@ PARTS = {  # property of a box -> number of channels, and the names that exporte
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class MapChannels:
     """Range of channels of a map."""
 
-    map: Map
+    map: OutputMap
     first: int
     count: int
 
@@ -334,7 +338,7 @@ class Centers:
     It follows ``CenterHead`` of mmdetection3d and of OpenPCDet, and Autoware's ``generateBoxes3D_kernel``.
     """
 
-    parts: tuple[Mapping[str, Part], ...]  # for each head, by the keys of PARTS
+    parts: tuple[Mapping[str, MapChannels], ...]  # for each head, by the keys of BOX_CHANNELS
     shape: tuple[int, int]  # cells along y and x
     params: PillarParams
 
@@ -345,14 +349,14 @@ class Centers:
 
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
         """Return the boxes with a sufficient score. See ``Head.candidates``."""
-        found, first = [], 0
+        candidates, first = [], 0
         for number, head in enumerate(self.parts):
-            found.append(self._of_head(outputs, head, number, first))
+            candidates.append(self._head_candidates(outputs, head, number, first))
             first += head["score"].count
-        return Candidates(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        return Candidates(*(np.concatenate(column) for column in zip(*candidates, strict=True)))
 
-    def _of_head(
-        self, outputs: Mapping[str, Any], head: Mapping[str, Part], number: int, first: int
+    def _head_candidates(
+        self, outputs: Mapping[str, Any], head: Mapping[str, MapChannels], number: int, first: int
     ) -> Candidates:
         """Return the boxes of one head. ``first`` is the class of its first channel."""
         params = self.params
@@ -376,7 +380,9 @@ class Centers:
             boxes[clear], chosen, class_id[clear] + first, np.full(len(chosen), number, np.int64)
         )
 
-    def _boxes(self, outputs: Mapping[str, Any], head: Mapping[str, Part], rows: I64) -> tuple[F64, F64]:
+    def _boxes(
+        self, outputs: Mapping[str, Any], head: Mapping[str, MapChannels], rows: I64
+    ) -> tuple[F64, F64]:
         """Return (K, 7) boxes at these cells, and the (K,) lengths of their (sin, cos)."""
         params, (height, width) = self.params, self.shape
         offset, z, size, rotation = (
@@ -387,7 +393,7 @@ class Centers:
         boxes[:, 0] = (rows % width + offset[:, 0]) * (high_x - low_x) / width + low_x
         boxes[:, 1] = (rows // width + offset[:, 1]) * (high_y - low_y) / height + low_y
         boxes[:, 2] = z[:, 0]
-        boxes[:, 3:6] = np.exp(np.minimum(size, MOST_LOG))
+        boxes[:, 3:6] = np.exp(np.minimum(size, MAX_LOG_SIZE))
         sine, cosine = rotation.T if params.rotation == "sin_cos" else rotation.T[::-1]
         boxes[:, 6] = np.arctan2(sine, cosine)
         if params.boxes == "wlh":
@@ -396,11 +402,11 @@ class Centers:
         return boxes, np.hypot(sine, cosine)
 
 
-def _centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
+def _find_centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
     """Make the reader of a network with centres."""
     groups = params.groups or (params.classes,)
     counts = [len(group) for group in groups]
-    heads = _joined(outputs, counts, params) or _separate(outputs, counts, params)
+    heads = _find_joined_maps(outputs, counts, params) or _find_separate_maps(outputs, counts, params)
     for key, choices in (("boxes", "lwh or wlh"), ("rotation", "sin_cos or cos_sin")):
         if getattr(params, key) is None:
             raise ValueError(f"it works with centres, and objects.{key} is not set: {choices}")
@@ -408,14 +414,16 @@ def _centers(outputs: Mapping[str, Any], params: PillarParams) -> Centers:
     return Centers(tuple(heads), _same_grid(outputs, maps), params)
 
 
-def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParams) -> list[dict[str, Part]]:
+def _find_separate_maps(
+    outputs: Mapping[str, Any], counts: list[int], params: PillarParams
+) -> list[dict[str, MapChannels]]:
     """Find a map for each property of each head by name. A number after the name is that of the head."""
     heads = []
     for number, classes in enumerate(counts):
         head = {}
-        for key, (channels, names) in PARTS.items():
+        for key, (channels, names) in BOX_CHANNELS.items():
             count = channels or classes
-            name = _named(outputs, names, number, len(counts))
+            name = _find_output(outputs, names, number, len(counts))
             if name is None:
                 several = f" of head {number}" if len(counts) > 1 else ""
                 raise ValueError(
@@ -423,54 +431,54 @@ def _separate(outputs: Mapping[str, Any], counts: list[int], params: PillarParam
                     "(one of anchors needs objects.anchors)"
                 )
             # Some maps have as many uncertainties after the values.
-            head[key] = Part(
-                _map(outputs, name, (count, 2 * count) if channels else (count,), params), 0, count
+            head[key] = MapChannels(
+                _check_map(outputs, name, (count, 2 * count) if channels else (count,), params), 0, count
             )
         heads.append(head)
     return heads
 
 
-def _named(outputs: Mapping[str, Any], names: tuple[str, ...], number: int, of: int) -> str | None:
+def _find_output(outputs: Mapping[str, Any], names: tuple[str, ...], number: int, of: int) -> str | None:
     """Return the output with one of these names, between an optional graph name and head number."""
-    found = []
+    matches = []
     for output in outputs:
         match = re.fullmatch(r"(?:.*[./])?(.+?)(?:[_.]?(\d+))?", output)
         if match is None or match[1].lower() not in names:
             continue
         if (match[2] is None and of == 1) or (match[2] is not None and (of == 1 or int(match[2]) == number)):
-            found.append(output)
-    if len(found) > 1:
+            matches.append(output)
+    if len(matches) > 1:
         raise ValueError(
-            f"{' and '.join(found)} may both be {names[0]}: set objects.groups, if it has several heads"
+            f"{' and '.join(matches)} may both be {names[0]}: set objects.groups, if it has several heads"
         )
-    return found[0] if found else None
+    return matches[0] if matches else None
 
 
-def _joined(
+def _find_joined_maps(
     outputs: Mapping[str, Any], counts: list[int], params: PillarParams
-) -> list[dict[str, Part]] | None:
+) -> list[dict[str, MapChannels]] | None:
     """Find three maps with the channels of all heads one after the other, as mmdeploy exports them."""
     names = {
         role: [o for o in outputs if re.fullmatch(rf"{role}\d*", o)]
         for role in ("cls_score", "bbox_pred", "dir_cls_pred")
     }
-    if any(len(found) != 1 for found in names.values()):
+    if any(len(parts) != 1 for parts in names.values()):
         return None
     heads = len(counts)
-    score = _map(outputs, names["cls_score"][0], (sum(counts),), params)
-    box = _map(outputs, names["bbox_pred"][0], (6 * heads, 8 * heads), params)
-    turn = _map(outputs, names["dir_cls_pred"][0], (2 * heads,), params)
+    score = _check_map(outputs, names["cls_score"][0], (sum(counts),), params)
+    box = _check_map(outputs, names["bbox_pred"][0], (6 * heads, 8 * heads), params)
+    turn = _check_map(outputs, names["dir_cls_pred"][0], (2 * heads,), params)
     each = np.shape(outputs[box.name])[3 if box.last else 1] // heads  # 8 channels include a velocity
-    found = []
+    parts = []
     for number, count in enumerate(counts):
         first = number * each
-        found.append(
+        parts.append(
             {
-                "score": Part(score, sum(counts[:number]), count),
-                "offset": Part(box, first, 2),
-                "z": Part(box, first + 2, 1),
-                "size": Part(box, first + 3, 3),
-                "rotation": Part(turn, 2 * number, 2),
+                "score": MapChannels(score, sum(counts[:number]), count),
+                "offset": MapChannels(box, first, 2),
+                "z": MapChannels(box, first + 2, 1),
+                "size": MapChannels(box, first + 3, 3),
+                "rotation": MapChannels(turn, 2 * number, 2),
             }
         )
-    return found
+    return parts

@@ -21,13 +21,13 @@ from bevviz.stages.pillars.nms import survivors
 
 FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
-PROBED = 8  # points of the first test cloud
-LONGEST = 200.0  # metres: a longer box is no object
-FARTHEST = 10_000.0  # metres: no LiDAR reaches farther
+PROBE_POINTS = 8  # points of the first test cloud
+MAX_BOX_SIDE = 200.0  # metres: a longer box is no object
+MAX_DISTANCE = 10_000.0  # metres: no LiDAR reaches farther
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class NetworkOutput:
     """Output of a network for one cloud, before any threshold.
 
     Attributes:
@@ -81,10 +81,10 @@ class PillarNetwork:
                 f"{at}: takes {self._fixed} pillars, no more and no less; export it with that axis dynamic"
             )
         # The probe has several pillars, because OpenPCDet's encoder loses an axis with a single one.
-        across = np.linspace(params.point_range[:3], params.point_range[3:], PROBED + 2)[1:-1]
+        across = np.linspace(params.point_range[:3], params.point_range[3:], PROBE_POINTS + 2)[1:-1]
         self.probe = self.infer((across - [0, 0, params.z_offset]).astype(np.float32))
 
-    def infer(self, points: F32, intensity: F32 | None = None) -> Answer:
+    def infer(self, points: F32, intensity: F32 | None = None) -> NetworkOutput:
         """Run the network on a cloud.
 
         Args:
@@ -111,11 +111,11 @@ class PillarNetwork:
             intensity,
         )
         outputs = self._run(pillars) if len(pillars) else {}
-        return Answer(outputs, pillars.left_out_points, pillars.left_out_pillars)
+        return NetworkOutput(outputs, pillars.left_out_points, pillars.left_out_pillars)
 
     def _run(self, pillars: Pillars) -> dict[str, Any]:
         """Run the file or both files on pillars. Return the outputs by name."""
-        given = {}
+        feed = {}
         for role, wanted in self._inputs.items():
             if role == "pillars":
                 value: Any = pillars.points
@@ -124,17 +124,17 @@ class PillarNetwork:
             else:
                 value = np.zeros((len(pillars), wanted.shape[1]), np.int32)
                 value[:, -1], value[:, -2] = pillars.cells.T
-            given[wanted.name] = value.astype(NUMBERS[wanted.type], copy=False)
+            feed[wanted.name] = value.astype(NUMBERS[wanted.type], copy=False)
         if self._encoder is None:
-            return self._session.run(given)
+            return self._session.run(feed)
         if self._fixed:
-            ((name, value),) = given.items()
-            given = {
+            ((name, value),) = feed.items()
+            feed = {
                 name: np.concatenate(
                     [value, np.zeros((self._fixed - len(value), *value.shape[1:]), value.dtype)]
                 )
             }
-        encoded = next(iter(self._encoder.run(given).values()))
+        encoded = next(iter(self._encoder.run(feed).values()))
         channels = self._canvas.shape[1]
         if encoded.ndim < 2 or encoded.size != len(encoded) * channels or len(encoded) < len(pillars):
             raise UserError(
@@ -177,19 +177,19 @@ class PillarNetwork:
         """Return the input of the second file."""
         inputs, (nx, ny) = self._session.inputs, self._params.grid
         shape = inputs[0].shape
-        given = listed((i.name, i.shape) for i in inputs)
+        inputs_text = listed((i.name, i.shape) for i in inputs)
         known = len(inputs) == 1 and len(shape) == 4 and isinstance(shape[1], int)
         if not known or inputs[0].type not in FLOATS:
             raise UserError(
                 f"{self.where}: with objects.encoder it should take one map [1, channels, y, x]; "
-                f"its inputs: {given}"
+                f"its inputs: {inputs_text}"
             )
         if any(
             isinstance(n, int) and n != wanted for n, wanted in zip(shape, (1, shape[1], ny, nx), strict=True)
         ):
             raise UserError(
-                f"{self.where}: takes {given}, and by objects.point_range and objects.voxel_size the grid is "
-                f"{nx} pillars in x, {ny} in y"
+                f"{self.where}: takes {inputs_text}, and by objects.point_range and objects.voxel_size the "
+                f"grid is {nx} pillars in x, {ny} in y"
             )
         return inputs[0]
 
@@ -232,25 +232,27 @@ class ObjectNetwork:
         """
         return self.interpret(self.network.infer(points, intensity))
 
-    def interpret(self, answer: Answer) -> tuple[Boxes3D, F32, list[str]]:
+    def interpret(self, output: NetworkOutput) -> tuple[Boxes3D, F32, list[str]]:
         """Apply the thresholds to the network's output. The result is that of ``__call__``."""
         params, where = self._params, self.network.where
-        if answer.left_out_pillars:
+        if output.left_out_pillars:
             tell(
                 f"{where}: clouds hold more than {params.max_pillars:,} pillars (objects.max_pillars); "
                 "those that come last are left out"
             )
-        if not answer.outputs:
+        if not output.outputs:
             return Boxes3D.empty(), np.zeros(0, np.float32), []
         with reading(where):
-            found = self._head.candidates(answer.outputs)
-        sound = np.isfinite(found.boxes).all(axis=1)
-        sound &= ((found.boxes[:, 3:6] > 0) & (found.boxes[:, 3:6] < LONGEST)).all(axis=1)
-        sound &= (np.abs(found.boxes[:, :3]) < FARTHEST).all(axis=1)
-        rows = np.flatnonzero(sound)
-        rows = rows[np.argsort(-found.score[rows], kind="stable")]
-        boxes, class_id = found.boxes[rows], found.class_id[rows]
-        shared = {"all": np.zeros_like(class_id), "group": found.group[rows], "class": class_id}[params.nms]
+            candidates = self._head.candidates(output.outputs)
+        is_valid = np.isfinite(candidates.boxes).all(axis=1)
+        is_valid &= ((candidates.boxes[:, 3:6] > 0) & (candidates.boxes[:, 3:6] < MAX_BOX_SIDE)).all(axis=1)
+        is_valid &= (np.abs(candidates.boxes[:, :3]) < MAX_DISTANCE).all(axis=1)
+        rows = np.flatnonzero(is_valid)
+        rows = rows[np.argsort(-candidates.score[rows], kind="stable")]
+        boxes, class_id = candidates.boxes[rows], candidates.class_id[rows]
+        shared = {"all": np.zeros_like(class_id), "group": candidates.group[rows], "class": class_id}[
+            params.nms
+        ]
         alive = survivors(boxes, shared, params.nms_iou, params.nms_distance)
         kept = np.flatnonzero(alive)[: params.max_objects]
         final = boxes[kept]
@@ -258,7 +260,7 @@ class ObjectNetwork:
         final[:, 6] = np.arctan2(np.sin(final[:, 6]), np.cos(final[:, 6]))
         rows32 = final.astype(np.float32)
         names = [params.classes[c] for c in class_id[kept].tolist()]
-        return Boxes3D(rows32[:, :3], rows32[:, 3:6], rows32[:, 6]), found.score[rows][kept], names
+        return Boxes3D(rows32[:, :3], rows32[:, 3:6], rows32[:, 6]), candidates.score[rows][kept], names
 
 
 def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession:
@@ -274,26 +276,26 @@ def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession
 def _inputs(session: NetworkSession, where: str, *, alone: bool) -> dict[str, Any]:
     """Return role -> input. The number of axes of an input determines its role."""
     inputs = session.inputs
-    given = listed((i.name, i.shape) for i in inputs)
-    found: dict[str, Any] = {}
-    for one in inputs:
-        shape = one.shape
+    inputs_text = listed((i.name, i.shape) for i in inputs)
+    roles: dict[str, Any] = {}
+    for node in inputs:
+        shape = node.shape
         role = {3: "pillars", 2: "cells", 1: "counts"}.get(len(shape), "")
-        fits = one.type in (FLOATS if role == "pillars" else NUMBERS) and role not in found
+        fits = node.type in (FLOATS if role == "pillars" else NUMBERS) and role not in roles
         fits &= role != "cells" or shape[1] in (3, 4)
         fits &= role != "counts" or shape[0] != 1
         if not role or not fits:
-            found = {}
+            roles = {}
             break
-        found[role] = one
-    if "pillars" not in found or (alone and len(found) > 1):
+        roles[role] = node
+    if "pillars" not in roles or (alone and len(roles) > 1):
         wanted = "pillars [N, points, features]"
         if not alone:
             wanted += ", and if need be the number of points in each [N] and its cell [N, 4]"
-        raise UserError(f"{where}: its inputs are {given}; a network on pillars takes {wanted}")
-    if not alone and "cells" not in found:
+        raise UserError(f"{where}: its inputs are {inputs_text}; a network on pillars takes {wanted}")
+    if not alone and "cells" not in roles:
         raise UserError(
-            f"{where}: its inputs are {given}: without the cell of each pillar it is an encoder; set "
+            f"{where}: its inputs are {inputs_text}: without the cell of each pillar it is an encoder; set "
             "objects.method to the file behind it, and objects.encoder to this one"
         )
-    return found
+    return roles
