@@ -104,20 +104,20 @@ def mounting(source: SyntheticSource) -> Any:
 def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]]:
     """Return topic, time of receipt and message of a frame and the time up to the next frame, in order."""
     cloud, camera, truth = frame.clouds[0], frame.cameras[0], frame.truth
-    found = [(drive.LIDAR_TOPIC, cloud.received, encode_cloud(cloud))]
+    timed_messages = [(drive.LIDAR_TOPIC, cloud.received, encode_cloud(cloud))]
     for stamp in range(frame.stamp, frame.stamp + drive.PERIOD, ODOMETRY_PERIOD):
-        found += _poses(source, stamp)
+        timed_messages += _poses(source, stamp)
     if truth is not None:
         results = [[pair] for pair in zip(truth.labels, truth.scores.tolist(), strict=True)]
         boxes = encode_boxes_3d(truth.stamp, truth.frame_id, truth.boxes, results, ids=truth.ids)
-        found.append((drive.TRUTH_TOPIC, truth.received, boxes))
+        timed_messages.append((drive.TRUTH_TOPIC, truth.received, boxes))
     if camera.image is not None and camera.intrinsics is not None:
         received, info = camera.image.received, encode_camera_info(camera.image, camera.intrinsics)
-        found += [
+        timed_messages += [
             (drive.CAMERA_INFO_TOPIC, received, info),
             (drive.IMAGE_TOPIC, received, encode_image(camera.image)),
         ]
-    return sorted(found, key=lambda m: m[1])
+    return sorted(timed_messages, key=lambda m: m[1])
 
 
 def _poses(source: SyntheticSource, stamp: int) -> list[tuple[str, int, Any]]:

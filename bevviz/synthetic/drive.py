@@ -103,7 +103,7 @@ class SyntheticSource:
             raise UserError(f"seed {seed}: a seed is 0 or above")
         self.total = frames
         self.seed = seed
-        self.faults = faults.find(plant, (frames - 1) * PERIOD * 1e-9)
+        self.faults = faults.find_scenes(plant, (frames - 1) * PERIOD * 1e-9)
         self.scene = Scene(
             f"synthetic drive, seed {seed}" + "".join(f", {name}" for name in plant),
             lidar=LIDAR_FRAME,
@@ -117,7 +117,7 @@ class SyntheticSource:
         self.base_from_camera = self._base_from_true_camera  # the stated mounting
         if camera_error is not None:
             self.base_from_camera = self.base_from_camera @ camera_error
-        for fault in faults.find_sensors(plant):
+        for fault in faults.find_sensor_faults(plant):
             error = np.array(fault.camera_error)
             self.base_from_camera = self.base_from_camera @ geometry.transform(error[:3], error[3:])
             image_late += fault.image_late
@@ -192,12 +192,12 @@ class SyntheticSource:
         """Render frame ``index`` with its ground truth."""
         rng = np.random.default_rng((self.seed, index))
         stamp = START + index * PERIOD
-        shot = stamp + IMAGE_DELAY
+        image_stamp = stamp + IMAGE_DELAY
         map_from_lidar = self.map_from_base(stamp) @ self.base_from_lidar
-        map_from_camera = self.map_from_base(shot) @ self.base_from_camera
-        taken = shot - self._image_late
-        map_from_lens = self.map_from_base(taken) @ self._base_from_true_camera
-        at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, taken))
+        map_from_camera = self.map_from_base(image_stamp) @ self.base_from_camera
+        exposure = image_stamp - self._image_late
+        map_from_lens = self.map_from_base(exposure) @ self._base_from_true_camera
+        at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, exposure))
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
         scan = self._lidar.scan(View(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng)
@@ -211,14 +211,16 @@ class SyntheticSource:
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}
         fields["label"] = self._labels(scan)
         cloud = Cloud(stamp, LIDAR_FRAME, scan.xyz, fields, LIDAR_TOPIC, stamp + LATENCY, name=LIDAR_FRAME)
-        image = Image(shot, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=shot + LATENCY)
+        image = Image(
+            image_stamp, CAMERA_FRAME, picture.bgr, topic=IMAGE_TOPIC, received=image_stamp + LATENCY
+        )
         camera = Camera(
             name="zed",
             image=image,
             intrinsics=self.intrinsics,
             camera_from_points=geometry.inverse(map_from_camera) @ map_from_lidar,
             world_from_camera=map_from_camera,
-            sync_error=(shot - stamp) * 1e-9,
+            sync_error=(image_stamp - stamp) * 1e-9,
             tf_age=0.0,
             motion_compensated=True,
             mounting=geometry.inverse(self.base_from_camera) @ self.base_from_lidar,

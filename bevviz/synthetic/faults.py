@@ -14,7 +14,7 @@ import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.synthetic import models
-from bevviz.synthetic.world import Stage
+from bevviz.synthetic.world import SceneArea
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,27 +29,27 @@ class Fault:
 
     description: str
     time: float
-    scene: Callable[[Stage], None]
+    scene: Callable[[SceneArea], None]
 
 
-def _hidden_person(stage: Stage) -> None:
+def _hidden_person(stage: SceneArea) -> None:
     """Add a van parked on the right, and a person directly behind it as seen from the sensors."""
     stage.add("car", models.car(stage.rng, "van"), 12.0, -5.0)
     stage.add("person", models.person(stage.rng, walking=False), 16.3, -5.2, turn=np.pi / 2)
 
 
-def _flat_car(stage: Stage) -> None:
+def _flat_car(stage: SceneArea) -> None:
     """Add a car half a metre high."""
     stage.add("car", models.car(stage.rng, "saloon").scaled((0.7, 0.7, 0.33)), 10.0, -4.6)
 
 
-def _merged_people(stage: Stage) -> None:
+def _merged_people(stage: SceneArea) -> None:
     """Add two people a hand's breadth apart."""
     for lateral in (-4.6, -3.75):
         stage.add("person", models.person(stage.rng, walking=False, child=False), 10.0, lateral, turn=np.pi)
 
 
-def _shared_box(stage: Stage) -> None:
+def _shared_box(stage: SceneArea) -> None:
     """Add a person beside a cabinet of the same height. The cabinet has no class."""
     stage.add("person", models.person(stage.rng, walking=False, child=False), 9.0, -4.2, turn=np.pi)
     stage.place(models.litter_bin(stage.rng).moved(np.diag([1.2, 1.2, 1.7, 1.0])), 10.5, -5.4)
@@ -102,12 +102,12 @@ SENSOR_FAULTS: Mapping[str, SensorFault] = {
 }
 
 
-def find_sensors(names: Sequence[str]) -> list[SensorFault]:
+def find_sensor_faults(names: Sequence[str]) -> list[SensorFault]:
     """Return the sensor faults among these names."""
     return [SENSOR_FAULTS[name] for name in names if name in SENSOR_FAULTS]
 
 
-def find(names: Sequence[str], duration: float) -> list[Fault]:
+def find_scenes(names: Sequence[str], duration: float) -> list[Fault]:
     """Return the scenes with these names.
 
     Args:
@@ -117,7 +117,7 @@ def find(names: Sequence[str], duration: float) -> list[Fault]:
     Raises:
         UserError: a name is unknown, or the drive ends before the fault is seen.
     """
-    found = []
+    scenes = []
     for name in names:
         if name in SENSOR_FAULTS:
             continue
@@ -132,5 +132,5 @@ def find(names: Sequence[str], duration: float) -> list[Fault]:
                 f"plant {name}: it is seen after {fault.time:g} s and the drive has {duration:g} s; "
                 "give it more frames"
             )
-        found.append(fault)
-    return found
+        scenes.append(fault)
+    return scenes

@@ -96,8 +96,11 @@ def loft(rings: ArrayLike, color: Sequence[int], material: Material, closed: boo
     count, n = r.shape[:2]
     ring = np.arange(count if closed else count - 1)[:, None]
     a, b = np.arange(n), np.roll(np.arange(n), -1)
-    here, there = ring * n, (ring + 1) % count * n
-    sides = [np.stack([here + a, here + b, there + b], -1), np.stack([here + a, there + b, there + a], -1)]
+    ring_start, next_start = ring * n, (ring + 1) % count * n
+    sides = [
+        np.stack([ring_start + a, ring_start + b, next_start + b], -1),
+        np.stack([ring_start + a, next_start + b, next_start + a], -1),
+    ]
     vertices, triangles = r.reshape(-1, 3), [s.reshape(-1, 3) for s in sides]
     if not closed:
         centre, last = count * n, (count - 1) * n

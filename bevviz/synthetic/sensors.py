@@ -22,7 +22,7 @@ _SURFACE: Mapping[Material, tuple[float, float]] = {
     Material.CLOTH: (0.33, 0.08), Material.SKIN: (0.45, 0.0), Material.METAL: (0.55, 0.0),
     Material.FOLIAGE: (0.45, 0.7), Material.BARK: (0.25, 0.4), Material.SIGN: (1.0, 0.0),
 }  # fmt: skip
-SIGHT = 130.0  # metres that a camera sees through the haze, less than the length of street around it
+VISIBILITY = 130.0  # metres that a camera sees through the haze, less than the length of street around it
 REFLECTANCE, TEXTURE = np.array([_SURFACE[m] for m in Material], np.float32).T
 
 
@@ -55,7 +55,7 @@ class Caster:
 
 
 @dataclass(frozen=True, slots=True)
-class Hits:
+class RayHits:
     """Hits of rays on surfaces: one row for each of the H rays that hit something."""
 
     ray: NDArray[np.intp]  # (H,) row of the ray
@@ -73,7 +73,7 @@ class View:
     def __init__(self, static: Caster, moving: Mesh) -> None:
         self._casters: Sequence[Caster] = (static, Caster(moving)) if len(moving.triangles) else (static,)
 
-    def cast(self, rays: F32, reach: float = np.inf) -> Hits:
+    def cast(self, rays: F32, reach: float = np.inf) -> RayHits:
         """Cast (R, 6) rays and return the nearest hits within ``reach`` metres."""
         answers = [caster.cast(rays) for caster in self._casters]
         distance = answers[0]["t_hit"]
@@ -82,7 +82,7 @@ class View:
             nearest = (answers[1]["t_hit"] < distance).view(np.uint8)
             distance = np.minimum(distance, answers[1]["t_hit"])
         ray = np.flatnonzero(distance < reach)
-        out = Hits(
+        out = RayHits(
             ray,
             distance[ray],
             np.empty((len(ray), 3), np.float32),
@@ -189,7 +189,7 @@ class Lidar:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class CameraPicture:
     """Image of a camera with the object of each pixel."""
 
     bgr: U8  # (H, W, 3)
@@ -219,12 +219,14 @@ class PinholeCamera:
             self.width, self.height, np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), "plumb_bob", np.zeros(5)
         )
 
-    def picture(self, view: View, map_from_camera: F64, light: Light, rng: np.random.Generator) -> Picture:
+    def picture(
+        self, view: View, map_from_camera: F64, light: Light, rng: np.random.Generator
+    ) -> CameraPicture:
         """Render the view from this pose."""
         import cv2
 
         rays = _rays(map_from_camera, self._directions)
-        hits = view.cast(rays, SIGHT)
+        hits = view.cast(rays, VISIBILITY)
         image = _sky(rays[:, 3:], light)
         direction = rays[hits.ray, 3:]
         point = rays[hits.ray, :3] + direction * hits.distance[:, None]
@@ -241,14 +243,14 @@ class PinholeCamera:
         shade = albedo * (sky_seen * light.ambient + lit[:, None] * light.direct)
         _reflect(shade, hits, direction, light)
         haze = np.exp(-hits.distance / 350.0)[:, None]
-        clear = np.clip((SIGHT - hits.distance) / (0.4 * SIGHT), 0, 1)[:, None]
+        clear = np.clip((VISIBILITY - hits.distance) / (0.4 * VISIBILITY), 0, 1)[:, None]
         hazy = shade * haze + light.horizon * (1 - haze)
         image[hits.ray] = hazy * clear + image[hits.ray] * (1 - clear)
         image = cv2.GaussianBlur(image.reshape(self.height, self.width, 3), (3, 3), 0.55)
         image += rng.standard_normal(image.shape, np.float32) * 2.0
         number = np.full(len(rays), -1, np.int32)
         number[hits.ray] = hits.object
-        return Picture(np.clip(image, 0, 255).astype(np.uint8), number.reshape(self.height, self.width))
+        return CameraPicture(np.clip(image, 0, 255).astype(np.uint8), number.reshape(self.height, self.width))
 
 
 def _noise(seed: int) -> F32:
@@ -262,7 +264,7 @@ def _noise(seed: int) -> F32:
 _TILE = _noise(7)
 
 
-def _texture(hits: Hits, point: F32) -> F32:
+def _texture(hits: RayHits, point: F32) -> F32:
     """Return the brightness around 1 from noise at two scales, projected along the main axis."""
     flat = np.abs(hits.normal[:, 2]) > 0.7
     wide = np.abs(hits.normal[:, 0]) > np.abs(hits.normal[:, 1])
@@ -284,7 +286,7 @@ def _markings(uv: F32) -> NDArray[np.bool_]:
     return dashed
 
 
-def _paint_road(albedo: F32, hits: Hits) -> None:
+def _paint_road(albedo: F32, hits: RayHits) -> None:
     """Paint markings on the road and joints on the pavement."""
     road = np.flatnonzero(hits.material == Material.ROAD)
     albedo[road[_markings(hits.uv[road])]] = (205, 208, 210)
@@ -294,7 +296,7 @@ def _paint_road(albedo: F32, hits: Hits) -> None:
     albedo[slab[joint & (hits.distance[slab] < 30)]] *= 0.8
 
 
-def _paint_facades(albedo: F32, hits: Hits) -> None:
+def _paint_facades(albedo: F32, hits: RayHits) -> None:
     """Paint windows on facades."""
     wall = np.flatnonzero(hits.material == Material.FACADE)
     u, v = hits.uv[wall].T
@@ -308,7 +310,7 @@ def _paint_facades(albedo: F32, hits: Hits) -> None:
     albedo[wall[pane]] = np.array([88, 76, 66], np.float32) * (0.7 + 0.6 * ((lot[pane, None] * 0.618) % 1.0))
 
 
-def _reflect(shade: F32, hits: Hits, direction: F32, light: Light) -> None:
+def _reflect(shade: F32, hits: RayHits, direction: F32, light: Light) -> None:
     """Mirror the sky in glass and paint, more at a grazing angle (Schlick 1994)."""
     shiny = np.flatnonzero((hits.material == Material.GLASS) | (hits.material == Material.PAINT))
     normal, ray = hits.normal[shiny], direction[shiny]

@@ -129,7 +129,7 @@ class World:
         self,
         seed: int,
         duration: float,
-        scenes: Sequence[tuple[float, Callable[[Stage], None]]] = (),
+        scenes: Sequence[tuple[float, Callable[[SceneArea], None]]] = (),
         *,
         weave: bool = False,
     ) -> None:
@@ -139,7 +139,7 @@ class World:
         self.light = _light(_stream(seed, "light"))
         self._sway = _stream(seed, "sway").uniform(0, 2 * np.pi, 2)
         stages = [
-            Stage(self.street, self._way(time), time, np.random.default_rng(seed)) for time, _ in scenes
+            SceneArea(self.street, self._way(time), time, np.random.default_rng(seed)) for time, _ in scenes
         ]
         for (_, scene), stage in zip(scenes, stages, strict=True):
             scene(stage)
@@ -153,7 +153,7 @@ class World:
             if row is rows[-1] or all(stage.is_clear_of(actor) for stage in stages)
         ]
         self._parked = {a.number: a.mesh(self.street, 0.0) for a in self.actors if a.speed == 0}
-        self._scenery: list[Placed] = [
+        self._scenery: list[SceneryItem] = [
             *chain.from_iterable(_houses(_stream(seed, "houses", side), self.street, side) for side in SIDES),
             *chain.from_iterable(
                 _furniture(_stream(seed, "furniture", side), self.street, side) for side in SIDES
@@ -228,7 +228,7 @@ class World:
         return [self.actors[i] for i in np.flatnonzero(near)]
 
 
-class Stage:
+class SceneArea:
     """The right half of the road ahead of the ego vehicle at one time, where a scene is placed.
 
     Args:
@@ -243,7 +243,7 @@ class Stage:
     def __init__(self, street: Street, way: float, time: float, rng: np.random.Generator) -> None:
         self.rng, self._street, self._way, self._time = rng, street, way, time
         self.actors: list[Actor] = []
-        self.placed: list[Placed] = []
+        self.placed: list[SceneryItem] = []
 
     def add(self, label: str, model: models.Model, ahead: float, lateral: float, turn: float = 0.0) -> None:
         """Add a standing road user ``ahead`` metres in front of the ego vehicle."""
@@ -264,7 +264,7 @@ class Stage:
 # --- population --------------------------------------------------------------------------------
 
 SIDES = (-1, 1)
-Placed = tuple[float, Mesh]  # metres along the street, and the mesh that begins there
+SceneryItem = tuple[float, Mesh]  # metres along the street, and the mesh that begins there
 _TOWN = (
     1  # chosen so that each planted fault on the street of seed 0 fools the stages named in its description
 )
@@ -401,7 +401,7 @@ def _ground(street: Street, start: float, end: float) -> Mesh:
     return merge(parts)
 
 
-def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[SceneryItem]:
     """Yield houses, and gaps with hedges and trees."""
     s = street.start
     while s < street.end:
@@ -418,7 +418,7 @@ def _houses(rng: np.random.Generator, street: Street, side: int) -> Iterator[Pla
         s += length
 
 
-def _furniture(rng: np.random.Generator, street: Street, side: int) -> Iterator[Placed]:
+def _furniture(rng: np.random.Generator, street: Street, side: int) -> Iterator[SceneryItem]:
     """Yield lamps, trees, signs and bins along the pavement."""
     turn = 0 if side < 0 else np.pi
     for s in _spaced(rng, street.start + 2, street.end, 7, 15):
