@@ -1,4 +1,7 @@
-"""The command line: parse, call, print. Imports are inside the commands, so that --help is instant."""
+"""The command line: parse the arguments, run the command, report errors.
+
+Commands import their modules when they run, so that ``--help`` is instant.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run bevviz.
 
     Returns:
-        The exit status: 0 done, 1 nothing made, 2 wrong input, 3 an error of bevviz itself, 130 interrupted.
+        Exit status: 0 done, 1 no result, 2 wrong input, 3 an error of bevviz itself, 130 interrupted.
     """
     status = _main(arguments)
     if arguments is None:
@@ -77,8 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    # Imports and frames make many objects and few cycles: at Python's default of 700 between two looks for
-    # cycles these take a tenth of all the time.
+    # Imports and frames make many objects and few cycles. At Python's default threshold of 700 the collector
+    # takes a tenth of the run time.
     gc.set_threshold(50_000, 10, 10)
     if arguments is None:
         interrupts.install()
@@ -107,7 +110,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         print("bevviz: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader of our output has gone, as in `bevviz info bag | head`
+    except BrokenPipeError:  # The reader of our output has gone, as in `bevviz info bag | head`.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except Exception as error:
@@ -128,12 +131,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     finally:
         if arguments is None:
             interrupts.ignore()
-            if "velodyne_decoder" not in sys.modules:  # it would complain that it is not cleared
-                gc.freeze()  # the process ends: looking through all that it has takes a third of a second
+            if "velodyne_decoder" not in sys.modules:  # It would complain that it is not cleared.
+                gc.freeze()  # A last search for cycles would take a third of a second.
 
 
 def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
-    """The parser, and the names of the commands."""
+    """Return the parser and the names of the commands."""
     parser = Parser(
         prog="bevviz",
         description="See what a LiDAR-camera perception pipeline saw, made and decided, in Rerun.",

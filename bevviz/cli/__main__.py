@@ -1,3 +1,5 @@
+"""Entry point of ``python -m bevviz.cli``."""
+
 import sys
 
 from bevviz.cli import main

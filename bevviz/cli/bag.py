@@ -1,4 +1,4 @@
-"""``bevviz bag``."""
+"""Command ``bevviz bag``: run the pipeline over a bag."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from bevviz.support.contexts import without_collections
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``bag``."""
     bag = commands.add_parser(
         "bag",
         help="run the pipeline over a recorded bag",

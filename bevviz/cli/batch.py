@@ -1,4 +1,4 @@
-"""``bevviz batch``."""
+"""Command ``bevviz batch``: run the pipeline over many bags."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``batch``."""
     batch = commands.add_parser(
         "batch",
         help="run the pipeline over many bags",
@@ -127,7 +128,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     config = load_config(options)
     selection = FrameSelection(options.start, options.end, options.every, options.frames)
     jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint, options.truth)
-    # What is wrong for every bag is told once.
+    # Report once here an error that every bag would hit.
     blueprints.load(options.blueprint, Scene("", "lidar"))
     if config.detector.model:
         Detector(config.detector)
@@ -136,8 +137,13 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 
 def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, str]]) -> bool:
-    """Do what is left. Returns whether it was interrupted."""
+    """Run the unfinished jobs. Return whether the user interrupted them.
 
+    Args:
+        jobs: all jobs of the batch.
+        options: of the command.
+        failed: filled with the name and the error of each failed bag.
+    """
     from bevviz.fleet.batch import left_to_do
 
     todo = left_to_do(jobs, options.force, _warn)
@@ -205,7 +211,7 @@ def _sum_up(
     options: argparse.Namespace,
     interrupted: bool,
 ) -> int:
-    """Summary and catalog of what is complete."""
+    """Write the summary of the complete bags, register them in a catalog, and return the exit status."""
     from bevviz.fleet.summary import write_summary
 
     folder: Path = options.output
@@ -243,7 +249,7 @@ def _gate(
     limits: list[Limit],
     junit: Path | None,
 ) -> bool:
-    """Whether every bag keeps every limit."""
+    """Return whether every bag is within every limit."""
     from bevviz.evaluate.gate import Kept, check, write_junit
 
     suites: dict[str, list[Kept] | str] = dict(failed)

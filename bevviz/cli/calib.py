@@ -1,4 +1,4 @@
-"""``bevviz calib``."""
+"""Command ``bevviz calib``: check the camera's mounting and stamps."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.model.frame import Scene
 
-FRAMES = 30  # that are taken where --every does not say
+FRAMES = 30  # Number of frames to use without --every.
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``calib``."""
     calib = commands.add_parser(
         "calib",
         help="is it the calibration or the clock?",
@@ -119,7 +120,7 @@ def _log(
     config: Config,
     options: argparse.Namespace,
 ) -> None:
-    """Into every output that was asked for; without one, only the text was."""
+    """Log the results to the requested outputs, or to the viewer if there is a display."""
     from bevviz.calib.log import log_calibration
 
     outputs = Outputs.of(options).or_viewer()

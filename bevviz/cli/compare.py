@@ -1,4 +1,4 @@
-"""``bevviz compare``."""
+"""Command ``bevviz compare``: two configurations, two saved runs, or bevviz and the robot."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ its own configuration. Two .rrd files: what was saved, old (A) against new (B)."
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``compare``."""
     compare = commands.add_parser(
         "compare", help="what if? two configurations, two saved runs, or the robot", description=DESCRIPTION
     )
@@ -181,7 +182,7 @@ def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
 
 
 def _sides(options: argparse.Namespace) -> tuple[tuple[str, str], tuple[Config, Config]]:
-    """What the sides are called and their configurations."""
+    """Return the names and the configurations of the two sides."""
     own = options.a, options.b, options.set_a, options.set_b
     if not any(own) and options.preset is None and options.config is None:
         options.a, options.b = "reference", None if _recorded(options) else "default"
@@ -202,5 +203,5 @@ def _side(options: argparse.Namespace, base: str | None, settings: list[str]) ->
 
 
 def _recorded(options: argparse.Namespace) -> bool:
-    """Whether a recording stands for its bag, and its configuration for the default one."""
+    """Return whether the input is a recording. Its configuration then replaces the default one."""
     return getattr(options, "recorded", None) is not None

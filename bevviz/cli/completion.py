@@ -1,4 +1,4 @@
-"""``bevviz completion``."""
+"""Command ``bevviz completion``: complete commands, options and parameters in a shell."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ EXAMPLES = """in the shell's start-up file:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``completion``."""
     completion = commands.add_parser(
         "completion",
         help="what a shell needs to complete commands, options and parameters",
@@ -34,7 +35,7 @@ def _completion(options: argparse.Namespace) -> int:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell, which has called us as ``completion`` told it to. Does not return then."""
+    """Answer a completion request of the shell and end the process."""
     import argcomplete
 
     for action in _actions(parser):
@@ -54,7 +55,7 @@ def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 
 def _keys(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
-    """Of all parameters, with = where a value follows."""
+    """Return the keys of all parameters, with ``=`` if a value follows."""
     from bevviz.config import TUTORIAL_NAMES, keys
 
     sign = "=" if action.option_strings else ""

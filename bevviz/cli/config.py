@@ -1,4 +1,4 @@
-"""``bevviz config``."""
+"""Command ``bevviz config``: print the configuration, or explain a parameter."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ EXAMPLES = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``config``."""
     config = commands.add_parser(
         "config",
         help="print the effective configuration, or explain one parameter",
@@ -23,7 +24,7 @@ def add(commands: Commands) -> None:
     )
     config.add_argument("key", nargs="?", metavar="KEY", help="one parameter, or a section, to be explained")
     add_config(config)
-    config.set_defaults(run=_config, keep=None)  # as a run has it
+    config.set_defaults(run=_config, keep=None)  # Show ``logging.keep`` as a run would have it.
 
 
 def _config(options: argparse.Namespace) -> int:

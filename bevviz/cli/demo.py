@@ -1,4 +1,4 @@
-"""``bevviz demo``."""
+"""Command ``bevviz demo``: the synthetic drive."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
 from bevviz.support import progress
 
-# Held to bevviz.synthetic.faults by a test: importing that takes as long as a command should.
+# A test compares this text with bevviz.synthetic.faults. Importing that module would slow down --help.
 PLANTS = """faults to --plant:
   hidden_person   at 1 s: a person hidden behind a parked van: no point, no pixel
   flat_car        at 3 s: a car half a metre high, which the reference preset takes for ground
@@ -25,6 +25,7 @@ bevviz why flat.mcap --at 3 --class car --model demo --preset reference
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``demo``."""
     demo = commands.add_parser(
         "demo",
         help="a synthetic drive through the whole pipeline",
@@ -67,7 +68,7 @@ def _demo(options: argparse.Namespace) -> int:
         write_bag(source, options.bag, progress.bar(source, total=source.total, unit="scan", desc="simulate"))
         print(f"{options.bag}: {source.total} scans; 'bevviz bag {options.bag} --model demo' runs on it")
         return 0
-    # A project's sensors and network are not the demo's: it is the same everywhere.
+    # The demo ignores the project's sensors and network, so that it is the same everywhere.
     config = load(
         options.config, options.set, options.preset, layers=[Layer("demo", {"detector.model": "demo"})]
     )

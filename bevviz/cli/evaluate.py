@@ -1,4 +1,4 @@
-"""``bevviz evaluate``."""
+"""Command ``bevviz evaluate``: compare the results with the ground truth."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ EPILOG = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``evaluate``."""
     evaluate = commands.add_parser(
         "evaluate",
         help="how right it is, where the truth is known; a gate for CI",
@@ -77,7 +78,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool) -> int:
-    """The exit status of the run."""
+    """Run the pipeline with the evaluation and return the exit status."""
     from bevviz.anomalies import FailureSummary
     from bevviz.pipeline.session import Session
 
@@ -111,7 +112,7 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
 
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
-    """The exit status of the gate."""
+    """Print and write the results. Return the exit status of the gate: 1 if a limit is not kept, else 0."""
     from bevviz.evaluate.gate import check, write_junit
 
     if not Outputs.of(options) and not on_stdout(options):

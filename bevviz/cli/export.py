@@ -1,4 +1,4 @@
-"""``bevviz export``."""
+"""Command ``bevviz export``: write frames and results as a data set."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ EPILOG = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``export``."""
     export = commands.add_parser(
         "export",
         help="write frames as KITTI or nuScenes, with what was found as labels",

@@ -1,8 +1,9 @@
-"""``rerun-importer-bevviz``: Rerun's viewer runs it on the files that it opens, and shows what it writes.
+"""Executable ``rerun-importer-bevviz``: Rerun's viewer runs it on each file it opens and shows its output.
 
-Arguments and exit code are those of the external importers (rerun.io/docs/concepts/logging-and-ingestion): a
-recording on standard output, or ``NOT_OURS``. Rerun asks every importer about every file, so that one that is
-none of ours is answered before anything is imported.
+Arguments and exit code follow the protocol of external importers
+(rerun.io/docs/concepts/logging-and-ingestion): write a recording to standard output, or end with
+``NOT_OURS``. Rerun asks every importer about every file. A foreign file is therefore rejected before the
+slow imports.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from bevviz.support import cleanup
 
 NOT_OURS = 66
 BAGS = (".db3", ".bag")
-METADATA = "metadata.yaml"  # in a folder that is one bag
+METADATA = "metadata.yaml"  # This file marks a folder that is one bag.
 
 
 def main() -> None:
-    """The executable."""
+    """Run the importer and end the process with its exit code."""
     threading.Thread(target=_end_with_viewer, daemon=True).start()
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
-    """Returns the exit code."""
+    """Import the file and return the exit code."""
     parser = argparse.ArgumentParser(
         prog="rerun-importer-bevviz",
         description="Rerun's viewer runs this on what it opens: 'rerun drive.db3', or a bag dropped on it. "
@@ -41,7 +42,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--recording-id", default=None, metavar="ID", help="that the viewer proposes")
     options, _ = parser.parse_known_args(arguments)
     path = options.path.absolute()
-    # What is asked with a folder has the folder's name for its application, else the file's own.
+    # Rerun takes the application ID from the folder if it asks about a folder, else from the file.
     with_folder = options.application_id in ("", path.parent.name) and options.application_id != path.stem
     if not _is_ours(path, with_folder):
         return NOT_OURS
@@ -51,7 +52,7 @@ def run(arguments: list[str]) -> int:
 
     proposed = (options.application_id, options.recording_id)
     try:
-        # Bags of a folder would be laid over each other in the one recording that is proposed.
+        # Each bag of a folder needs its own recording. In the proposed one they would be mixed.
         _import(path, *((path.stem, None) if with_folder and path.is_file() else proposed))
     except UserError as error:
         print(f"bevviz: error: {error}", file=sys.stderr)
@@ -62,9 +63,9 @@ def run(arguments: list[str]) -> int:
 
 
 def _end_with_viewer() -> None:
-    """When nobody reads standard output any more, ends at once: the SDK would go on, or wait for ever."""
+    """End the process when the viewer closes standard output. The SDK would go on, or wait for ever."""
     pipe = select.poll()
-    pipe.register(sys.stdout, 0)  # errors and hang-ups are told in any case
+    pipe.register(sys.stdout, 0)  # poll() always reports errors and hang-ups.
     pipe.poll()
     cleanup.remove()
     os._exit(1)
@@ -83,7 +84,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.recording.recorder import Recorder
     from bevviz.recording.source_lookup import Origin
 
-    # A viewer opens files of anybody: no function is run, whoever trusts it.
+    # The viewer may open files of unknown origin. Never run the functions they name, even if trusted.
     never = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
     stated = layers(path if path.is_dir() else path.parent)
     config = load(layers=[replace(layer, trust=never) for layer in stated])
@@ -107,7 +108,10 @@ def _is_ours(path: Path, with_folder: bool) -> bool:
 
 
 def _comes_with_another(path: Path, with_folder: bool) -> bool:
-    """Whether Rerun asks about the same bag once more: of a folder it does, and of every file in it."""
+    """Return whether Rerun also asks about another path of the same bag.
+
+    Rerun asks about a folder, and about every file in it.
+    """
     if path.is_dir():
         return len(_files(path)) == 1
     of_folder = path.name == METADATA or ((path.parent / METADATA).is_file() and len(_files(path.parent)) > 1)

@@ -1,4 +1,4 @@
-"""``bevviz info``."""
+"""Command ``bevviz info``: describe a bag or a running robot."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from bevviz.errors import UserError
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``info``."""
     info = commands.add_parser(
         "info",
         help="what is in a bag, and what is missing for a full run",

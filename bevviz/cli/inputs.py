@@ -1,4 +1,4 @@
-"""What is read must not be written over, nor anything written twice."""
+"""Check of the output paths: no output may overwrite an input or another output."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ WRITTEN = {
     "write": "--write",
     "bag": "--bag",
 }
-TEXTS = ("csv", "json", "write")  # that are written at the end, where nothing looks at their place before
+# Files written at the end of the run. Only this module checks their folder before.
+TEXTS = ("csv", "json", "write")
 
 
 def check_outputs(options: argparse.Namespace) -> None:
-    """Before an hour's work.
+    """Check the output paths before the run starts.
 
     Raises:
-        UserError: an option's output is one of the command's inputs, by whatever name or link, or another
-            option's output, or there is no folder for it.
+        UserError: an output is one of the inputs, also by another name or link. Or two outputs are the same
+            file. Or the folder of an output does not exist.
     """
-    if getattr(options, "check", False):  # it writes nothing
+    if getattr(options, "check", False):  # It writes nothing.
         return
     inputs = {identity: path for path in _inputs(options) for identity in _identities(path)}
     outputs: dict[Path, str] = {}
@@ -58,7 +59,7 @@ def _inputs(options: argparse.Namespace) -> Iterator[Path]:
 
 
 def _identities(path: Path) -> Iterator[tuple[int, int]]:
-    """Of a file, or of the files in a folder."""
+    """Yield device and inode of a file, or of each file in a folder."""
     with suppress(OSError, ValueError):
         for file in path.iterdir() if path.is_dir() else [path]:
             with suppress(OSError):

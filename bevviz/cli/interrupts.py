@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP end a command, with what was made until then complete."""
+"""Signal handling: Ctrl-C, SIGTERM and SIGHUP end a command and leave complete files."""
 
 from __future__ import annotations
 
@@ -15,32 +15,35 @@ from bevviz.support import cleanup
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-_came = Event()  # a signal, whatever became of its exception
+_came = Event()  # Set by every signal, even if its exception got lost.
 
 
 def came() -> bool:
-    """Whether the process was interrupted: an exception among imports comes out of them as another one."""
+    """Return whether a signal came. An exception raised during an import can arrive as another one."""
     return _came.is_set()
 
 
 def install() -> None:
-    """For the whole process, before anything else. What ``nohup`` or a shell ignores stays ignored."""
+    """Install the handlers for the whole process. Call it first.
+
+    Signals that ``nohup`` or a shell ignores stay ignored.
+    """
     for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _interrupt)
 
 
 def ignore() -> None:
-    """The command is over: nothing that comes now may spoil its exit status."""
+    """Ignore signals after the command, so that they cannot change its exit status."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def leave(status: int) -> None:
-    """End the process at once where a thread is still at work in compiled code.
+    """End the process at once if a thread still runs compiled code.
 
-    After an interrupt, a thread that compiles a stage would find half of its compiler gone, and abort.
-    A thread with a network that exceeded its limits would end in a segmentation fault.
+    After an interrupt, a thread that compiles a stage would lose its compiler and abort. A thread with a
+    network that exceeded its limits would end in a segmentation fault.
     """
     threads = threading.enumerate()
     is_endless = any(thread.name == cleanup.ENDLESS_THREAD for thread in threads)
@@ -52,7 +55,10 @@ def leave(status: int) -> None:
 
 
 def _interrupt(number: int, stack: object) -> None:
-    """An exception only where a file needs its end: imports and libraries may swallow one."""
+    """Raise KeyboardInterrupt if a file has to be completed, else end the process.
+
+    Imports and libraries may swallow the exception. So it is raised only if it is needed.
+    """
     if not cleanup.any_unfinished():
         cleanup.remove()
         signal.signal(number, signal.SIG_DFL)
@@ -63,16 +69,16 @@ def _interrupt(number: int, stack: object) -> None:
 
 @contextmanager
 def terminable() -> Iterator[Event]:
-    """Within, a signal raises KeyboardInterrupt and sets the event.
+    """Raise KeyboardInterrupt and set the yielded event when a signal comes.
 
-    Both, since an exception that comes while a library calls back into Python can get lost there. What
-    comes after the first is ignored where ``install`` was called: half a file is no use to the impatient.
+    The event is needed because an exception can get lost while a library calls back into Python. After
+    ``install``, later signals are ignored: they would leave an incomplete file.
     """
     ended = Event()
 
     def interrupt(number: int, stack: object) -> None:
         ended.set()
-        if _interrupt in before.values():  # of a process that is a command
+        if _interrupt in before.values():  # This process is a command.
             _came.set()
         raise KeyboardInterrupt
 
@@ -90,5 +96,6 @@ def terminable() -> Iterator[Event]:
 
 
 def wait_for_interrupt() -> None:
+    """Wait for a signal."""
     with suppress(KeyboardInterrupt), terminable():
         signal.pause()

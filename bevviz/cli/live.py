@@ -1,4 +1,4 @@
-"""``bevviz live`` and ``bevviz snap``."""
+"""Commands ``bevviz live`` and ``bevviz snap``: run beside a robot, and save the last seconds."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add the commands ``live`` and ``snap``."""
     live = commands.add_parser(
         "live",
         help="run the pipeline beside a robot",
@@ -110,12 +111,12 @@ def add(commands: Commands) -> None:
 
 
 def _split(text: str) -> str:
-    """The setting that is meant."""
+    """Return the setting for a size or a time, as ``key=value``."""
     return f"live.split_{'size' if text.strip().endswith('B') else 'time'}={text}"
 
 
 def _live(options: argparse.Namespace) -> int:
-    # What Rerun would warn of is meant: files are indexed when they are complete.
+    # Silence Rerun's warning about files without an index. They get one when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.config.reloading import Settings
     from bevviz.live.notes import Notes
@@ -161,7 +162,7 @@ def _live(options: argparse.Namespace) -> int:
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
-    """What cannot work is said before a robot is waited for."""
+    """Check the outputs before waiting for a robot."""
     from bevviz.model.frame import Scene
     from bevviz.recording import blueprints
     from bevviz.recording.ports import check_port, own_address
@@ -183,7 +184,7 @@ def _watch_robot(
     loader: StageLoader,
     raw: RawRecorder,
 ) -> int:
-    """Publish back and take orders, as far as that is asked for."""
+    """Wait for the robot, then run. Publish results and take requests as the options say."""
     from bevviz.live.control import Control, unasked
     from bevviz.live.diagnostics import Diagnostics
     from bevviz.live.publish import Publisher
@@ -203,7 +204,7 @@ def _watch_robot(
         orders: Orders | None = None
         orders = Orders(source.node, settings.config, take, refuse)
         orders.config = settings.config
-        if not options.observe:  # while a robot is waited for
+        if not options.observe:  # Warm up while waiting for the robot.
             warm = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm, name="warm up", daemon=True).start()
         shown = ""
@@ -262,8 +263,7 @@ def _watch(
     control: Control | None = None,
     raw: RawRecorder | None = None,
 ) -> int:
-    """The live run, until the source ends or the user ends it."""
-
+    """Run until the source ends or the user ends it."""
     from bevviz.live.runtime import Live, Outputs
 
     window = options.viewer
@@ -321,7 +321,7 @@ def _watch(
 
 
 def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[object]:
-    """The workbench's page beside the run, where it is asked for."""
+    """Return the workbench's page for the run, if it is requested."""
     if options.workbench is None:
         return nullcontext()
     try:
@@ -337,7 +337,7 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
 
 
 def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Those of ``--save``: for the recording, and for the messages."""
+    """Return the paths of ``--save``: the recording's and the messages'."""
     from bevviz.live.files import check_name
 
     found: dict[str, Path] = {}

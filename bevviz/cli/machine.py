@@ -1,4 +1,4 @@
-"""``--json``: the result for other programs, one form for each command (docs/api.md)."""
+"""Option ``--json``: the result for other programs, in one format for each command (docs/api.md)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ STDOUT = "-"
 
 
 def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
+    """Add the option ``--json``."""
     group.add_argument(
         OPTION,
         nargs="?",
@@ -24,7 +25,7 @@ def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
 
 
 def with_json(arguments: Iterable[str]) -> list[str]:
-    """The arguments with ``--json PATH`` as ``--json=- PATH``, unless it is followed by a file for it."""
+    """Replace ``--json PATH`` by ``--json=- PATH``, unless PATH is a .json file."""
     told: list[str] = []
     for argument in arguments:
         if told and told[-1] == OPTION and not argument.endswith(".json"):
@@ -34,17 +35,17 @@ def with_json(arguments: Iterable[str]) -> list[str]:
 
 
 def on_stdout(options: argparse.Namespace) -> bool:
-    """Whether it takes the place of the text."""
+    """Return whether JSON replaces the text on standard output."""
     return str(options.json) == STDOUT
 
 
 def give(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> None:
-    """Print or write it, where it is asked for.
+    """Print or write the result if ``--json`` is given.
 
     Args:
         options: of the command.
-        form: its name; the number behind it counts up where a reader of the old one would fail.
-        tree: of what JSON knows, NaN, and tuples.
+        form: name of the format. The number after it increases with a change that breaks a reader.
+        tree: the result: values that JSON can represent, NaN, and tuples.
 
     Raises:
         UserError: the file cannot be written.
@@ -63,7 +64,7 @@ def give(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> Non
 
 
 def _plain(value: Any) -> Any:
-    """What is no number is null."""
+    """Replace NaN and infinity by None, and tuples by lists."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (1700000000.0) or
 ISO 8601 (2026-11-21T10:00:00)."""
 
-_NEGATIVES = re.compile(r"-[\d.][-+\d.eE]*(,[-+\d.eE]+)+")  # several numbers, the first below zero
+# Matches several numbers, the first of them negative.
+_NEGATIVES = re.compile(r"-[\d.][-+\d.eE]*(,[-+\d.eE]+)+")
 
 
 def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argparse._ArgumentGroup:
-    """The bag and the detector, where one is run. Returns the group that says what of it is run."""
+    """Add the arguments for the bag and, with ``detector``, for the model. Return their option group."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = f"{parser.epilog}\n\n{TIMES}" if parser.epilog else TIMES
     parser.add_argument(
@@ -53,7 +54,7 @@ def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argpar
 
 
 def add_dataset(group: argparse._ActionsContainer) -> None:
-    """Which data set, and which drive of it."""
+    """Add the options that select a data set and a drive in it."""
     group.add_argument(
         "--dataset",
         dest="source_dataset",
@@ -69,6 +70,7 @@ def add_dataset(group: argparse._ActionsContainer) -> None:
 
 
 def add_truth(parser: argparse.ArgumentParser) -> None:
+    """Add the options for the ground truth."""
     truth = parser.add_argument_group("ground truth", "The bag's own (.../ground_truth) is found by itself.")
     truth.add_argument("--truth", metavar="TOPIC", help="a Detection3DArray that states what is there")
     truth.add_argument(
@@ -80,6 +82,7 @@ def add_truth(parser: argparse.ArgumentParser) -> None:
 
 
 def add_limits(parser: argparse.ArgumentParser) -> None:
+    """Add the options for the limits of an evaluation."""
     gate = parser.add_argument_group(
         "gate", "METRIC[.CLASS][@RANGE]: recall=0.8, recall.person@0-10=0.9, ap_3d_0.7.car.moderate=0.5."
     )
@@ -95,14 +98,14 @@ def add_limits(parser: argparse.ArgumentParser) -> None:
 
 
 def add_at(group: argparse._ArgumentGroup, what: str, *, required: bool = False) -> None:
-    """One of its frames, by time or, as single frames have none, by number."""
+    """Add the options that select one frame: by time, or by number for data without times."""
     scan = group.add_mutually_exclusive_group(required=required)
     scan.add_argument("--at", metavar="TIME", help=what)
     scan.add_argument("--at-frame", type=number, metavar="N", help="the same by its number, counted from 0")
 
 
 def add_selection(group: argparse._ArgumentGroup) -> None:
-    """Which of its frames."""
+    """Add the options that select a range of frames."""
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")
     group.add_argument("--end", metavar="TIME", help="stop at this time")
     group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
@@ -110,13 +113,14 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
 
 
 def number(text: str) -> int:
+    """Parse a number of 0 or more."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is no number, counted from 0")
     return int(text)
 
 
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
-    """What ``add_bag`` and ``add_selection`` ask for."""
+    """Open the bag and the frames that the options of ``add_bag`` and ``add_selection`` select."""
     from bevviz.bags.source import BagSource
 
     return BagSource(
@@ -130,6 +134,7 @@ def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add the options for the configuration."""
     group = parser.add_argument_group(
         "configuration",
         "What a bevviz.toml in this folder or above, or BEVVIZ_MODEL, states need not be given; this wins.",
@@ -150,7 +155,13 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_output(
     parser: argparse.ArgumentParser, blueprint: str | None = "debug", *, raw: bool = False
 ) -> argparse._ArgumentGroup:
-    """Where to, and in which layout; None: the command has one of its own. ``raw``: messages, too."""
+    """Add the options for the outputs.
+
+    Args:
+        parser: of the command.
+        blueprint: default layout. None: the command has a layout of its own.
+        raw: whether ``--save`` can also write the messages.
+    """
     group = parser.add_argument_group(
         "output", "The viewer, where there is a display. Several can be given at once."
     )
@@ -191,7 +202,7 @@ def add_output(
 
 
 def add_keep(group: argparse._ActionsContainer) -> None:
-    """How much of a run is saved; a command without it always has everything."""
+    """Add the option for how much of a run is saved. A command without it always saves everything."""
     group.add_argument(
         "--keep",
         choices=("everything", "inspect", "report"),
@@ -200,7 +211,7 @@ def add_keep(group: argparse._ActionsContainer) -> None:
 
 
 def add_bind(group: argparse._ArgumentGroup, option: str) -> None:
-    """For whom a server is open."""
+    """Add the option for the address at which a server listens."""
     group.add_argument(
         "--bind",
         default="127.0.0.1",
@@ -210,6 +221,7 @@ def add_bind(group: argparse._ArgumentGroup, option: str) -> None:
 
 
 def add_ros_args(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the arguments of ROS."""
     parser.add_argument(
         "--ros-args",
         nargs=argparse.REMAINDER,
@@ -220,12 +232,12 @@ def add_ros_args(parser: argparse.ArgumentParser) -> None:
 
 
 def load_config(options: argparse.Namespace) -> Config:
-    """The configuration asked for, ``--model`` included."""
+    """Return the requested configuration, ``--model`` included."""
     return loaded(options, options.config, given_settings(options), options.preset)
 
 
 def given_settings(options: argparse.Namespace) -> list[str]:
-    """``key=value`` each, of ``--set``, ``--model`` and the data set."""
+    """Return the settings of ``--set``, ``--model``, ``--keep`` and the data set, as ``key=value``."""
     model = getattr(options, "model", None)
     return [
         *options.set,
@@ -251,7 +263,7 @@ def loaded(
     settings: Sequence[str],
     preset: Preset | None,
 ) -> Config:
-    """``bevviz.config.load`` upon the project's, or upon the recording's that was given instead of a bag."""
+    """Load a configuration on top of the recording's, if the input is one, else of the project's."""
     from bevviz.config import load
 
     recorded: Recorded | None = getattr(options, "recorded", None)
@@ -262,13 +274,15 @@ def loaded(
         found = load(file, settings, preset, layers=project_layers(options))
     if hasattr(options, "keep"):
         return found
-    # What is looked at once, whole, is read from the bag again: whatever a recording or a project keeps.
+    # A single frame is read from the bag and logged whole, even if the recording or the project keeps less.
     logging = found.logging.model_copy(update={"keep": "everything"})
     return found.model_copy(update={"logging": logging})
 
 
 def project_layers(options: argparse.Namespace) -> list[Layer]:
-    """What is stated for the working directory, looked for once; for a recording, its own is taken.
+    """Return the settings stated for the working directory. Return none for a recording: it has its own.
+
+    The files are read once.
 
     Raises:
         UserError: as ``bevviz.config.project.layers``.
@@ -284,9 +298,9 @@ def project_layers(options: argparse.Namespace) -> list[Layer]:
 
 
 def follow_recording(options: argparse.Namespace) -> None:
-    """Where a recording is given instead of a bag, its bag takes its place, and it is told which.
+    """Replace a recording in ``options.paths`` by its bag, and tell the user which.
 
-    One that has none behind it is ``options.shown``, for the command that can show it as it is.
+    A recording without a bag becomes ``options.shown`` if the command can show recordings.
 
     Raises:
         UserError: as ``bevviz.recording.source_lookup.follow``; ``--bag`` without a recording.
@@ -314,7 +328,10 @@ def follow_recording(options: argparse.Namespace) -> None:
 
 
 def with_negatives(arguments: Iterable[str]) -> list[str]:
-    """The arguments with ``--point -5,1,0`` as ``--point=-5,1,0``: argparse takes it for an option."""
+    """Return the arguments with ``--point -5,1,0`` replaced by ``--point=-5,1,0``.
+
+    Argparse takes the negative number for an option.
+    """
     joined: list[str] = []
     for argument in arguments:
         option = joined[-1] if joined else ""
@@ -326,18 +343,21 @@ def with_negatives(arguments: Iterable[str]) -> list[str]:
 
 
 def positive(text: str) -> int:
+    """Parse a whole number of 1 or more."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is no whole number of 1 or more")
     return int(text)
 
 
 def port(text: str) -> int:
+    """Parse a port."""
     if not text.isdecimal() or not 0 < int(text) < 65535:
         raise argparse.ArgumentTypeError(f"'{text}' is no port (1 to 65534)")
     return int(text)
 
 
 def slice_(text: str) -> tuple[int | None, int | None]:
+    """Parse ``A:B``. An empty end is None."""
     first, colon, last = text.partition(":")
     if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):
         raise argparse.ArgumentTypeError(f"'{text}' is not A:B, for example 100:200, 100: or :50")

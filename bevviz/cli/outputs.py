@@ -1,4 +1,4 @@
-"""Where a command's results go: what its options ask for, and what that means where they ask for nothing."""
+"""Outputs of a command: recordings, viewers, servers, and lines on stderr."""
 
 from __future__ import annotations
 
@@ -29,34 +29,35 @@ if TYPE_CHECKING:
 
 
 class Outputs(NamedTuple):
-    """What the options of ``add_output`` ask for; several at once."""
+    """Outputs that the options of ``add_output`` request."""
 
     save: Path | None = None
-    serve: int | None = None  # port
-    bind: str = "127.0.0.1"  # address that it is at
-    connect: str | None = None  # URL
+    serve: int | None = None  # Port of the web viewer.
+    bind: str = "127.0.0.1"  # Address at which it listens.
+    connect: str | None = None  # URL of a running viewer.
     viewer: bool = False
     blueprint: str | Blueprint = "debug"
-    unseen: bool = False  # saved as nothing could be shown
-    browser: bool = False  # where the page of ``serve`` is opened
+    unseen: bool = False  # Saved because nothing could be shown.
+    browser: bool = False  # Whether to open the page of ``serve``.
 
     @staticmethod
     def of(options: argparse.Namespace) -> Outputs:
+        """Return the outputs that the options request."""
         blueprint = getattr(options, "blueprint", "debug")
         return Outputs(options.save, options.serve, options.bind, options.connect, options.viewer, blueprint)
 
     def __bool__(self) -> bool:
-        """Whether anything is asked for."""
+        """Return whether any output is requested."""
         return bool(
             self.save is not None or self.serve is not None or self.connect is not None or self.viewer
         )
 
     def or_viewer(self) -> Outputs:
-        """Where nothing is asked for, the viewer on this machine, if it can be shown."""
+        """Return the requested outputs. If there are none and there is a display, return the viewer."""
         return self if self or not has_display() else self._replace(viewer=True)
 
     def or_file(self, default: Path) -> Outputs:
-        """Where nothing is asked for and nothing can be shown, a file."""
+        """Return the requested outputs. If there are none, return the viewer, the browser or a file."""
         chosen = self.or_viewer()
         if chosen:
             return chosen
@@ -69,7 +70,7 @@ class Outputs(NamedTuple):
 
     @contextmanager
     def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
-        """A recording that goes there; addresses are said."""
+        """Open a recording with these outputs and print their addresses."""
         from bevviz.recording.sinks import open_recording
 
         with open_recording(
@@ -90,7 +91,7 @@ class Outputs(NamedTuple):
             yield sinks
 
     def keep_serving(self, sinks: Sinks, what: str = "") -> None:
-        """Until the user ends it, where a server was asked for."""
+        """Serve until the user ends it, if a server is requested."""
         if self.serve is not None:
             from bevviz.recording.saved_viewer import too_large_for_web
 
@@ -105,25 +106,26 @@ _quiet = False
 
 
 def speak(*, quiet: bool) -> None:
-    """Of a process that is a command: what is announced is said, unless it is to be ``quiet``."""
+    """Print notes and progress on stderr, unless ``quiet``. A process that is a command calls this."""
     global _quiet
     _quiet = quiet
     progress.to(None if quiet else say, bars=not quiet)
 
 
 def say(line: str, *, always: bool = False) -> None:
-    """On stderr; with ``--quiet`` only what is ``always`` said, as the address of a server."""
+    """Print a line on stderr. ``--quiet`` suppresses it unless ``always`` is set."""
     if always or not _quiet:
         print(f"bevviz: {printable(line)}", file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:
+    """Print warnings on stderr."""
     for warning in warnings:
         print(f"bevviz: {style.warning('warning:')} {printable(warning)}", file=sys.stderr)
 
 
 def hint(scene: Scene, config: Config) -> None:
-    """Say what would give the user more."""
+    """Tell the user which missing input or setting would give more."""
     from bevviz.support.kernel import CACHED
 
     if not CACHED:
@@ -136,7 +138,7 @@ def hint(scene: Scene, config: Config) -> None:
 
 
 def tell_of_browser(address: str) -> None:
-    """Where to look, also from elsewhere, while a server runs."""
+    """Print the address of a viewer and how to reach it from elsewhere. Open the browser if there is one."""
     say(f"viewer at {address}", always=True)
     ports = [str(port) for port in re.findall(r":(\d+)", unquote(address))]
     over_ssh = " ".join(f"-L {port}:localhost:{port}" for port in ports)
@@ -148,7 +150,7 @@ def tell_of_browser(address: str) -> None:
 
 
 def program() -> str:
-    """How this program was called, to be typed again."""
+    """Return the command that runs this program, to be typed again."""
     called = Path(sys.argv[0])
     if called.name == "__main__.py":
         return f"{shlex.quote(sys.executable)} -m bevviz"
@@ -159,15 +161,17 @@ def program() -> str:
 
 
 def has_browser() -> bool:
-    """Whether one opens without a display: $BROWSER, as remote editors and WSL set it for their user."""
+    """Return whether a browser opens without a display. Remote editors and WSL set $BROWSER for that."""
     return bool(os.environ.get("BROWSER")) and not has_display()
 
 
 def open_browser(address: str) -> None:
+    """Open a page in the browser."""
     import webbrowser
 
     webbrowser.open(address)
 
 
 def has_display() -> bool:
+    """Return whether windows can be shown."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,4 @@
-"""argparse, with the nearest name for one that is wrong, and the usage of the command that it is about."""
+"""Argument parser with short errors: the nearest name for a wrong one, and the command's usage."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _CHOICE = re.compile(r"invalid choice: '(?P<given>.*)' \(choose from (?P<known>.
 
 
 class Parser(argparse.ArgumentParser):
-    """Of the program, or of a command: what is wrong is one line, and a second one the command's usage."""
+    """Parser of the program or of a command. An error is one line, followed by the command's usage."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str], namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As argparse, but what is unknown is told first, and by the command that it was given to."""
+        """Parse arguments like argparse. The command that got an unknown option reports it first."""
         for option in self._own(args):
             name = option.partition("=")[0]
             known = self._option_string_actions
@@ -37,14 +37,14 @@ class Parser(argparse.ArgumentParser):
         return found, unknown
 
     def _own(self, args: Sequence[str]) -> Iterable[str]:
-        """Options by their names; what comes after the name of a command, or is for ROS, is not ours."""
+        """Yield this parser's own options. Those of a subcommand and of ROS are not among them."""
         if any(isinstance(action, argparse._SubParsersAction) for action in self._actions):
             args = list(takewhile(lambda arg: arg.startswith("-"), args))
         mine = takewhile(lambda arg: arg not in ("--", "--ros-args"), args)
         return (arg for arg in mine if arg.startswith("--"))
 
     def error(self, message: str) -> NoReturn:
-        """Two lines on stderr; exit status 2."""
+        """Print an error and the usage on stderr, and exit with status 2."""
         if choice := _CHOICE.search(message):
             given, known = choice["given"], re.findall(r"[^\s',]+", choice["known"])
             if message.startswith(f"argument {COMMAND}:"):
@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2)
 
     def short_usage(self) -> str:
-        """One line: what has to be given, and where the rest is explained."""
+        """Return one line with the required arguments."""
         words = [self.prog]
         for action in self._get_positional_actions():
             name = str(action.metavar or action.dest)
@@ -74,7 +74,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def nearest(given: str, known: Iterable[str]) -> str:
-    """The end of a sentence: the likeliest name that was meant; empty: there is none.
+    """Return a hint with the most similar name, as the end of a sentence. Empty if none is similar.
 
     >>> nearest("--modle", ["--model", "--set"])
     "; did you mean '--model'?"
@@ -84,7 +84,7 @@ def nearest(given: str, known: Iterable[str]) -> str:
 
 
 def _no_command(given: str, known: Iterable[str]) -> str:
-    """Of what is neither a command nor a file; what looks like a file was meant as one."""
+    """Return the message for an argument that is neither a command nor an existing file."""
     path = Path(given)
     if path.suffix or len(path.parts) > 1:
         there: list[str] = []

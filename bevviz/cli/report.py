@@ -1,4 +1,4 @@
-"""``bevviz report``."""
+"""Command ``bevviz report``: make a bug report, or check one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bevviz.support.files import CONFIG_LIMIT, read_text
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``report``."""
     report = commands.add_parser(
         "report",
         help="a bug report that stands on its own, and its check",

@@ -1,4 +1,4 @@
-"""A run of the command line: with a progress bar, into the outputs that are asked for, until a signal."""
+"""Runs of the command line: progress bar, outputs, and an orderly end after a signal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ R = TypeVar("R")
 
 
 def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]) -> RunEnd:
-    """The run, with a progress bar; a signal ends it after the frame at hand."""
+    """Run the frames with a progress bar. After a signal the run ends with the current frame."""
     from bevviz.pipeline.progress_bar import Progress
     from bevviz.pipeline.run import run
 
@@ -33,12 +33,12 @@ def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Obs
 
 
 def process(drive: Drive, outputs: Outputs, default: Path) -> int:
-    """Every stage on every frame, logged to every output that is asked for.
+    """Run every stage on every frame and log the results to every output. Return the exit status.
 
     Args:
         drive: the frames.
-        outputs: where to.
-        default: file where there is no display.
+        outputs: requested outputs.
+        default: file to save if nothing can be shown.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.recording.recorder import Recorder
@@ -68,15 +68,15 @@ def logged(
     observers: Callable[[RecordingStream], Sequence[Observer[R]]],
     finish: Callable[[], None] = lambda: None,
 ) -> int:
-    """A run whose observers log.
+    """Run the frames with observers that log.
 
     Args:
-        items: frames, or what there is of each.
-        processor: what makes a result of each.
-        config: how they are made.
-        outputs: where what is logged goes.
-        observers: of the recording.
-        finish: called after the last one, before what was made is served.
+        items: frames, or other inputs of the processor.
+        processor: makes a result of each item.
+        config: configuration of the run.
+        outputs: outputs of the recording.
+        observers: makes the observers for the recording.
+        finish: called after the last frame, before results are served.
 
     Returns:
         The exit status.
@@ -85,7 +85,7 @@ def logged(
 
     with outputs.opened(items.scene, config) as sinks:
         seen = [*observers(sinks.recording), DiskWatch(sinks)]
-        early = list(items.warnings)  # known before an hour's work, and said before it
+        early = list(items.warnings)  # Print these warnings before the long run, not after it.
         warn(early)
         end = through(items, processor, seen)
         warn(warning for warning in items.warnings if warning not in early)

@@ -1,4 +1,4 @@
-"""Colour where a terminal shows it. NO_COLOR (no-color.org) is without, FORCE_COLOR with it everywhere."""
+"""Colours of text in a terminal. NO_COLOR (no-color.org) disables them, FORCE_COLOR forces them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import TextIO
 
 
 def error(text: str) -> str:
+    """Return the text in the colour of errors."""
     return _styled(text, "1;31", sys.stderr)
 
 
 def warning(text: str) -> str:
+    """Return the text in the colour of warnings."""
     return _styled(text, "33", sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""``bevviz sweep``."""
+"""Command ``bevviz sweep``: run one or two parameters over a range."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``sweep``."""
     sweep = commands.add_parser(
         "sweep",
         help="a parameter over a range: counts, times, precision and recall",
@@ -62,7 +63,7 @@ def _sweep(options: argparse.Namespace) -> int:
         sweep = Sweep(parameters, configs, truth)
         outputs = Outputs.of(options)._replace(blueprint=layout(sweep))
         with ExitStack() as stack:
-            # Before the run, that may take long: what cannot be opened is told now.
+            # The run may take long. Report an output that cannot be opened before it.
             sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None
             hint(source.scene, config)
             end = through(source, sweep, [])

@@ -1,4 +1,4 @@
-"""``bevviz trust``."""
+"""Command ``bevviz trust``: allow the functions that a file names to run."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ EXAMPLES = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``trust``."""
     trust = commands.add_parser(
         "trust",
         help="let the functions of a project file, or of a YAML file, run",
@@ -86,7 +87,7 @@ def _state(path: Path, sha256: str) -> str:
 
 
 def _file(path: Path | None) -> Path:
-    """The file that is meant."""
+    """Return the file to trust: the path itself, or the project file of its folder or of one above."""
     from bevviz.config.project import NAME, find
 
     if path is not None and not path.is_dir():

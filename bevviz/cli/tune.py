@@ -1,4 +1,4 @@
-"""``bevviz tune``."""
+"""Command ``bevviz tune``: run a frame again at each save of the configuration."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``tune``."""
     tune = commands.add_parser(
         "tune",
         help="watch a configuration: one frame, run anew at each save",
@@ -87,7 +88,7 @@ def _tune(options: argparse.Namespace) -> int:
 
 
 def _frame(options: argparse.Namespace, settings: Settings) -> tuple[Frame, Scene, Sequence[str]]:
-    """The frame, decoded once, with the sensors' names and what is to be said of the bag."""
+    """Return the decoded frame, the sensors' names, and the warnings about the bag."""
     from bevviz.bags.source import BagSource
 
     with BagSource(options.paths, settings.config, at=options.at) as source:

@@ -1,4 +1,4 @@
-"""``bevviz why``."""
+"""Command ``bevviz why``: explain why an object was reported or missed."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ EXAMPLES = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``why``."""
     why = commands.add_parser(
         "why",
         help="why an object was reported, or was not",
@@ -162,7 +163,7 @@ def _selection(options: argparse.Namespace) -> Selection:
 
 
 def _beside(questioner: Questioner, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
-    """What else lies at the place that was asked about."""
+    """Return the answers about other objects at the selected place."""
     if not (selection.box or selection.point or selection.cell):
         return []
     told = {answer.subject.key for answer in answers}
@@ -170,7 +171,7 @@ def _beside(questioner: Questioner, selection: Selection, answers: Sequence[Answ
 
 
 def _in_short(questioner: Questioner, selection: Selection) -> str:
-    """What was asked about in one line; why there is nothing to say where there is not."""
+    """Return one line about the selected objects, or the reason why there are none."""
     from bevviz.why.answer_text import summary
     from bevviz.why.sentences import not_run
 

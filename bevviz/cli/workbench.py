@@ -1,4 +1,4 @@
-"""``bevviz open``."""
+"""Command ``bevviz open``: the workbench."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ EXAMPLES = """examples:
 
 
 def add(commands: Commands) -> None:
+    """Add the command ``open``."""
     command = commands.add_parser(
         "open",
         help="the workbench: a page where a click on anything answers why",
@@ -109,14 +110,14 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt), terminable():  # the way to end it
+        with suppress(KeyboardInterrupt), terminable():  # The user ends it with a signal.
             drive = "\n".join(str(path.resolve()) for path in options.paths)
             serve(make, drive, options.port, ready, "native" if beside else "page")
     return 0
 
 
 def _show(recording: Path, options: argparse.Namespace) -> int:
-    """A recording without a bag: nothing can be asked, but all of it looked at."""
+    """Show a recording without a bag. It can be looked at, but not asked."""
     from bevviz.recording import saved_viewer as shown
 
     say(f"{recording}: no bag behind it, shown as it is")
@@ -132,7 +133,11 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
 
 
 def _beside(options: argparse.Namespace) -> bool:
-    """Whether Rerun's own viewer is shown beside the page; what stands against it is told now."""
+    """Return whether Rerun's viewer is shown next to the page.
+
+    Raises:
+        UserError: the viewer cannot be shown or reached.
+    """
     if options.connect is not None:
         from bevviz.recording.sinks import check_viewer
 
@@ -143,9 +148,9 @@ def _beside(options: argparse.Namespace) -> bool:
 
 
 def _arrow_without_pandas() -> None:
-    """pyarrow looks for pandas at the first array that it makes: half a second, for nothing used here.
+    """Make pyarrow skip its import of pandas, which takes half a second and is not needed.
 
-    Where its own pandas functions are called it looks again.
+    pyarrow looks for pandas at its first array. It looks again when one of its pandas functions is called.
     """
     if "pandas" in sys.modules:
         return
@@ -160,6 +165,8 @@ def _arrow_without_pandas() -> None:
 
 
 class _NoPandas:
+    """Import finder that hides pandas."""
+
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
         if name == "pandas":
