@@ -1,4 +1,4 @@
-"""Which object of one side is which of the other, and how they differ."""
+"""Differences between two results of the same frame: which objects correspond, and how they differ."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.results import FrameResult
 from bevviz.stages.fusion import assign
 
-REACH = 2.0  # metres between the centres of one object, seen from above
-OVERLAP = 0.1  # least IoU, seen from above, of one object that has two classes
-MOVED = 0.2  # metres: what is further away has moved
+REACH = 2.0  # metres between the centres of one object, in the bird's-eye view
+OVERLAP = 0.1  # least IoU of one object with two classes, in the bird's-eye view
+MOVED = 0.2  # metres: an object has moved if its centre is further away
 IMAGE_OVERLAP = 0.5  # least IoU of one detection in the image
 
 
 class Change(StrEnum):
+    """Kind of difference of an object between side A and side B."""
+
     SAME = "same"
     MOVED = "moved"
     CLASS = "other class"
@@ -42,35 +44,36 @@ class ImageBoxes:
 
     @staticmethod
     def empty() -> ImageBoxes:
+        """Return no detections."""
         return ImageBoxes(np.zeros((0, 4), np.float32), ())
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What one side has found in a frame. Boxes in ``Frame.points_frame``."""
+    """Results of one side in a frame. Boxes are in ``Frame.points_frame``."""
 
     boxes: Boxes3D
     names: tuple[str, ...]
     scores: F32
-    images: Mapping[str, ImageBoxes] = field(default_factory=dict)  # by camera, where detections were made
-    clusters: int | None = None  # None: not known
+    images: Mapping[str, ImageBoxes] = field(default_factory=dict)  # by camera; only cameras with detections
+    clusters: int | None = None  # None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One object of either side or of both. Row -1 and an empty name where a side has it not."""
+    """One object of one side or of both. A side without it has row -1 and an empty name."""
 
     change: Change
     row_a: int
     row_b: int
     name_a: str
     name_b: str
-    distance: float = float("nan")  # between the centres: metres seen from above, in an image pixels
+    distance: float = float("nan")  # between the centres: metres in the bird's-eye view, pixels in an image
     iou: float = 0.0
 
     @property
     def text(self) -> str:
-        """In words, without the place."""
+        """The difference in words, without the position."""
         if self.change is Change.CLASS:
             return f"{self.name_a} in A is {self.name_b} in B"
         if self.change is Change.MOVED:
@@ -80,7 +83,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class FrameDifferences:
-    """How two sides differ in one frame."""
+    """Differences of two sides in one frame."""
 
     index: int
     stamp: int
@@ -88,22 +91,22 @@ class FrameDifferences:
     b: Seen
     objects: tuple[Difference, ...]
     images: Mapping[str, tuple[Difference, ...]]  # by camera
-    judged: Judged | None = None  # where it is known what is really there
+    judged: Judged | None = None  # None: no ground truth
 
     @property
     def counts(self) -> Counter[Change]:
-        """Objects by what has become of them."""
+        """Number of objects of each kind of difference."""
         return Counter(difference.change for difference in self.objects)
 
     @property
     def number(self) -> int:
-        """Objects that differ, and detections that do."""
+        """Number of objects and detections that differ."""
         pairs = [*self.objects, *(d for found in self.images.values() for d in found)]
         return sum(difference.change is not Change.SAME for difference in pairs)
 
 
 def seen(result: FrameResult) -> Seen:
-    """What a run has found."""
+    """Return the result of a run as one side of a comparison."""
     images = {}
     for camera in result.cameras:
         if (found := camera.detections) is not None:
@@ -118,7 +121,7 @@ def seen(result: FrameResult) -> Seen:
 
 
 def differences(index: int, stamp: int, a: Seen, b: Seen, judged: Judged | None = None) -> FrameDifferences:
-    """How two sides differ in the frame."""
+    """Return the differences of two sides in a frame."""
     both = [camera for camera in a.images if camera in b.images]
     return FrameDifferences(
         index,
@@ -132,11 +135,11 @@ def differences(index: int, stamp: int, a: Seen, b: Seen, judged: Judged | None 
 
 
 def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
-    """Each object of both sides once.
+    """Pair the objects of two sides. Each object of either side occurs once.
 
-    Two boxes may be one object if they have the same class and their centres are within 2 m seen from
-    above, or another class and an IoU of 0.1 or more seen from above. Among these the pairs are the
-    one-to-one assignment with most pairs of least total cost ::
+    Two boxes may be one object if they have the same class and their centres are within 2 m in the
+    bird's-eye view. With different classes they need an IoU of 0.1 or more in the bird's-eye view. The pairs
+    are the one-to-one assignment with the most pairs and, among those, the least total cost ::
 
         distance / 2 m + (1 - IoU) + (1 if the class differs)
 
@@ -151,7 +154,10 @@ def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
 
 
 def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
-    """Each detection of both sides once; two are one where their boxes have an IoU of 0.5 or more."""
+    """Pair the detections of two sides in an image. A pair has an IoU of 0.5 or more.
+
+    Each detection of either side occurs once.
+    """
     iou = geometry.iou(a.xyxy, b.xyxy)
     middle_a, middle_b = ((boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 for boxes in (a, b))
     distance = np.linalg.norm(middle_a[:, None] - middle_b[None], axis=2)
@@ -166,7 +172,7 @@ def _other(a: Sequence[str], b: Sequence[str]) -> np.ndarray[tuple[int, int], np
 def _paired(
     a: Sequence[str], b: Sequence[str], cost: F64, distance: F32, iou: F32, moved: float
 ) -> tuple[Difference, ...]:
-    # Two that stay alone cost more than any pair, so that nothing stays alone that needs not.
+    # Two unmatched objects cost more than any pair, so that the assignment makes as many pairs as it can.
     column = assign(np.asarray(cost, np.float64), unmatched=10.0)
     found = []
     for i, j in enumerate(column.tolist()):

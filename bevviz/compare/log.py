@@ -1,4 +1,4 @@
-"""Logs how two sides differ: boxes in the colour of the difference, counts, words and states."""
+"""Logging of the differences of two sides: coloured boxes, counts, texts and states."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ COLORS = {
     Change.ONLY_A: SIDES["only A"],
     Change.ONLY_B: SIDES["only B"],
 }
-HEIGHT = 0.57  # of a view of one side, of what a view of space has in other layouts
+HEIGHT = 0.57  # height of a view of one side, as a share of a 3D view's height in other layouts
 
 
 class DifferenceLogger(Writer):
-    """Writes differences to the recording that the two sides are written to.
+    """Writer of differences to the recording that also holds the two sides.
 
     Args:
-        recording: where to.
-        names: what the two sides are.
-        summary: Markdown that says how they were made.
+        recording: target.
+        names: names of the two sides.
+        summary: Markdown text about the two configurations.
     """
 
     def __init__(self, recording: rr.RecordingStream, names: tuple[str, str], summary: str) -> None:
         super().__init__(recording)
-        self._lanes = StateLanes(COLORS)  # one for each class: the worst that has become of it
+        self._lanes = StateLanes(COLORS)  # one lane for each class, with its worst change
         self.recording.send_property("compare", rr.AnyValues(a=names[0], b=names[1]))
         a, b = map(markdown, names)
         text = f"# What was compared\n\n- **A**: {a}\n- **B**: {b}\n\n{summary}"
@@ -78,11 +78,18 @@ class DifferenceLogger(Writer):
                 )
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
+        """Refresh the writer and log the state of every class anew."""
         super().refresh(known)
         self._lanes.states = {}
 
     def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
-        """One frame. Times in nanoseconds; ``received`` is 0 where it is not known."""
+        """Log the differences of one frame.
+
+        Args:
+            found: differences of the frame.
+            received: receive time in nanoseconds; 0: unknown.
+            world_from_points: (4, 4) pose of the points in the fixed frame.
+        """
         self.begin(found.index, found.stamp, received)
         for change in DIFFERENT:
             mine = [d for d in found.objects if d.change is change]
@@ -108,7 +115,7 @@ class DifferenceLogger(Writer):
         if change is not Change.ONLY_A:
             side, rows = (found.b, [d.row_b for d in mine])
         path = entities.difference(change)
-        # What is better and worse is more than what differs: where that is known, its names alone are shown.
+        # If the ground truth is known, only objects that one side alone finds get a name. They matter more.
         is_named = named_in_space(side.boxes.center[rows], height=HEIGHT)
         labels = [_label(d) if found.judged is None and is_named[i] else "" for i, d in enumerate(mine)]
         what = boxes3d(side.boxes, np.array(rows), labels)
@@ -155,7 +162,7 @@ class DifferenceLogger(Writer):
 
 
 def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]:
-    """By class, of either side: an object that one side lacks is worse than one that has moved."""
+    """Return the worst change of each class of either side. A missing object is worse than one that moved."""
     worst: dict[str, Change] = {}
     for difference in sorted(objects, key=lambda d: WORST_FIRST.index(d.change)):
         for name in {difference.name_a, difference.name_b} - {""}:
@@ -164,7 +171,7 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
 
 
 def place(difference: Difference, found: FrameDifferences) -> str:
-    """Where the object is, from the origin of its frame: ``at 12.3 m, 4 degrees left``."""
+    """Return the position of the object relative to its frame's origin, as ``at 12.3 m, 4° left``."""
     boxes, row = (
         (found.a.boxes, difference.row_a) if difference.row_b < 0 else (found.b.boxes, difference.row_b)
     )
@@ -175,7 +182,7 @@ def place(difference: Difference, found: FrameDifferences) -> str:
 
 
 def page(found: FrameDifferences) -> str:
-    """The differences of one frame as a page."""
+    """Return the differences of one frame as Markdown."""
     return "\n".join(_lines(found))
 
 
@@ -207,7 +214,7 @@ def _lines(found: FrameDifferences) -> Iterator[str]:
 
 
 def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
-    """Rows of a table: what, and how many of it in A and B."""
+    """Yield table rows: title, number in A, number in B."""
     a, b = found.a, found.b
     yield "objects", str(len(a.names)), str(len(b.names))
     if a.clusters is not None or b.clusters is not None:

@@ -1,4 +1,4 @@
-"""Two saved runs: what they found is read back from their recordings, frame by frame, by stamp."""
+"""Comparison of two saved runs. Their results are read from the recordings and paired by stamp."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ Row = Mapping[str, Any]
 
 @dataclass(slots=True)
 class SavedFrame:
-    """What a recording holds of one frame, as far as it is compared."""
+    """Results of one frame in a recording, as far as they are compared."""
 
-    index: int = -1  # -1: no frame of a run
+    index: int = -1  # -1: not a frame of the run
     received: int = 0
     fused: Row = field(default_factory=dict)
-    detections: dict[str, Row] = field(default_factory=dict)  # by camera, where there are any
+    detections: dict[str, Row] = field(default_factory=dict)  # by camera; only cameras with detections
     detected: bool = False
     clusters: int | None = None
 
     @property
     def world_from_points(self) -> F64:
+        """Pose (4, 4) of the points in the fixed frame."""
         if "Transform3D:translation" not in self.fused:
             return np.eye(4)
         return geometry.transform(
@@ -51,16 +52,17 @@ class SavedFrame:
         )
 
     def seen(self, cameras: Sequence[str]) -> Seen:
+        """Return the results as one side of a comparison."""
         boxes, names, scores = _boxes(self.fused)
         images = {camera: _image_boxes(self.detections.get(camera, {})) for camera in cameras}
         return Seen(boxes, names, scores, images if self.detected else {}, self.clusters)
 
 
 class SavedRun:
-    """A recording that bevviz has made, read once.
+    """Recording made by bevviz, read once.
 
     Raises:
-        UserError: cannot be read, or is no recording of bevviz.
+        UserError: the recording cannot be read, or is not from bevviz.
     """
 
     def __init__(self, path: Path) -> None:
@@ -81,19 +83,22 @@ class SavedRun:
 
     @property
     def name(self) -> str:
+        """Name of the run: file, preset and version."""
         return f"{self.path} ({self._property['preset'][0]}, {self._property['versions'][0]})"
 
     @property
     def scene(self) -> Scene:
+        """Names of the drive, its LiDARs and cameras."""
         lidar = "lidars" if len(self.lidars) > 1 else "".join(self.lidars)
         return Scene(self._property["source"][0], lidar, self.lidars, self.cameras)
 
     @property
     def config(self) -> Mapping[str, Any]:
+        """Configuration of the run as dotted keys and values."""
         return flat_yaml(self._property["config"][0], str(self.path))
 
     def stream(self) -> Iterator[Chunk]:
-        """The run itself, without what a comparison has added to it."""
+        """Yield the chunks of the run, without the results of a comparison."""
         added = [f"{root}/**" for root in (entities.B, entities.COMPARE)]
         yield from RrdReader(self.path).stream().drop(content=added)
 
@@ -123,7 +128,7 @@ class SavedRun:
 
 @dataclass(frozen=True, slots=True)
 class SavedFrames:
-    """One frame of two runs, and how it differs."""
+    """Results of two runs for one frame, and their differences."""
 
     a: SavedFrame
     b: SavedFrame
@@ -131,7 +136,7 @@ class SavedFrames:
 
 
 class SavedPair:
-    """Two runs, old and new, and the frames that both have; to be iterated over.
+    """Old and new run. Iterate over it to get the stamps of their common frames.
 
     Raises:
         UserError: a recording cannot be used, or they have no frame in common.
@@ -149,14 +154,17 @@ class SavedPair:
 
     @property
     def scene(self) -> Scene:
+        """Names of the old run's drive, LiDARs and cameras."""
         return self.a.scene
 
     @property
     def total(self) -> int:
+        """Number of common frames."""
         return len(self._stamps)
 
     @property
     def warnings(self) -> Sequence[str]:
+        """One sentence for each run with frames that the other one lacks."""
         both = len(self._stamps)
         return [
             f"{run.path}: {len(run.frames) - both} of {len(run.frames)} frames are not in the other one"
@@ -168,22 +176,24 @@ class SavedPair:
         return iter(self._stamps)
 
     def perceive(self, stamp: int, network: Executor | None = None) -> SavedFrames:
-        """How the runs differ at one of the stamps."""
+        """Compare the runs at one of the stamps."""
         a, b = self.a.frames[stamp], self.b.frames[stamp]
         found = differences(a.index, stamp, a.seen(self.a.cameras), b.seen(self.b.cameras))
         return SavedFrames(a, b, found)
 
     def finish(self, frames: SavedFrames) -> SavedFrames:
+        """Return the frames as they are."""
         return frames
 
 
 class SavedPairRecorder(Observer[SavedFrames]):
-    """Sends both runs on, the new one under ``/b``, and logs how they differ."""
+    """Observer that copies both runs to a recording, the new one under ``/b``, and logs their differences."""
 
     def __init__(self, recording: rr.RecordingStream, pair: SavedPair) -> None:
         self._recording, self._pair = recording, pair
 
     def begin(self, items: Items[object]) -> None:
+        """Copy both runs."""
         recording, pair = self._recording, self._pair
         recording.send_chunks(pair.a.stream())
         recording.send_chunks(_beside(pair.b))
@@ -193,12 +203,13 @@ class SavedPairRecorder(Observer[SavedFrames]):
         self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
     def see(self, frames: SavedFrames) -> None:
+        """Log the differences of a frame."""
         posed = frames.a if frames.a.fused else frames.b
         self._differences.log(frames.found, frames.a.received, posed.world_from_points)
 
 
 def _beside(run: SavedRun) -> Iterator[Chunk]:
-    """What the run has made, under ``/b``; what the sensors and the robot brought is in the other one."""
+    """Yield the run's results, moved to ``/b``. The data of sensors and robot are those of the old run."""
     brought = {entities.TRUTH, *(entities.points(lidar) for lidar in run.lidars)}
     for camera in run.cameras:
         brought |= {entities.sensor(camera), entities.image(camera)}
@@ -213,7 +224,7 @@ def _beside(run: SavedRun) -> Iterator[Chunk]:
 
 
 def _rows(chunk: Chunk) -> list[Row]:
-    """Times as numbers, and what was logged, without what is null."""
+    """Return the logged rows without null values. Times are integers."""
     batch = chunk.to_record_batch()
     clocks = set(chunk.timeline_names) - {entities.FRAME}
     batch = batch.cast(pa.schema([f.with_type(pa.int64()) if f.name in clocks else f for f in batch.schema]))
@@ -239,5 +250,5 @@ def _image_boxes(row: Row) -> ImageBoxes:
         return ImageBoxes.empty()
     middle = np.array(row["Boxes2D:centers"], np.float32) - CORNER
     half = np.array(row["Boxes2D:half_sizes"], np.float32)
-    names = tuple(label.rpartition(" ")[0] for label in row["Boxes2D:labels"])  # behind it the score
+    names = tuple(label.rpartition(" ")[0] for label in row["Boxes2D:labels"])  # the score follows the name
     return ImageBoxes(np.hstack([middle - half, middle + half]), names)

@@ -1,4 +1,4 @@
-"""The two sides of a comparison on the same frames: two configurations, or a configuration and the robot."""
+"""The two sides of a comparison: two configurations, or a configuration and the robot."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from bevviz.stages.robot_results import detections_of, in_points_frame
 
 @dataclass(frozen=True, slots=True)
 class ComparedFrame:
-    """What both sides make of a frame, and how that differs; None where a side says nothing of it."""
+    """Results of both sides for a frame, and their differences. None: a side has no result."""
 
     frame: Frame
     a: FrameResult | None
@@ -38,19 +38,20 @@ class ComparedFrame:
 
 
 class SideFailures(Observer[ComparedFrame]):
-    """Which stages failed on either side."""
+    """Observer that collects the stages that failed on either side."""
 
     def __init__(self) -> None:
         self._sides = {"A": FailureSummary(), "B": FailureSummary()}
 
     def see(self, result: ComparedFrame) -> None:
+        """Collect the failures of a frame."""
         for side, made in (("A", result.a), ("B", result.b)):
             if made is not None:
                 self._sides[side].see(made)
 
     @property
     def warnings(self) -> list[str]:
-        """One sentence for each stage of a side."""
+        """One sentence for each failed stage of a side."""
         return [f"{side}: {text}" for side, found in self._sides.items() for text in found.warnings]
 
 
@@ -58,14 +59,14 @@ Truths = Callable[[Frame], Truth | None]
 
 
 class ComparedSessions:
-    """Two configurations on the same frames.
+    """Processor that runs two configurations on the same frames.
 
     Args:
         a, b: the configurations.
-        truth: what is really there in a frame, where that is known.
+        truth: returns the ground truth of a frame, if it is known.
 
     Raises:
-        UserError: a detector's model cannot be used, or they need different frames.
+        UserError: a detector's model cannot be used, or the configurations need different frames.
     """
 
     def __init__(self, a: Config, b: Config, truth: Truths | None = None) -> None:
@@ -73,10 +74,12 @@ class ComparedSessions:
         self._sessions, self._truth = Sessions([a, b]), truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
+        """Run the stages of both configurations on a frame."""
         a, b = self._sessions.perceive(frame, network)
         return ComparedFrame(frame, a, b)
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
+        """Finish the results of both sides in frame order, and compare them."""
         assert compared.a is not None
         assert compared.b is not None
         a, b = self._sessions.finish((compared.a, compared.b))
@@ -84,15 +87,17 @@ class ComparedSessions:
 
 
 class ComparedRobot:
-    """What a session makes, and what the robot published on a Detection3DArray topic."""
+    """Processor that compares a session with the robot's Detection3DArray topic."""
 
     def __init__(self, session: Session, topic: str, truth: Truths | None = None) -> None:
         self._session, self._topic, self._truth = session, topic, truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
+        """Run the stages on a frame."""
         return ComparedFrame(frame, self._session.perceive(frame, network), None)
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
+        """Finish the result in frame order, and compare it with the robot's."""
         assert compared.a is not None
         theirs = published(compared.frame, self._topic, compared.a.config)
         return _differing(compared.frame, self._session.finish(compared.a), theirs, self._truth)
@@ -107,10 +112,12 @@ def _differing(frame: Frame, a: FrameResult, b: FrameResult | None, truths: Trut
 
 
 class ComparisonRecorder(Observer[ComparedFrame]):
-    """Logs both sides and how they differ: what A makes where a run alone has it, what B makes under ``/b``.
+    """Observer that logs both sides and their differences.
+
+    Entities of A have the same paths as in a single run. Those of B are under ``/b``.
 
     Args:
-        recording: where to.
+        recording: target.
         a, b: the configurations.
         summary: of the same comparison.
     """
@@ -121,6 +128,7 @@ class ComparisonRecorder(Observer[ComparedFrame]):
         self._recording, self._configs, self._summary = recording, (a, b), summary
 
     def begin(self, items: Items[object]) -> None:
+        """Log the static entities of both sides."""
         a, b = self._configs
         self._loggers = (
             Logger(self._recording, a, items.scene),
@@ -131,6 +139,7 @@ class ComparisonRecorder(Observer[ComparedFrame]):
         self._differences = DifferenceLogger(self._recording, self._summary.names, self._summary.about)
 
     def see(self, compared: ComparedFrame) -> None:
+        """Log both sides and their differences for a frame."""
         for logger, result in zip(self._loggers, (compared.a, compared.b), strict=True):
             if result is not None:
                 logger.log(result)
@@ -142,10 +151,10 @@ class ComparisonRecorder(Observer[ComparedFrame]):
 
 
 def robot_topic(topics: tuple[str, ...], asked: str) -> str:
-    """The topic with the robot's classed boxes: the one asked for, or the one whose name says so.
+    """Return the requested topic, or the topic with the robot's classed boxes if its name shows it.
 
     Raises:
-        UserError: there is none, or several could be meant.
+        UserError: there is no such topic, or there are several candidates.
     """
     there = ", ".join(topics)
     if asked:
@@ -162,7 +171,7 @@ def robot_topic(topics: tuple[str, ...], asked: str) -> str:
 
 
 def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
-    """What the robot says of the frame, as if a run had made it; None where it says nothing."""
+    """Return the robot's results for the frame as a frame result. None: the robot published none."""
     labelled = next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
     if labelled is None:
         return None
@@ -171,7 +180,7 @@ def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
 
 
 def _objects(labelled: LabelledBoxes3D, frame: Frame) -> Objects:
-    """The robot's boxes in the frame of the points."""
+    """Return the robot's boxes in the frame of the points."""
     boxes = in_points_frame(frame, labelled)
     none = np.full(len(boxes), -1, np.int32)
     return Objects(boxes, labelled.labels, labelled.scores, none, ("",) * len(boxes), none)

@@ -1,4 +1,4 @@
-"""The differences of all frames as a table, as JSON and as CSV."""
+"""Summary of the differences in all frames: table, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -26,52 +26,56 @@ from bevviz.support import table
 from bevviz.support.files import save
 from bevviz.support.text import fenced, printable
 
-WORST = 10  # frames in the table
-EXAMPLES = 2  # of each
+WORST = 10  # number of frames in the table
+EXAMPLES = 2  # number of objects shown for each frame
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
 
 
 class Compared(Protocol):
-    """What is known of a frame of both sides; None: one of them says nothing of it."""
+    """Frame of a comparison."""
 
     @property
-    def found(self) -> FrameDifferences | None: ...
+    def found(self) -> FrameDifferences | None:
+        """Differences of the frame. None: a side has no result."""
+        ...
 
 
 class ComparisonSummary(Observer[Compared]):
-    """Counts frame after frame.
+    """Observer that counts differences over all frames.
 
     Args:
-        names: what the two sides are.
+        names: names of the two sides.
         config: dotted key -> how its value differs.
     """
 
     def __init__(self, names: tuple[str, str], config: Mapping[str, ParameterChange]) -> None:
         self.names, self.config = names, {key: str(change) for key, change in config.items()}
-        self.without = 0  # frames that a side says nothing of
+        self.without = 0  # frames for which a side has no result
         self.frames: list[dict[str, Any]] = []
         self._classes: dict[str, Counter[str]] = defaultdict(Counter)
         self._detections: dict[str, Counter[str]] = defaultdict(Counter)
         self._clusters: Counter[str] = Counter()
-        self._other_clusters = 0  # frames with more of them on one side
+        self._other_clusters = 0  # frames in which the number of clusters differs
         self._detected = False
-        self._judged: dict[str, Counter[str]] = defaultdict(Counter)  # by class of the truth
+        self._judged: dict[str, Counter[str]] = defaultdict(Counter)  # by class of the ground truth
         self._wrong: dict[str, Counter[str]] = {"A": Counter(), "B": Counter()}  # by name
-        self._names: set[str] = set()  # that the truth has
+        self._names: set[str] = set()  # names that the ground truth accepts
         self._moved: list[float] = []
 
     @property
     def about(self) -> str:
-        """What was compared, in Markdown."""
+        """Differences of the configurations, in Markdown."""
         return fenced("\n".join(parameters(self.config)))
 
     def see(self, compared: Compared) -> None:
+        """Count a frame, or note that a side has no result."""
         if compared.found is None:
             self.without += 1
         else:
             self.add(compared.found)
 
     def add(self, found: FrameDifferences) -> None:
+        """Count the differences of a frame."""
         for difference in found.objects:
             _count(self._classes, difference)
             if difference.change is Change.MOVED:
@@ -126,7 +130,7 @@ class ComparisonSummary(Observer[Compared]):
 
     @property
     def truth(self) -> Mapping[str, Any] | None:
-        """What both find of what is there, by class, and how much of it is wrong; None: not known."""
+        """Labelled objects that each side finds, by class, and the number of false ones. None: no truth."""
         if not self._judged:
             return None
         wrong = {
@@ -136,14 +140,14 @@ class ComparisonSummary(Observer[Compared]):
 
     @property
     def worst(self) -> Sequence[Mapping[str, Any]]:
-        """Frames that differ: those in which something is no longer found first, then by differences."""
+        """Frames that differ. Frames in which B loses an object come first, then those with most changes."""
         return sorted(
             (f for f in self.frames if f["number"]),
             key=lambda f: (-len(f["broke"]), -f["number"], f["frame"]),
         )
 
     def table(self) -> str:
-        """For the terminal."""
+        """Return the summary for the terminal."""
         return "\n".join(map(printable, self._lines()))
 
     def _lines(self) -> Iterator[str]:
@@ -207,7 +211,7 @@ class ComparisonSummary(Observer[Compared]):
         return f"{objects}; the number of clusters differs in {self._other_clusters} of {frames}"
 
     def as_tree(self) -> dict[str, Any]:
-        """For JSON: everything that the table is made of, and each difference."""
+        """Return the counts and every difference for JSON."""
         return {
             "a": self.names[0],
             "b": self.names[1],
@@ -220,7 +224,7 @@ class ComparisonSummary(Observer[Compared]):
         }
 
     def write_csv(self, path: Path) -> None:
-        """A row for each object that differs.
+        """Write a row for each object that differs.
 
         Raises:
             UserError: the file cannot be written.
@@ -235,7 +239,7 @@ class ComparisonSummary(Observer[Compared]):
 
 
 def parameters(config: Mapping[str, str]) -> Iterator[str]:
-    """The parameters that differ, one a line."""
+    """Yield the parameters that differ, one in each line."""
     if not config:
         yield "parameters: no difference"
         return
@@ -244,7 +248,7 @@ def parameters(config: Mapping[str, str]) -> Iterator[str]:
 
 
 def _count(counts: Mapping[str, Counter[str]], difference: Difference) -> None:
-    """Under the class that B has, or A where B has none."""
+    """Count a difference under B's class, or under A's if B lacks the object."""
     counts[difference.name_b or difference.name_a][difference.change.value] += 1
     if difference.name_a:
         counts[difference.name_a]["objects A"] += 1

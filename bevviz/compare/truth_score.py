@@ -1,4 +1,4 @@
-"""Which of two sides is right: what each finds of the objects that are really there."""
+"""Scores of two sides against the ground truth: which labelled objects each side finds."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from bevviz.model.results import FrameResult, Objects
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A frame of both sides against the truth. Row i is the i-th object that had to be found."""
+    """Frame of both sides compared with the ground truth. Row i is the i-th object to be found."""
 
     labels: tuple[str, ...]
     boxes: Boxes3D  # in the frame of the points
     a: Bool  # found by A
     b: Bool
-    wrong_a: tuple[str, ...]  # names of A's objects that are none
+    wrong_a: tuple[str, ...]  # names of A's false objects
     wrong_b: tuple[str, ...]
-    names: frozenset[str]  # that the labels of this frame accept: others are not judged
+    names: frozenset[str]  # names that the labels of this frame accept; other names are not judged
 
     @property
     def fixed(self) -> Sequence[int]:
-        """Rows that only B finds."""
+        """Rows of objects that only B finds."""
         rows: list[int] = np.flatnonzero(self.b & ~self.a).tolist()
         return rows
 
     @property
     def broken(self) -> Sequence[int]:
-        """Rows that only A finds."""
+        """Rows of objects that only A finds."""
         rows: list[int] = np.flatnonzero(self.a & ~self.b).tolist()
         return rows
 
     def text(self, row: int) -> str:
-        """``person at 12.3 m``."""
+        """Return class and distance of an object, as ``person at 12.3 m``."""
         return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
 
 
 def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
-    """What either side finds of one frame's objects."""
+    """Compare both sides of a frame with its ground truth."""
     must = np.flatnonzero(truth.must)
     (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
     return Judged(
@@ -58,7 +58,7 @@ def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
 
 
 def _side(objects: Objects | None, truth: Truth) -> tuple[Bool, tuple[str, ...]]:
-    """(K,) which boxes of the truth are found, and the names of the objects that are none of them."""
+    """Return (K,) whether each labelled box is found, and the names of the false objects."""
     if objects is None:
         return np.zeros(len(truth.labels), bool), ()
     matches = judge_objects(objects, truth)

@@ -1,4 +1,4 @@
-"""The views of two runs that are compared, for layouts; see ``bevviz.recording.views``."""
+"""Views of two compared runs, for layouts. See also ``bevviz.recording.views``."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _SIDES = {"": ("A", Change.ONLY_A), entities.B: ("B", Change.ONLY_B)}
 
 
 def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
-    """What one run has found, with the differences that concern it: obstacles, clusters, objects."""
+    """Return the 3D view of one run: obstacles, clusters, objects and their differences."""
     name, only = _SIDES[root]
     beside = [entities.TRUTH, *changes(only, Change.MOVED, Change.CLASS)]
     return space(scene, raw=False, names=False, name=f"3D {name}", root=root, beside=beside)
 
 
 def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
-    """The one image, with the detections of one run and those that the other one has not."""
+    """Return the image view with one run's detections and with those missing in the other run."""
     name, only = _SIDES[root]
     image, own = entities.image(camera_name), entities.detections(camera_name)
     different = [entities.image_difference(camera_name, change) for change in (only, Change.CLASS)]
@@ -33,44 +33,49 @@ def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
 
 
 def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
-    """The cameras and the bird's-eye view of one run."""
+    """Return the camera views and the bird's-eye view of one run, in tabs."""
     name = _SIDES[root][0]
     cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
     return rrb.Tabs(*cameras, birds_eye(scene, root, f"Bird's-eye view {name}"))
 
 
 def differences() -> rrb.TextDocumentView:
-    """How the runs differ in the frame, in words."""
+    """Return the view of the frame's differences as text."""
     return rrb.TextDocumentView(name="Differences", origin=entities.COMPARE, contents=["$origin"])
 
 
 def changes(*which: Change) -> list[str]:
-    """Contents: objects that differ, in these ways or in any, and that one run alone is right about."""
+    """Return the entity paths of objects that differ, and of objects that one run alone gets right.
+
+    Args:
+        which: kinds of difference; none: all of them.
+    """
     return [f"{entities.difference(change)}/**" for change in (*(which or DIFFERENT), "broken", "fixed")]
 
 
 def compared() -> rrb.TextDocumentView:
-    """What the two runs are."""
+    """Return the view of the names and configurations of both runs."""
     return rrb.TextDocumentView(name="A and B", origin=entities.COMPARE_ABOUT)
 
 
 def difference_log() -> rrb.TextLogView:
+    """Return the view of the differences as log lines."""
     return text_log("Log of differences", entities.COMPARE_LOG)
 
 
 def numbers() -> rrb.Tabs:
-    """In tabs: side by side, their legends would hide the curves."""
+    """Return the plots, in tabs. Side by side, their legends would hide the curves."""
     return rrb.Tabs(difference_counts(), side_counts(), name="Numbers")
 
 
 def difference_counts() -> rrb.TimeSeriesView:
-    """Objects that differ, by how."""
+    """Return the plot of the number of objects that differ, by kind of difference."""
     contents = [entities.difference_count(change) for change in DIFFERENT]
     return plot("Objects that differ", entities.COMPARE, contents, linked=True)
 
 
 def side_counts() -> rrb.TimeSeriesView:
-    """Objects and clusters of both."""
+    """Return the plot of the number of objects and clusters on both sides."""
     contents = [
         entities.difference_count(f"{what}_{side}") for what in ("objects", "clusters") for side in "ab"
     ]
@@ -78,10 +83,10 @@ def side_counts() -> rrb.TimeSeriesView:
 
 
 def difference_states() -> rrb.StateTimelineView:
-    """For each class the worst that has become of it, over time."""
+    """Return the timeline of the worst change of each class."""
     return rrb.StateTimelineView(name="Worst of each class", origin=entities.COMPARE_STATES, time_view=LINKED)
 
 
 def version() -> rrb.TextDocumentView:
-    """What was changed in the configuration, in ``bevviz tune``."""
+    """Return the view of the parameters changed in ``bevviz tune``."""
     return rrb.TextDocumentView(name="Version", origin=entities.TUNE)
