@@ -1,8 +1,8 @@
-"""Average precision as the KITTI object benchmark defines it, in the image, from above and in 3D.
+"""Average precision as the KITTI object benchmark defines it: in the image, in the bird's-eye view and in 3D.
 
-Geiger, Lenz and Urtasun 2012, with the 40 recall points of Simonelli et al. 2019. What follows is the rule of
-the benchmark's own development kit: which labels and detections count, which are only not held against
-anybody, and at which scores the curve is sampled.
+Geiger, Lenz and Urtasun 2012, with the 40 recall points of Simonelli et al. 2019. The rules are those of
+the benchmark's development kit: which labels and detections count, which are ignored, and at which scores
+the curve is sampled.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ from bevviz.model.results import FrameResult
 from bevviz.support.kernel import kernel
 
 RECALL_POINTS = 40
-COUNTS, IGNORED, OTHER = 0, 1, -1  # what a label or a detection is to a class and difficulty
+COUNTS, IGNORED, OTHER = 0, 1, -1  # role of a label or detection for a class and difficulty
 
-Roles = NDArray[np.int8]  # of these
+Roles = NDArray[np.int8]  # one of the three values for each label or detection
 Key: TypeAlias = tuple[str, float, str, str]  # view, overlap, class, difficulty
 
 
 class Difficulty(NamedTuple):
-    height: float  # pixels that an object is high, at least
-    occluded: int  # at most
-    truncated: float  # at most
+    """Limits for the labels of one difficulty of KITTI."""
+
+    height: float  # pixels, least height of an object
+    occluded: int  # largest level of occlusion
+    truncated: float  # largest truncated share
 
 
 DIFFICULTIES = {
@@ -42,7 +44,7 @@ DIFFICULTIES = {
 }
 OVERLAPS = (0.5, 0.7)
 VIEWS = ("bev", "3d")
-KITTI_CLASSES = {  # label -> labels that are neither right nor wrong, names that detectors give it
+KITTI_CLASSES = {  # label -> labels that count neither as right nor as wrong, names that detectors use
     "Car": (("Van",), ("car",)),
     "Pedestrian": (("Person_sitting",), ("pedestrian", "person")),
     "Cyclist": ((), ("cyclist", "bicycle")),
@@ -51,17 +53,17 @@ KITTI_CLASSES = {  # label -> labels that are neither right nor wrong, names tha
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Objects of a frame, or detections in its image, against its truth."""
+    """Objects of a frame, or detections in its image, compared with the ground truth."""
 
     names: tuple[str, ...]  # (D,) in lower case
     score: F32  # (D,)
-    height: F32  # (D,) pixels; inf where there is no image box
+    height: F32  # (D,) pixels; inf without an image box
     overlaps: dict[str, F32]  # (D, K) IoU with each label, by view
-    excused: dict[str, F32]  # (D,) largest share in a region where nothing is labelled, by view
+    excused: dict[str, F32]  # (D,) by view, largest share in a region without labels
 
 
 def found_objects(result: FrameResult, truth: Truth) -> Found:
-    """The fused objects of a frame."""
+    """Compare the fused objects of a frame with the ground truth."""
     objects = result.objects
     assert objects is not None
     above, volume = geometry.box_iou(objects.boxes, truth.boxes)
@@ -76,7 +78,7 @@ def found_objects(result: FrameResult, truth: Truth) -> Found:
 
 @dataclass
 class Curve:
-    """One class, at one difficulty: frame after frame, then ``average``."""
+    """Precision-recall curve of one class at one difficulty: add every frame, then call ``average``."""
 
     view: str
     min_overlap: float
@@ -85,7 +87,13 @@ class Curve:
         self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
 
     def add(self, found: Found, det: Roles, label: Roles) -> None:
-        """``det`` (D,) and ``label`` (K,): COUNTS, IGNORED or OTHER."""
+        """Add a frame.
+
+        Args:
+            found: its objects.
+            det: (D,) COUNTS, IGNORED or OTHER for each object.
+            label: (K,) the same for each label.
+        """
         rows, columns = np.flatnonzero(det != OTHER), np.flatnonzero(label != OTHER)
         if len(rows) == 0 and not (label == COUNTS).any():
             return
@@ -102,11 +110,11 @@ class Curve:
 
     @property
     def labels(self) -> int:
-        """That have to be found."""
+        """Number of labels to be found."""
         return sum(int((frame[3] == COUNTS).sum()) for frame in self._frames)
 
     def average(self) -> float:
-        """Mean precision over the recall points; NaN where nothing has to be found."""
+        """Return the mean precision over the recall points. NaN if there is no label to be found."""
         total = self.labels
         if not total:
             return float("nan")
@@ -121,7 +129,7 @@ class Curve:
 
 
 def _thresholds(scores: F32, total: int) -> Iterable[float]:
-    """Scores of right ones at which recall comes nearest to each of its points."""
+    """Return the scores of true positives at which the recall is nearest to each recall point."""
     scores = np.sort(scores)[::-1]
     recall = 0.0
     chosen = []
@@ -147,9 +155,13 @@ def _matched(
     threshold: float,
     count_false: bool,
 ) -> tuple[int, int, F32]:
-    """Right ones, false ones, and the scores of the right ones.
+    """Match labels to objects.
 
-    Each label in turn takes of what is left the best overlap or, where scores are sampled, the best score.
+    Each label in turn takes the best of the objects that are left: the one with the best overlap or, without
+    ``count_false``, with the best score.
+
+    Returns:
+        Number of true positives, number of false positives, scores of the true positives.
     """
     taken = np.zeros(len(score), np.bool_)
     scores = np.empty(len(label), np.float32)
@@ -181,16 +193,19 @@ def _matched(
 
 
 class AveragePrecision:
-    """Of all classes of a drive: for KITTI's labels by its difficulties, else of what must be found."""
+    """Average precision of all classes of a drive.
+
+    KITTI's labels are split by KITTI's difficulties. Other labels count if they have to be found.
+    """
 
     def __init__(self, views: Sequence[str] = VIEWS) -> None:
         self._views = views
         self._curves: dict[Key, Curve] = {}
-        self._frames: list[tuple[Found, Truth]] = []  # of other labels than KITTI's
-        self._judged = Classes()  # of these
+        self._frames: list[tuple[Found, Truth]] = []  # frames with labels other than KITTI's
+        self._judged = Classes()  # classes of these frames
 
     def add(self, found: Found, truth: Truth) -> None:
-        """One frame."""
+        """Add a frame."""
         if truth.image is None:
             self._judged.add(truth)
             self._frames.append((found, truth))
@@ -209,7 +224,10 @@ class AveragePrecision:
                 self._add(self._curves, (kind.lower(), name), found, det, label)
 
     def _by_label(self) -> dict[Key, Curve]:
-        """Of labels that are not KITTI's: what each detection is is known when all labels are."""
+        """Return the curves of labels other than KITTI's.
+
+        The class of a detection is known when all labels are known. So these curves are made at the end.
+        """
         curves: dict[Key, Curve] = {}
         names = {label.lower() for _, truth in self._frames for label in truth.labels}
         for found, truth in self._frames:
@@ -229,17 +247,17 @@ class AveragePrecision:
 
     @property
     def labels(self) -> dict[tuple[str, str], int]:
-        """(class, difficulty) -> labels that had to be found."""
+        """(class, difficulty) -> number of labels to be found."""
         found = {key[2:]: curve.labels for key, curve in self._curves.items()}
         must = ((k, truth) for _, truth in self._frames for k in np.flatnonzero(truth.must).tolist())
         found |= Counter((truth.labels[k].lower(), "") for k, truth in must)
         return {of: count for of, count in found.items() if count}
 
     def results(self) -> dict[Key, float]:
-        """(view, overlap, class, difficulty) -> average precision; only where there was something to find.
+        """Return (view, overlap, class, difficulty) -> average precision, for curves with labels to be found.
 
-        The kit takes one score for each right object at most: with 40 labels or fewer it has fewer than 40
-        points, and the average is (labels - 1) / 40 at best.
+        The kit samples at most one score for each true positive. With 40 labels or fewer it has fewer than 40
+        points, so that the average is at most (labels - 1) / 40.
         """
         curves = self._curves | self._by_label()
         return {key: curve.average() for key, curve in curves.items() if curve.labels}
@@ -250,7 +268,11 @@ def _roles(counts: Bool, ignored: Bool) -> Roles:
 
 
 def _classes(found: Found, truth: Truth, judged: Classes) -> list[str | None]:
-    """Of each detection: that of the label it overlaps most of those it may be, else what it is judged as."""
+    """Return the class of each detection.
+
+    It is the class of the label with the largest overlap, among the labels that accept the detection's name.
+    Without overlap it is the class for which the name is judged.
+    """
     overlap = np.where(accepts(truth, list(found.names)), found.overlaps[VIEWS[0]], 0)
     classes = [judged.of(name) for name in found.names]
     for d in np.flatnonzero((overlap > 0).any(axis=1)).tolist():

@@ -1,4 +1,4 @@
-"""Detections in an image against what is there."""
+"""Score of the detections in images against the ground truth."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import CameraResult
 
-DETECTION_OVERLAP = 0.5  # least IoU in the image of a detection and what it is
+DETECTION_OVERLAP = 0.5  # least IoU of a detection and its label in the image
 
 
 class DetectionScore:
-    """Counts over frames: right ones and missed ones by label, false ones by name."""
+    """Counts of detections over frames: true and missed ones by label, false ones by name."""
 
     def __init__(self) -> None:
         self._labels: dict[str, Counter[str]] = defaultdict(Counter)
         self._false: Counter[str] = Counter()
 
     def classes(self, judged: Classes) -> dict[str, Counter[str]]:
-        """``true``, ``false`` and ``missed`` of each class."""
+        """Return the counts ``true``, ``false`` and ``missed`` of each class."""
         return judged.with_false(self._labels, self._false, "false")
 
     def add(self, result: CameraResult, truth: Truth) -> None:
-        """One camera's detections against the image boxes of the truth, best score first."""
+        """Match one camera's detections with the labelled image boxes, best score first, and count."""
         found, camera = result.detections, result.camera
         if found is None or camera.intrinsics is None or camera.camera_from_points is None:
             return
@@ -50,7 +50,10 @@ class DetectionScore:
 
 
 def _image_boxes(truth: Truth, result: CameraResult) -> F32:
-    """(K, 4) as labelled, or around what is in the image of each projected box; NaN where nothing is."""
+    """Return (K, 4) image boxes of the labels.
+
+    They are labelled, or enclose the visible part of the projected 3D box. NaN if the box is not visible.
+    """
     camera = result.camera
     if truth.image is not None and truth.camera is not None and truth.camera.name == camera.name:
         return truth.image.xyxy
@@ -68,7 +71,7 @@ def _image_boxes(truth: Truth, result: CameraResult) -> F32:
 
 
 def _in_regions(xyxy: F32, truth: Truth) -> Bool:
-    """(D,) which image boxes lie for the most part where nothing was labelled."""
+    """Return (D,) whether more than half of an image box lies in a region without labels."""
     none = np.zeros(len(xyxy), bool)
     if truth.image is None or len(truth.image.dont_care) == 0 or len(xyxy) == 0:
         return none

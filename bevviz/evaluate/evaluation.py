@@ -1,4 +1,4 @@
-"""Every metric of a drive: objects by class and range, average precision, tracks, detections, ground."""
+"""Metrics of a drive: objects by class and range, average precision, tracks, detections, ground."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-EXAMPLES = 10  # labels that cannot be used, in the JSON
+EXAMPLES = 10  # number of unusable labels in the JSON
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedFrame:
-    """One frame against its truth. Rows of the truth, and of the objects."""
+    """Objects of a frame compared with the ground truth, as text."""
 
     index: int
     stamp: int
-    true: tuple[str, ...]  # in words, as ``person at 12.3 m, 4 degrees left``
+    true: tuple[str, ...]  # text as ``person at 12.3 m, 4° left``
     missed: tuple[str, ...]
-    false: tuple[tuple[str, str], ...]  # name and words: a name that no label accepts is not judged
+    false: tuple[tuple[str, str], ...]  # name and text; a name that no label accepts is not judged
 
 
 class Evaluation(Observer[FrameResult]):
-    """Holds every frame of a run against the truth.
+    """Observer that compares every frame of a run with the ground truth.
 
     Args:
-        truth: what is really there in a frame; None where that is not known.
+        truth: returns the ground truth of a frame. None: it is not known.
 
     Attributes:
-        last: of the frame that was seen last: its truth, and what each object is.
+        last: result, ground truth and matches of the last frame.
 
     Example:
         >>> evaluation = drive.evaluate()
@@ -56,11 +56,11 @@ class Evaluation(Observer[FrameResult]):
     def __init__(self, truth: Truths) -> None:
         self._truth = truth
         self.judged: list[JudgedFrame] = []
-        self.without = 0  # frames without truth
-        self.unusable: list[str] = []  # a sentence for each label that nothing can be held to
+        self.without = 0  # frames without ground truth
+        self.unusable: list[str] = []  # one sentence for each label that cannot be used
         self.last: tuple[FrameResult, Truth, Matches] | None = None
         self._score = Score()
-        self._rows: list[tuple[str, str, float]] = []  # what became of it, class, metres away
+        self._rows: list[tuple[str, str, float]] = []  # outcome, class, distance in metres
         self._precision = AveragePrecision()
         self._tracks = TrackScore()
         self._detections = DetectionScore()
@@ -69,6 +69,7 @@ class Evaluation(Observer[FrameResult]):
         self._metrics: dict[str, float] | None = None
 
     def see(self, result: FrameResult) -> None:
+        """Compare a frame with its ground truth."""
         truth = self._truth(result.frame)
         self._metrics, self.last = None, None
         if truth is None:
@@ -88,7 +89,7 @@ class Evaluation(Observer[FrameResult]):
         count_ground(self._ground, result)
 
     def _place(self, objects: Objects, truth: Truth, matches: Matches) -> None:
-        """Class and range of what is true, false and missed."""
+        """Store class and distance of the true, false and missed objects."""
         for j in np.flatnonzero(matches.true).tolist():
             k = int(matches.partner[j])
             label = truth.labels[k].lower()
@@ -102,12 +103,12 @@ class Evaluation(Observer[FrameResult]):
     # --- numbers -------------------------------------------------------------------------------
 
     def judges(self, name: str) -> bool:
-        """Whether some label accepts a name, in lower case."""
+        """Return whether some label accepts a name in lower case."""
         return self._score.judged.of(name) is not None
 
     @property
     def metrics(self) -> Mapping[str, float]:
-        """Every number by its name, ``METRIC[.CLASS][@RANGE]``, where it could be measured."""
+        """Every metric that could be measured, by its name ``METRIC[.CLASS][@RANGE]``."""
         if self._metrics is None:
             self._metrics = dict(self._all_metrics())
         return self._metrics
@@ -151,17 +152,23 @@ class Evaluation(Observer[FrameResult]):
 
     @property
     def classes(self) -> list[str]:
-        """That labels have, or a false object that is judged."""
+        """Classes of the labels and of the judged false objects."""
         return sorted({cls for _, cls, _ in self._judged_rows()})
 
     def counts(self, cls: str = "", low: float = 0.0, high: float = math.inf) -> Counter[str]:
-        """``true``, ``false`` and ``missed``, of a class or of all, between two distances in metres."""
+        """Return the counts ``true``, ``false`` and ``missed`` between two distances in metres.
+
+        Args:
+            cls: class; empty: all classes.
+            low: least distance.
+            high: distances are below this one.
+        """
         return Counter(
             what for what, name, away in self._judged_rows() if name == (cls or name) and low <= away < high
         )
 
     def _judged_rows(self) -> Iterator[tuple[str, str, float]]:
-        """What is true, missed or false, its class and range."""
+        """Yield outcome, class and distance of the true, false and missed objects."""
         classes = {name: self._score.judged.of(name) for what, name, _ in self._rows if what == "false"}
         for what, name, away in self._rows:
             cls = classes[name] if what == "false" else name
@@ -170,18 +177,18 @@ class Evaluation(Observer[FrameResult]):
 
     @property
     def labels(self) -> Mapping[str, int]:
-        """Labels that an average precision is of, by ``CLASS`` or ``CLASS.DIFFICULTY``."""
+        """Number of labels for the average precision, by ``CLASS`` or ``CLASS.DIFFICULTY``."""
         labels = self._precision.labels
         return {f"{c}.{d}" if d else c: number for (c, d), number in labels.items()}
 
     @property
     def now(self) -> Mapping[str, Any]:
-        """``true``, ``missed`` and ``false`` of the frame that was seen last, in words."""
+        """Objects ``true``, ``missed`` and ``false`` of the last frame, as text."""
         return self._frame(self.judged[-1])
 
     @property
     def worst(self) -> list[dict[str, Any]]:
-        """Frames in which something was missed or false, most of that first."""
+        """Frames with missed or false objects, those with most of them first."""
         frames = [self._frame(frame) for frame in self.judged]
         wrong = [frame for frame in frames if frame["missed"] or frame["false"]]
         return sorted(wrong, key=lambda f: (-len(f["missed"]) - len(f["false"]), f["frame"]))
@@ -198,13 +205,13 @@ class Evaluation(Observer[FrameResult]):
     # --- how it is shown -----------------------------------------------------------------------
 
     def table(self) -> str:
-        """For the terminal."""
+        """Return the evaluation for the terminal."""
         from bevviz.evaluate.tables import text
 
         return text(self)
 
     def as_tree(self) -> dict[str, Any]:
-        """For JSON: every metric, and the frames, worst first."""
+        """Return every metric, and the frames with errors, worst first, for JSON."""
         return {
             "frames": len(self.judged),
             "frames_without_truth": self.without,
@@ -215,7 +222,7 @@ class Evaluation(Observer[FrameResult]):
         }
 
     def to_pandas(self) -> DataFrame:
-        """A row for each metric: its name, class, range and value."""
+        """Return a row for each metric: name, class, range and value."""
         from bevviz.model.frame import data_frame
 
         rows = []
@@ -235,7 +242,7 @@ def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:
 
 
 def _plain(value: float) -> float | None:
-    """JSON has no NaN."""
+    """Return None for NaN, which JSON does not have, else the rounded number."""
     return None if math.isnan(value) else round(value, 6)
 
 
@@ -259,7 +266,7 @@ def _words(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> Ju
 
 
 def place(boxes: Boxes3D, row: int) -> str:
-    """``at 12.3 m, 4° left``, from the origin of the points."""
+    """Return the position relative to the points' origin, as ``at 12.3 m, 4° left``."""
     x, y = boxes.center[row, :2].tolist()
     angle = math.degrees(math.atan2(y, x))
     return f"at {math.hypot(x, y):.1f} m, {abs(angle):.0f}° {'left' if angle >= 0 else 'right'}"

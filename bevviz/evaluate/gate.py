@@ -1,4 +1,4 @@
-"""Limits that an evaluation is held to, and JUnit XML that says whether it keeps them."""
+"""Limits for the metrics of an evaluation, and JUnit XML with the outcome."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bevviz.evaluate.metric_names import METRICS, base_of
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """``--min recall.person=0.8``"""
+    """Limit for a metric, as in ``--min recall.person=0.8``."""
 
     metric: str
     side: Literal["min", "max"]
@@ -28,18 +28,18 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """Whether a limit is kept, and why it is not; empty where it is."""
+    """Outcome of a limit. ``reason`` says why it is not kept and is empty if it is."""
 
     limit: Limit
-    measured: float  # NaN: it could not be measured
+    measured: float  # NaN: not measured
     reason: str
 
 
 def parse_limits(least: Sequence[str], most: Sequence[str]) -> list[Limit]:
-    """Of ``--min`` and ``--max``.
+    """Parse the values of ``--min`` and ``--max``.
 
     Raises:
-        UserError: no NAME=NUMBER, or no metric of that name.
+        UserError: a value is not NAME=NUMBER, or there is no metric of that name.
     """
     asked: list[tuple[Literal["min", "max"], str]] = [("min", text) for text in least]
     asked += [("max", text) for text in most]
@@ -67,7 +67,7 @@ def _limit(side: Literal["min", "max"], text: str) -> Limit:
 
 
 def check(limits: Sequence[Limit], metrics: Mapping[str, float]) -> list[Kept]:
-    """Whether each is kept. What could not be measured is not."""
+    """Compare the metrics with the limits. A limit whose metric could not be measured is not kept."""
     return [_kept(limit, metrics) for limit in limits]
 
 
@@ -83,11 +83,11 @@ def _kept(limit: Limit, metrics: Mapping[str, float]) -> Kept:
 
 
 def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
-    """A test suite for each drive, a test case for each limit.
+    """Write a test suite for each drive with a test case for each limit.
 
     Args:
         path: the file.
-        suites: name of the drive -> its limits, or why it could not be run at all.
+        suites: name of the drive -> outcome of its limits, or the reason why it could not be run.
 
     Raises:
         UserError: the file cannot be written.
@@ -114,5 +114,5 @@ def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
 
 
 def _plain(text: str) -> str:
-    """Without the characters that XML cannot have."""
+    """Replace characters that XML does not allow."""
     return "".join(c if c.isprintable() else "?" for c in text)

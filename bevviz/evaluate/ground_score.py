@@ -1,4 +1,4 @@
-"""Ground against labelled points."""
+"""Score of the ground stage against labelled points."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from bevviz.model.results import FrameResult
 from bevviz.stages.voxel import of_points
 
-# SemanticKITTI's numbers (Behley et al. 2019), in the field ``label`` of a cloud.
+# Numbers of SemanticKITTI's classes (Behley et al. 2019), stored in the field ``label`` of a cloud.
 GROUND_LABELS = (40, 44, 48, 49, 60, 72)  # road, parking, pavement, other ground, marking, terrain
 OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
 UNLABELLED = (0, 1)
 
 
 def count_ground(counts: Counter[str], result: FrameResult) -> None:
-    """Points, where the cloud says in its field ``label`` what each is of."""
+    """Count the points of a frame by label and by ground mask. The cloud needs a field ``label``."""
     labels = result.frame.fields.get("label")
     if labels is None or labels.dtype.kind not in "ui" or result.ground is None or result.voxels is None:
         return

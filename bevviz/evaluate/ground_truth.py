@@ -1,4 +1,4 @@
-"""What is really there in a frame, and which of it must be found."""
+"""Ground truth of a frame, and which of its objects have to be found."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from bevviz.stages.robot_results import in_points_frame
 if TYPE_CHECKING:
     from bevviz.model.protocols import Frames
 
-MIN_HITS = 10  # LiDAR points on an object that must be found
-MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a box and its object
-RANGE = 40.0  # metres
+MIN_HITS = 10  # least number of LiDAR points on an object to be found
+MAX_DISTANCE = 2.0  # metres between the centres of a box and its object, on the ground plane
+RANGE = 40.0  # metres, largest distance of an object to be found
 
 
 Truths: TypeAlias = "Callable[[Frame], Truth | None]"
@@ -31,19 +31,19 @@ Truths: TypeAlias = "Callable[[Frame], Truth | None]"
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is really there, in the frame of the points."""
+    """Ground truth of a frame, in the frame of the points."""
 
     boxes: Boxes3D
     labels: tuple[str, ...]
-    accepted: tuple[frozenset[str], ...]  # names that are right for each, in lower case
-    must: Bool  # (K,) has to be found; the others may be
-    ids: tuple[str, ...] = ()  # (K,) the same from frame to frame; (): not known
-    image: ImageLabels | None = None  # what was labelled in the image, in a data set that has that
-    camera: Camera | None = None  # whose image that is
-    unusable: tuple[str, ...] = ()  # a sentence for each label that nothing can be held to
+    accepted: tuple[frozenset[str], ...]  # names accepted for each box, in lower case
+    must: Bool  # (K,) whether the object has to be found; the others may be found
+    ids: tuple[str, ...] = ()  # (K,) constant from frame to frame; (): unknown
+    image: ImageLabels | None = None  # labels in the image, if the data set has them
+    camera: Camera | None = None  # camera of that image
+    unusable: tuple[str, ...] = ()  # one sentence for each label that cannot be used
 
     def unlabelled(self, boxes: Boxes3D) -> Bool:
-        """(J,) which boxes have their centre, in the image, where nothing was labelled (KITTI's DontCare)."""
+        """Return (J,) whether a box has its centre in an image region without labels (KITTI's DontCare)."""
         none = np.zeros(len(boxes), bool)
         if self.image is None or self.camera is None or len(self.image.dont_care) == 0:
             return none
@@ -58,16 +58,16 @@ class Truth:
 
 
 def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> Truths | None:
-    """Where the truth of each frame comes from; None: there is none.
+    """Return a function that returns the ground truth of a frame. None: the bag has no ground truth.
 
     Args:
         roles: of the bag's topics.
-        topic: Detection3DArray that was asked for; None: the one that is called ground truth.
-        kitti: label file or folder that was asked for.
-        scans: how many the bag has, each of which has its labels.
+        topic: requested Detection3DArray; None: the topic called ground truth.
+        kitti: requested label file or folder.
+        scans: number of scans in the bag. Each one has its label file.
 
     Raises:
-        UserError: no such topic or file, or not as many label files as scans.
+        UserError: there is no such topic or file, or the numbers of label files and scans differ.
     """
     if kitti is not None:
         files = label_files(kitti)
@@ -98,14 +98,15 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
 
 
 def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None) -> Truths:
-    """Where the truth of a drive's frames comes from.
+    """Return a function that returns the ground truth of a drive's frames.
 
     Args:
-        frames: a bag, or frames that come with their own truth.
-        topic, kitti: as of ``truth_source``.
+        frames: a bag, or frames that come with their own ground truth.
+        topic: as in ``truth_source``.
+        kitti: as in ``truth_source``.
 
     Raises:
-        UserError: as of ``truth_source``, and where there is no truth.
+        UserError: as ``truth_source``, and if there is no ground truth.
     """
     roles: Roles | None = getattr(frames, "roles", None)
     if roles is None and (topic or kitti):
@@ -126,16 +127,15 @@ def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None
 
 
 def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
-    """Labelled boxes as truth for a frame.
+    """Return labelled boxes as the ground truth of a frame.
 
-    An object must be found if its centre lies within 40 m and in the image of some camera, where there is
-    one, and if 10 LiDAR points or more lie in its box. In a box without a size there are none: it is told in
-    ``unusable``.
+    An object has to be found if its centre lies within 40 m, and in the image of some camera if there is one,
+    and if its box holds 10 LiDAR points or more. A box without a size holds none; ``unusable`` lists it.
 
     Args:
         frame: the frame.
-        labelled: boxes, in any frame whose pose they come with. Labels of data sets accept the names
-            that detectors of COCO's classes have for them, others their own alone.
+        labelled: boxes in any frame, with its pose. A label of a data set accepts the names that detectors
+            of COCO's classes use for it. Any other label accepts its own name only.
     """
     boxes = in_points_frame(frame, labelled)
     must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
@@ -161,7 +161,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
 
 
 def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
-    """(K,) whether some camera has the centre in its image; every box where no camera has a place."""
+    """Return (K,) whether the centre lies in the image of some camera. Without a located camera, all do."""
     seen, asked = np.zeros(len(boxes), bool), False
     for camera in frame.cameras:
         if not _can_see(camera):
@@ -177,7 +177,7 @@ def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
 
 
 def _can_see(camera: Camera) -> bool:
-    """Whether it has an image and a place."""
+    """Return whether a camera has an image, intrinsics and a pose."""
     return (
         camera.image is not None and camera.intrinsics is not None and camera.camera_from_points is not None
     )

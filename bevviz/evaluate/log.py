@@ -1,4 +1,4 @@
-"""Logs an evaluation: true, false and missed objects in their colours, counts, and the tables."""
+"""Logging of an evaluation: true, false and missed objects in their colours, counts, and tables."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from bevviz.recording.primitives import boxes3d, document, transform
 from bevviz.recording.writer import WAIT, Writer
 from bevviz.support.text import markdown
 
-# What became of them, boxes, the rows of these that are meant, and the names of all.
+# Outcome, boxes, rows with this outcome, names of all boxes.
 Judged: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]
 
 
 class EvaluationRecorder(Observer[FrameResult]):
-    """Writes what an evaluation says of each frame beside the run; it must have seen the frame before.
+    """Observer that logs the evaluation of each frame. The evaluation must see the frame first.
 
     Args:
-        recording: where to.
-        evaluation: an observer of the same run.
+        recording: target.
+        evaluation: observer of the same run.
     """
 
     def __init__(self, recording: rr.RecordingStream, evaluation: Evaluation) -> None:
@@ -38,6 +38,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         self._writer = Writer(recording, wait=WAIT)
 
     def begin(self, items: Items[object]) -> None:
+        """Log the colours and the names of the plots."""
         for what, color in TRUTH.items():
             looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
             self._writer.static(entities.judged(what), looks)
@@ -46,6 +47,7 @@ class EvaluationRecorder(Observer[FrameResult]):
             self._writer.static(entities.judged_count(what), series)
 
     def see(self, result: FrameResult) -> None:
+        """Log the evaluation of a frame."""
         if self._evaluation.last is None:
             return
         writer, frame = self._writer, result.frame
@@ -68,7 +70,10 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.end()
 
     def _boxes(self, result: FrameResult, parts: Sequence[Judged]) -> None:
-        """What is right has its name where the pointer is, as what is wrong and has no room for it."""
+        """Log the boxes. A right object shows its name only under the pointer.
+
+        So does a wrong one without enough room for a label.
+        """
         centers = np.concatenate([np.zeros((0, 3), np.float32), *(b.center[rows] for _, b, rows, _ in parts)])
         wrong = np.repeat([what != "true" for what, *_ in parts], [len(rows) for *_, rows, _ in parts])
         named = iter((named_in_space(centers, wrong) & wrong).tolist() if len(wrong) else [])
@@ -83,6 +88,7 @@ class EvaluationRecorder(Observer[FrameResult]):
             log_spoken(self._writer, path, chosen, shown, said, [TRUTH[what]] * len(rows))
 
     def end(self) -> None:
+        """Log the tables of the whole run."""
         self._writer.static(entities.EVALUATE_ABOUT, document(f"# Evaluation\n\n{page(self._evaluation)}"))
         self._writer.close()
 

@@ -1,4 +1,4 @@
-"""How right fused objects are: held against the truth, by class and place."""
+"""Matching of fused objects with the ground truth."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from bevviz.model.results import Objects
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """A frame's objects against its truth.
+    """Objects of a frame matched with its ground truth.
 
-    An object is true if it is something that had to be found, false if it is nothing. What is something that
-    need not be found, or lies where nothing was labelled, is neither.
+    An object is true if it matches a label that has to be found. It is false if it matches no label. It is
+    neither if it matches a label that need not be found, or lies in a region without labels.
     """
 
-    partner: I32  # (J,) row of the truth that each object is, else -1
-    distance: F64  # (J,) metres on the ground plane between the centres, NaN where it is none
+    partner: I32  # (J,) row of the object's label, else -1
+    distance: F64  # (J,) metres on the ground plane between the centres, NaN without a label
     true: Bool  # (J,)
-    false: Bool  # (J,) whatever its name: one that no label accepts is for the caller to leave out
-    missed: Bool  # (K,) had to be found, and was not
+    false: Bool  # (J,) includes names that no label accepts; the caller leaves them out
+    missed: Bool  # (K,) had to be found, but was not
 
 
 class Classes:
-    """The labels of the frames so far, and what may be called so."""
+    """Labels of the frames so far, with the names that they accept."""
 
     def __init__(self) -> None:
         self._accepted: dict[str, frozenset[str]] = {}
 
     def add(self, truth: Truth) -> None:
-        """One frame's."""
+        """Add the labels of a frame."""
         for label, names in zip(truth.labels, truth.accepted, strict=True):
             self._accepted[label.lower()] = self._accepted.get(label.lower(), frozenset()) | names
 
     def of(self, name: str) -> str | None:
-        """What counts for which class where it is nothing that is labelled; None: it is not judged.
+        """Return the class for which an object without a label counts. None: the name is not judged.
 
-        For that of its own name; where no label has it, for the label that has fewest other names: what is
-        called a person is a pedestrian rather than a cyclist.
+        It is the class of the same name. If there is none, it is the accepting label with the fewest names: a
+        "person" counts as a pedestrian rather than as a cyclist.
         """
         fits = [label for label, names in self._accepted.items() if name in names]
         return name if name in fits else min(fits, key=lambda f: (len(self._accepted[f]), f), default=None)
@@ -51,7 +51,13 @@ class Classes:
     def with_false(
         self, labels: Mapping[str, Counter[str]], false: Mapping[str, int], what: str
     ) -> dict[str, Counter[str]]:
-        """Counts by label, and in them as ``what`` the counts by name of what is nothing."""
+        """Return the counts by label, with the false ones added.
+
+        Args:
+            labels: counts by label.
+            false: number of false objects by name.
+            what: key of the false ones in the counts.
+        """
         counts = {label: Counter(found) for label, found in labels.items()}
         for name, number in false.items():
             if (cls := self.of(name)) is not None:
@@ -61,15 +67,15 @@ class Classes:
 
 @dataclass
 class Score:
-    """Counts over frames. A name that no label accepts in any frame is not judged."""
+    """Counts of objects over frames. A name that no label accepts in any frame is not judged."""
 
     judged: Classes = field(default_factory=Classes)
-    errors: list[float] = field(default_factory=list)  # metres, of the right ones
+    errors: list[float] = field(default_factory=list)  # metres, of the true ones
     _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     _false: Counter[str] = field(default_factory=Counter)  # by name
 
     def add(self, found: Objects, truth: Truth) -> Matches:
-        """Pair one frame's objects with the truth, best score first, and count."""
+        """Match one frame's objects with the ground truth, best score first, and count."""
         self.judged.add(truth)
         matches = judge(found, truth)
         self._false.update(found.names[j].lower() for j in np.flatnonzero(matches.false))
@@ -83,40 +89,40 @@ class Score:
 
     @property
     def classes(self) -> dict[str, Counter[str]]:
-        """Right ones (tp), false ones (fp) and missed ones (fn) of each class, in lower case."""
+        """Counts of each class, in lower case: true (tp), false (fp) and missed (fn) objects."""
         return self.judged.with_false(self._labels, self._false, "fp")
 
     @property
     def total(self) -> Counter[str]:
-        """The same of all classes."""
+        """Counts of all classes together."""
         return sum(self.classes.values(), Counter())
 
     @property
     def precision(self) -> float:
-        """NaN where nothing was found."""
+        """Precision of all classes. NaN if there are no objects."""
         total = self.total
         return share(total["tp"], total["fp"])
 
     @property
     def recall(self) -> float:
-        """NaN where nothing had to be found."""
+        """Recall of all classes. NaN if there is no object to be found."""
         total = self.total
         return share(total["tp"], total["fn"])
 
     @property
     def f1(self) -> float:
-        """Harmonic mean of the two."""
+        """Harmonic mean of precision and recall."""
         total = self.total
         return share(2 * total["tp"], total["fp"] + total["fn"])
 
 
 def share(right: int, wrong: int) -> float:
-    """NaN where there is neither."""
+    """Return the share of right ones. NaN if there are none at all."""
     return right / (right + wrong) if right + wrong else float("nan")
 
 
 def judge(found: Objects, truth: Truth) -> Matches:
-    """What each object of a frame is, and what was missed."""
+    """Match the objects of a frame with its ground truth and judge them."""
     partner, distance = match(found, truth)
     paired = partner >= 0
     missed = truth.must.copy()
@@ -127,11 +133,11 @@ def judge(found: Objects, truth: Truth) -> Matches:
 
 
 def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
-    """Which box of the truth each object is: of the same class, the nearest within 2 m, best score first.
+    """Match objects with labels of the same class: the nearest within 2 m, best score first.
 
     Returns:
-        partner: (J,) row of the truth, else -1.
-        distance: (J,) metres on the ground plane to that one, else NaN.
+        partner: (J,) row of the label, else -1.
+        distance: (J,) metres on the ground plane to that label, else NaN.
     """
     best_first = np.argsort(-found.score, kind="stable")
     right = accepts(truth, [found.names[j] for j in best_first])
@@ -146,13 +152,13 @@ def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
 
 
 def accepts(truth: Truth, names: list[str]) -> Bool:
-    """(J, K) which names are right for which box of the truth."""
+    """Return (J, K) whether a name is accepted for a labelled box."""
     right = np.array([[name.lower() in accepted for accepted in truth.accepted] for name in names], bool)
     return right.reshape(len(names), len(truth.accepted))
 
 
 def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int32]], Bool]:
-    """Each row in turn takes the nearest column within ``limit`` that is still free.
+    """Pair each row in turn with the nearest free column within ``limit``.
 
     Args:
         distance: (N, M).
@@ -160,7 +166,7 @@ def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], n
 
     Returns:
         partner: (N,) column of each row, else -1.
-        free: (M,) columns that nobody took.
+        free: (M,) whether a column has no partner.
     """
     free = np.ones(distance.shape[1], bool)
     partner = np.full(len(distance), -1, np.int32)

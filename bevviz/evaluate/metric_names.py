@@ -1,4 +1,4 @@
-"""What can be measured: ``METRIC[.CLASS][@RANGE]``."""
+"""Names of the metrics: ``METRIC[.CLASS][@RANGE]``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from bevviz.evaluate.average_precision import OVERLAPS, VIEWS
 from bevviz.evaluate.ground_truth import RANGE
 
-EDGES = (0, 10, 20, 30, int(RANGE))  # metres: ranges that are counted by themselves
+EDGES = (0, 10, 20, 30, int(RANGE))  # metres, limits of the ranges that are counted separately
 
-METRICS = {  # without class and range -> what it is
+METRICS = {  # name without class and range -> meaning
     "recall": "share of the objects that had to be found",
     "precision": "share of the objects that were reported",
     "f1": "harmonic mean of the two",
@@ -39,11 +39,11 @@ METRICS = {  # without class and range -> what it is
 
 
 def base_of(name: str) -> str | None:
-    """The metric of ``METRIC[.CLASS][@RANGE]``; None: there is none of that name."""
+    """Return METRIC of ``METRIC[.CLASS][@RANGE]``. None: there is no such metric."""
     fitting = [base for base in METRICS if name == base or name.startswith((f"{base}.", f"{base}@"))]
     return max(fitting, key=len, default=None)
 
 
 def ranges() -> Iterator[tuple[int, int]]:
-    """From and to, in metres."""
+    """Yield start and end of each range, in metres."""
     return itertools.pairwise(EDGES)

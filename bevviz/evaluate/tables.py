@@ -1,4 +1,4 @@
-"""An evaluation as tables, for a terminal and for a page."""
+"""Tables of an evaluation, for a terminal and for a page."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from bevviz.support.text import printable
 if TYPE_CHECKING:
     from bevviz.evaluate.evaluation import Evaluation
 
-WORST = 10  # frames in the table
-EXAMPLES = 3  # objects of each
+WORST = 10  # number of frames in the table
+EXAMPLES = 3  # number of objects shown for each frame
 
 Row = tuple[str, ...]
 
 
 def text(found: Evaluation) -> str:
-    """For the terminal."""
+    """Return the tables for the terminal."""
     return "\n".join(map(printable, _lines(found, table.lines)))
 
 
 def page(found: Evaluation) -> str:
-    """In Markdown."""
+    """Return the tables in Markdown."""
     return "\n".join(_lines(found, lambda rows: [table.markdown(rows)], "- "))
 
 
@@ -62,7 +62,7 @@ def _lines(
 
 
 def tables(found: Evaluation) -> Iterator[list[Row]]:
-    """Rows of each table, the first the heading; only those that have something in them."""
+    """Yield the rows of each table, headings first. Tables without metrics are left out."""
     heads: Row = ("objects", "there", "found", "missed", "false", "precision", "recall", "error m", "90 % m")
     yield [heads, *(_row(found, name or "all", f".{name}" if name else "") for name in (*found.classes, ""))]
     by_range = (_row(found, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
@@ -98,7 +98,7 @@ def _row(found: Evaluation, title: str, tail: str) -> Row:
 
 
 def _by_class(metrics: Mapping[str, float], names: tuple[str, ...]) -> Iterator[Row]:
-    """A row for each class that has the first of them, all of them together last."""
+    """Yield a row for each class that has the first metric. The row of all classes comes last."""
     classes = [name.partition(".")[2] for name in metrics if name.partition(".")[0] == names[0]]
     for cls in sorted(classes, key=lambda cls: (not cls, cls)):
         yield (cls or "all", *(_number(metrics, f"{name}.{cls}" if cls else name) for name in names))

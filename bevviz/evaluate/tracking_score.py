@@ -1,7 +1,7 @@
-"""How well objects keep their ids: CLEAR MOT and IDF1 by py-motmetrics, and HOTA.
+"""Tracking metrics: CLEAR MOT and IDF1 by py-motmetrics, and HOTA.
 
-The two libraries that have HOTA (TrackEval, trackers) bring opencv-python, which writes over the headless
-OpenCV that bevviz stands on; so HOTA is here, and held to TrackEval's numbers by a test.
+HOTA is implemented here. The two libraries that have it (TrackEval, trackers) install opencv-python, which
+overwrites the headless OpenCV that bevviz needs. A test compares the results with those of TrackEval.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bevviz.model.frame import F64, I32
 from bevviz.model.results import FrameResult
 from bevviz.stages.fusion import assign
 
-ALPHAS = np.arange(0.05, 0.99, 0.05)  # similarities from which on a pair is one, as HOTA has them
+ALPHAS = np.arange(0.05, 0.99, 0.05)  # similarity thresholds of HOTA
 CLEAR = {
     "mota": "mota",
     "motp_m": "motp",
@@ -33,16 +33,16 @@ HINT = "MOTA and IDF1 need py-motmetrics: pip install 'bevviz[evaluate]'"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One class in one frame: numbers of the objects and tracks in it, and metres between them."""
+    """Objects and tracks of one class in one frame, with the distances between them."""
 
-    objects: I32  # (G,)
-    tracks: I32  # (T,)
-    distance: F64  # (G, T) on the ground, inf beyond 2 m
+    objects: I32  # (G,) numbers of the objects
+    tracks: I32  # (T,) numbers of the tracks
+    distance: F64  # (G, T) metres on the ground plane; inf beyond 2 m
 
 
 @dataclass
 class Identities:
-    """One class of a drive."""
+    """Frames of one class of a drive."""
 
     def __post_init__(self) -> None:
         self.steps: list[Step] = []
@@ -50,7 +50,13 @@ class Identities:
         self._tracks: dict[int, int] = {}
 
     def add(self, objects: Sequence[str], tracks: Sequence[int], distance: F64) -> None:
-        """One frame; ``distance`` (G, T) in metres."""
+        """Add a frame.
+
+        Args:
+            objects: ids of the labelled objects.
+            tracks: ids of the tracks.
+            distance: (G, T) metres.
+        """
         shape = len(objects), len(tracks)
         self.steps.append(
             Step(
@@ -61,9 +67,9 @@ class Identities:
         )
 
     def hota(self) -> dict[str, float]:
-        """Higher order tracking accuracy, and its parts for detection and association.
+        """Return HOTA (higher order tracking accuracy), and its parts for detection and association.
 
-        Luiten et al. 2021, with the similarity ``1 - distance / 2 m``. NaN where there is nothing.
+        Luiten et al. 2021, with the similarity ``1 - distance / 2 m``. NaN without objects and tracks.
         """
         size = len(self._objects), len(self._tracks)
         similar = [np.where(np.isfinite(s.distance), 1 - s.distance / MAX_DISTANCE, 0.0) for s in self.steps]
@@ -96,7 +102,7 @@ class Identities:
         }
 
     def clear(self) -> dict[str, float] | None:
-        """CLEAR MOT and IDF1; None where py-motmetrics is not installed."""
+        """Return CLEAR MOT and IDF1. None: py-motmetrics is not installed."""
         try:
             import motmetrics
         except ImportError:
@@ -111,16 +117,17 @@ class Identities:
 
 
 class TrackScore:
-    """Of all classes: tracks that are shown and seen, against the objects that have to be found.
+    """Tracking metrics of all classes.
 
-    A track on an object that need not be found counts neither way.
+    Confirmed tracks with a cluster in the frame are compared with the objects to be found. A track on an
+    object that need not be found does not count.
     """
 
     def __init__(self) -> None:
         self.classes: dict[str, Identities] = defaultdict(Identities)
 
     def add(self, result: FrameResult, truth: Truth, judged: Classes) -> None:
-        """One frame; nothing where the objects have no ids, or nothing is tracked."""
+        """Add a frame, unless its objects have no ids or there are no tracks."""
         tracks = result.tracks
         if tracks is None or not truth.ids:
             return
@@ -147,7 +154,7 @@ class TrackScore:
             )
 
     def results(self) -> dict[str, dict[str, float]]:
-        """Class -> metric -> value, of those that had something to be found; "" is all of them."""
+        """Return class -> metric -> value for classes with objects to be found. "" means all classes."""
         found = {}
         for name, identities in sorted(self.classes.items()):
             if any(len(step.objects) for step in identities.steps):
