@@ -1,4 +1,4 @@
-"""A batch: what is left to do, and that nobody else does it at the same time."""
+"""Batches: lock the output folder, find unfinished jobs and damaged results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """The folder for one batch alone. What an interrupted one left unfinished is removed, before and after.
+    """Lock the folder for one batch. Delete the unfinished files of an interrupted batch before and after.
 
     Raises:
         UserError: the folder cannot be made, or another batch works in it.
@@ -38,7 +38,7 @@ def claimed(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             raise UserError(f"-o {folder}: another batch is running in it") from None
         except OSError:
-            pass  # a network file system without locks on folders
+            pass  # Some network file systems cannot lock folders.
         remove = partial(shutil.rmtree, folder / PARTIAL, ignore_errors=True)
         remove()
         cleanup.remember(folder, remove)
@@ -52,10 +52,15 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def left_to_do(jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = lambda _: None) -> list[Job]:
-    """Those without a result that is complete and up to date; all of them where ``force`` is set.
+    """Return the jobs without a complete, up-to-date result. The largest bags come first.
 
-    The table of a damaged result is deleted, so that nothing vouches for it. ``warn`` gets one line for each.
-    The largest bags go first, so that no worker is left alone with one at the end.
+    The order keeps a worker from running a large bag alone at the end. The table of a damaged result is
+    deleted, so that the result counts as missing.
+
+    Args:
+        jobs: all jobs of the batch.
+        force: return all jobs.
+        warn: gets one line for each damaged result.
     """
     for job in jobs:
         if force:
@@ -91,7 +96,7 @@ def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
     for job in _checking(jobs):
         info = read_info(job.table)
         if info is not None and info.key != job.key:
-            continue  # it is out of date in any case
+            continue  # It is out of date anyway.
         if damage := find_damage(job.table, job.recording):
             warn(f"{job.name}: {damage}; its bag is run again")
         elif info is not None and info.recording_sha256:

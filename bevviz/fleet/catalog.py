@@ -1,4 +1,4 @@
-"""The recordings in a Rerun catalog, for queries across all of them and for links into each."""
+"""Recordings in a Rerun catalog, for queries over all of them and for links into each."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ TIMEOUT = 600  # seconds
 
 
 def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], blueprint: str) -> Link:
-    """Make the dataset hold these recordings; what it holds already stays, what has changed is replaced.
+    """Register the recordings in a dataset. Changed ones replace their old version; the others stay.
 
     Args:
-        url: of the catalog server, rerun+http://host:51234; it must see the files under the same paths.
-        name: of the dataset; made where it is missing.
-        results: recording and its description for each bag.
-        blueprint: layout for all of them, where the dataset has none yet.
+        url: of the catalog server, rerun+http://host:51234. It must see the files under the same paths.
+        name: of the dataset. It is made if it is missing.
+        results: recording and description of each bag.
+        blueprint: layout of the dataset, unless it has one already.
 
     Returns:
-        What makes the address of a frame.
+        A function that makes the address of a frame.
 
     Raises:
-        UserError: the server or what it needs is missing, or it cannot read a recording.
+        UserError: the server or a package is missing, or the server cannot read a recording.
     """
     from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
     from rerun.error_utils import RerunMissingDependencyError
@@ -73,10 +73,10 @@ def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], bluep
 
 @contextmanager
 def served(port: int, bind: str = LOOPBACK) -> Iterator[tuple[str, str]]:
-    """A catalog server at an address of this machine, and a web viewer: their addresses.
+    """Start a catalog server and a web viewer, and yield their addresses.
 
     Raises:
-        UserError: a port is in use, or the address is not of this machine.
+        UserError: a port is in use, or the address does not belong to this machine.
     """
     address = own_address(bind)
     check_port(port, "--serve-catalog")

@@ -1,4 +1,4 @@
-"""Which bags, under which name, and what makes the result of one out of date."""
+"""Jobs of a batch: their bags, their names, and the key that shows whether a result is up to date."""
 
 from __future__ import annotations
 
@@ -23,39 +23,40 @@ from bevviz.recording.provenance import dependencies_of, file_hash, model_path
 from bevviz.support.files import bag_files, sampled_files
 from bevviz.support.text import path_text
 
-PARTIAL = ".bevviz-partial"  # folder of what is not complete
+PARTIAL = ".bevviz-partial"  # folder of unfinished results
 
 
 @dataclass(frozen=True)
 class Job:
-    """One bag. Everything that a worker needs, also one on another machine that shares the file system."""
+    """One bag, with everything a worker needs, also on another machine that shares the file system."""
 
     name: str
-    bag: Path  # absolute
-    folder: Path  # absolute, for the results
+    bag: Path  # absolute path
+    folder: Path  # absolute path of the folder for results
     config: Config
     selection: FrameSelection
     blueprint: str
-    truth: str | None = None  # topic that results are held to, "" the bag's own; None: they are not
+    truth: str | None = None  # topic of the ground truth; "": the bag's own; None: no evaluation
 
     @property
     def recording(self) -> Path:
+        """Path of the complete recording."""
         return self.folder / f"{self.name}.rrd"
 
     @property
     def table(self) -> Path:
-        """The frames as rows. It is written last: where it is, the recording is complete."""
+        """Path of the table of frames. It is written last: if it exists, the recording is complete."""
         return self.folder / f"{self.name}.parquet"
 
     @property
     def size(self) -> int:
-        """Bytes of the bag."""
+        """Size of the bag in bytes."""
         return sum(file.stat().st_size for file in _files(self.bag))
 
     @cached_property
     def key(self) -> str:
-        """Another one for another bag, selection, configuration, model, layout or version."""
-        files = {"detector": {"model", "names"}}  # they count by their content, below
+        """Hash of bag, selection, configuration, model, layout and versions."""
+        files = {"detector": {"model", "names"}}  # Their content counts, see below.
         content: dict[str, Any] = {
             "bag": [
                 [path_text(file.name), file.stat().st_size, file.stat().st_mtime_ns]
@@ -72,11 +73,11 @@ class Job:
 
     @property
     def recording_id(self) -> str:
-        """Another one for another result: a viewer takes recordings with the same one for the same."""
+        """Recording ID with the job's name and key. A viewer merges recordings with the same ID."""
         return f"{self.name}-{self.key[:8]}"
 
     def complete(self) -> RunInfo | None:
-        """What is known of the result, None where it is missing or out of date."""
+        """Return the description of the result. None: it is missing or out of date."""
         info = read_info(self.table)
         if info is None or info.key != self.key or not self.recording.is_file():
             return None
@@ -91,10 +92,10 @@ def make_jobs(
     blueprint: str,
     truth: str | None = None,
 ) -> list[Job]:
-    """A job for each bag that the paths name; the arguments are those of ``Job``.
+    """Return a job for each bag that the paths name. The arguments are those of ``Job``.
 
     Raises:
-        UserError: a path that does not exist, or no bag at all.
+        UserError: a path does not exist, or there is no bag.
     """
     bags = find_bags(paths)
     detector, model = config.detector, model_path(config)
@@ -112,7 +113,7 @@ def make_jobs(
 
 
 def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:
-    """The results of all bags in a folder, by name."""
+    """Yield table and description of every result in a folder, sorted by name."""
     for path in sorted(folder.glob("*.parquet")):
         if (info := read_info(path)) is not None:
             yield path, info
@@ -122,12 +123,12 @@ def tables(folder: Path) -> Iterator[tuple[Path, RunInfo]]:
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:
-    """Bag files and folders: those given, those that a pattern fits, those somewhere in a folder.
+    """Find bag files and folders: the paths themselves, matches of patterns, and bags in folders.
 
-    A folder with a metadata.yaml is one bag; in any other one each bag file is a bag of its own.
+    A folder with a metadata.yaml is one bag. In any other folder each bag file is a bag of its own.
 
     Raises:
-        UserError: a path that does not exist, or a folder without bags.
+        UserError: a path does not exist, or a folder has no bags.
     """
     found: dict[Path, None] = {}
     for path in paths:
@@ -163,14 +164,14 @@ def _bags(path: Path) -> Iterator[Path]:
 
 
 def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str]:
-    """A name for each bag, which stays with it from run to run.
+    """Return a name for each bag that stays the same from run to run.
 
-    A bag that already has a result keeps its name. Of bags with the same name, each is named with as many of
-    its folders as tell them apart.
+    A bag that already has a result keeps its name. For equally named bags, the names also contain as many
+    folders as are needed to tell them apart.
 
     Args:
-        bags: absolute paths, each once.
-        owners: bag -> name of the results that are there.
+        bags: absolute paths without duplicates.
+        owners: bag -> name of its existing results.
     """
     names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
     taken = {"summary", *owners.values()}
@@ -182,7 +183,7 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
         names |= {bag: n for bag, n in candidates.items() if often[n] == 1 and n not in taken}
         new = [bag for bag in new if bag not in names]
         taken |= set(names.values())
-    for bag in new:  # same letters, apart from those that no file name should have
+    for bag in new:  # They differ only in characters that a file name should not have.
         names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(os.fsencode(bag)).hexdigest()[:8]}"
     return names
 
@@ -206,10 +207,10 @@ def _files(bag: Path) -> list[Path]:
 
 
 def _absolute(text: str) -> str:
-    """Of a file; a name that something is known by stays as it is."""
+    """Return the absolute path of a file. Return a name as it is."""
     return str(Path(text).resolve()) if _is_file(text) else text
 
 
 def _is_file(text: str) -> bool:
-    """Whether it is a path; "debug" and "demo" are names, whatever lies in the working directory."""
+    """Return whether the text is a path. "debug" and "demo" are names, even if such a file exists."""
     return bool(Path(text).suffix) and Path(text).is_file()

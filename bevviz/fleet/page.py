@@ -1,4 +1,4 @@
-"""The summary as a web page that needs nothing but itself."""
+"""Page with the summary of a batch: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from bevviz.bags.source import iso
 from bevviz.fleet.table import SEVERITIES, RunInfo, severity
 from bevviz.support.html import render
 
-SHOWN = 6  # remarks of one frame
+SHOWN = 6  # number of remarks shown for a frame
 
 
 @dataclass(frozen=True, slots=True)
 class BagTotals:
-    """The totals of one bag."""
+    """Totals of one bag."""
 
     name: str
     info: RunInfo
-    first: int  # stamp of the first frame
+    first: int  # stamp of the first frame in nanoseconds
     duration: float  # seconds between the first and the last stamp
-    totals: Mapping[str, int]  # of each count
+    totals: Mapping[str, int]  # sum of each count
     median_ms: float
     p95_ms: float
-    kinds: Mapping[str, int]  # frames by the gravest thing in them
+    kinds: Mapping[str, int]  # number of frames by severity
     worst: float
 
     @property
     def start(self) -> str:
-        """To the second."""
+        """Date and time of the first frame, to the second."""
         return iso(self.first)[:19].replace("T", " ")
 
 
 @dataclass(frozen=True, slots=True)
 class WorstFrame:
-    """A row of the page. ``address`` and ``command``: what opens the frame, in a browser and typed."""
+    """Row of the page. ``address`` and ``command`` open the frame in a browser and in a terminal."""
 
     kind: str
     badness: float
@@ -45,11 +45,11 @@ class WorstFrame:
     stamp: str
     clocks: str
     remarks: Sequence[str]
-    more: int  # further remarks
+    more: int  # number of remarks not shown
     address: str
     command: str
-    picture: bytes | None  # JPEG, of its first camera
-    above: bytes | None  # JPEG, of its bird's-eye view
+    picture: bytes | None  # JPEG of the first camera
+    above: bytes | None  # JPEG of the bird's-eye view
 
 
 def page(
@@ -59,14 +59,14 @@ def page(
     failed: Sequence[tuple[str, str]],
     viewer: str,
 ) -> str:
-    """The whole file.
+    """Return the page as HTML.
 
     Args:
         title: of the batch.
-        bags: totals of each.
+        bags: totals of each bag.
         worst: rows of the table of frames, worst first.
-        failed: name of each bag that failed, and why.
-        viewer: address of a web viewer for the links of the frames; empty: none is served.
+        failed: name and error of each failed bag.
+        viewer: address of a web viewer for the links to frames; empty: there is none.
     """
     return render(
         "batch.html",
@@ -103,7 +103,7 @@ def _worst_frame(row: Mapping[str, Any], viewer: str) -> WorstFrame:
 
 
 def _opened_by(link: str | None, recording: str, stamp: str, viewer: str) -> tuple[str, str]:
-    """Address and command; empty where there is none."""
+    """Return address and command that open a frame. The one that does not apply is empty."""
     if not link:
         return "", f"bevviz open {recording}.rrd --at {stamp}"
     if urlsplit(link).scheme not in ("rerun", "rerun+http", "rerun+https"):

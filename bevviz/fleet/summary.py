@@ -1,4 +1,4 @@
-"""One table of the frames of all bags, worst first, and the page that shows it."""
+"""Summary of a batch: a table of the frames of all bags, worst first, and its page."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from bevviz.support.files import save, written
 
 NAME = "summary"
 
-Link = Callable[[str, int], str]  # recording id, frame -> what opens it
+Link = Callable[[str, int], str]  # recording ID, frame -> address that opens it
 
 
 def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple[pa.Table, list[BagTotals]]:
-    """The frames of all bags, worst first, and the totals of each bag in the order given.
+    """Return the frames of all bags, worst first, and the totals of each bag in the given order.
 
     Args:
-        results: table and its description for each bag.
-        link: fills the column ``link``; None leaves it empty.
+        results: table and description of each bag.
+        link: fills the column ``link``; None: the column stays empty.
     """
     parts, bags = [], []
     for path, info in results:
@@ -40,7 +40,7 @@ def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple
 
 
 def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
-    """The first rows; stamps in nanoseconds."""
+    """Return the first rows, with stamps in nanoseconds."""
     at = frames.schema.get_field_index("stamp")
     stamps = frames["stamp"].cast(pa.int64())
     rows: list[dict[str, Any]] = frames.set_column(at, "stamp", stamps).slice(0, count).to_pylist()
@@ -78,15 +78,15 @@ def write_summary(
     link: Link | None,
     viewer: str,
 ) -> Path:
-    """Write both. Returns where the page is.
+    """Write table and page. Return the path of the page.
 
     Args:
-        folder: where to.
-        results: table and its description for each bag.
-        failed: name of each bag that failed, and why.
-        top: worst frames on the page.
-        link: what opens a frame; None: recordings are in no catalog.
-        viewer: address of a web viewer; empty: none is served.
+        folder: target.
+        results: table and description of each bag.
+        failed: name and error of each failed bag.
+        top: number of worst frames on the page.
+        link: makes the address of a frame; None: the recordings are in no catalog.
+        viewer: address of a web viewer; empty: there is none.
     """
     frames, bags = collect(results, link)
     path = folder / f"{NAME}.html"

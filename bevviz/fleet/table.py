@@ -1,4 +1,4 @@
-"""The frames of a recording as the rows of a table: counts, times and what went wrong."""
+"""Table of the frames of a recording: counts, times and problems."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from bevviz.model.results import Decision, DetectionState, FrameResult
 from bevviz.recording.decisions import remarks
 from bevviz.recording.provenance import file_hash
 
-DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))  # what a kept one can be
+# Decisions that are possible for a kept detection.
+DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))
 STAGES = (
     *("voxel", "ground", "clustering", "detector", "projection", "fusion", "tracking", "bev", "explain"),
     "total",
@@ -57,16 +58,14 @@ SCHEMA = pa.schema(
         ("badness", pa.float64()),
         ("missed", pa.int64()),
         ("false", pa.int64()),
-        (
-            "picture",
-            pa.binary(),
-        ),  # JPEG, of the worst frames alone: the first camera's image with what was found
-        ("above", pa.binary()),  # JPEG, of these too: the bird's-eye view
+        # JPEGs, only for the worst frames: the first camera with its detections, and the bird's-eye view.
+        ("picture", pa.binary()),
+        ("above", pa.binary()),
     ]
 )
 
 
-SEVERITIES = {  # of a frame, the gravest first: what is wrong in it
+SEVERITIES = {  # of a frame, the gravest first -> description
     "failed": "a stage failed",
     "lacking": "an input is missing",
     "wrong": "an object is missed or false",
@@ -77,7 +76,7 @@ SEVERITIES = {  # of a frame, the gravest first: what is wrong in it
 
 
 def severity(row: Mapping[str, Any]) -> str:
-    """The gravest thing in a frame; one of ``SEVERITIES``."""
+    """Return the gravest problem of a frame, a key of ``SEVERITIES``."""
     found = {
         "failed": row["failures"],
         "lacking": row["problems"],
@@ -90,31 +89,32 @@ def severity(row: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """What a table was made from and how; kept in it."""
+    """Description of a run. Its table contains it."""
 
     key: str
     bag: str
     recording_id: str
     frames: int
-    seconds: float  # that the run took
+    seconds: float  # run time
     scene: Scene
     warnings: tuple[str, ...] = ()
-    metrics: dict[str, float | None] | None = None  # None: it was not held to the truth
+    metrics: dict[str, float | None] | None = None  # None: not evaluated
     recording_size: int = 0  # bytes
-    # Of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than a
-    # recording is made. Rerun writes the file, so it is read once more when it is complete.
-    recording_sha256: str = ""  # empty: the table is of a version that did not keep it
+    # Hash of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than
+    # a recording is made. Rerun writes the file, so it is read once more when it is complete.
+    recording_sha256: str = ""  # empty: the table is of an older version
 
 
 _INFO = TypeAdapter(RunInfo)
 _ABOUT, _CHECKSUM = b"bevviz", b"bevviz_sha256"  # metadata of a table: the RunInfo as JSON, and its checksum
-_UNREADABLE = (OSError, LookupError, ValueError, MemoryError, pa.ArrowException)  # errors of damaged tables
+# Errors that reading a damaged table raises.
+_UNREADABLE = (OSError, LookupError, ValueError, MemoryError, pa.ArrowException)
 
 
 def row(result: FrameResult, config: Config) -> dict[str, Any]:
-    """One frame. ``bag`` and ``recording`` are for the caller to say.
+    """Return the row of a frame, without ``bag`` and ``recording``.
 
-    ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor, None where no sensor has one.
+    ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor. None: no sensor has a value.
     """
     frame = result.frame
     found: Counter[str] = Counter(dict.fromkeys(_integers, 0))
@@ -166,7 +166,13 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
 
 
 def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
-    """The row of a frame that was held to the truth; ``missed`` and ``false``: its objects, in words."""
+    """Add the results of the evaluation to the row of a frame.
+
+    Args:
+        row: of the frame.
+        missed: missed objects as text.
+        false: false objects as text.
+    """
     wrong = [*(f"missed {text}" for text in missed), *(f"false {text}" for text in false)]
     return {
         **row,
@@ -178,7 +184,7 @@ def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) 
 
 
 def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
-    """Write a table with checksums of its pages and of ``info``, which ``find_damage`` verifies."""
+    """Write a table with checksums of its pages and of ``info``. ``find_damage`` verifies them."""
     table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
     about = _INFO.dump_json(info)
     metadata = {_ABOUT: about, _CHECKSUM: hashlib.sha256(about).hexdigest()}
@@ -189,7 +195,7 @@ def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
 
 
 def read_info(path: Path) -> RunInfo | None:
-    """What is known of a table; None where there is none, or a broken or foreign one."""
+    """Return the description in a table. None: the table is missing, broken or foreign."""
     try:
         metadata = pq.read_schema(path).metadata or {}
         return _INFO.validate_json(metadata[_ABOUT])
@@ -198,13 +204,13 @@ def read_info(path: Path) -> RunInfo | None:
 
 
 def find_damage(table: Path, recording: Path) -> str:
-    """Say what is damaged in the result of a bag; an empty text means nothing is.
+    """Return a text about the damage in the result of a bag. Empty: there is none.
 
-    A table of an older version says nothing of its recording: any file is accepted there.
+    A table of an older version has no checksum of its recording. Any recording is accepted there.
 
     Args:
-        table: of the frames, an existing file.
-        recording: that was made with it.
+        table: of the frames; the file exists.
+        recording: made by the same run.
     """
     info = read_info(table)
     if info is None or not _is_whole(table, info):
@@ -225,7 +231,7 @@ def find_damage(table: Path, recording: Path) -> str:
 
 
 def _is_whole(table: Path, info: RunInfo) -> bool:
-    """Return whether a table can be read to its end and fits its checksums, where it has some."""
+    """Return whether a table can be read to its end and matches its checksums, if it has them."""
     try:
         with pq.ParquetFile(table, page_checksum_verification=True) as file:
             file.read()
@@ -233,7 +239,7 @@ def _is_whole(table: Path, info: RunInfo) -> bool:
                 return True
             metadata = file.schema_arrow.metadata
             checksum = hashlib.sha256(metadata[_ABOUT]).hexdigest()
-            # Names of columns have no checksum; one that is damaged would be read as a missing column.
+            # Column names have no checksum. A damaged name would look like a missing column.
             return bool(file.schema_arrow.equals(SCHEMA)) and metadata[_CHECKSUM] == checksum.encode()
     except _UNREADABLE:
         return False

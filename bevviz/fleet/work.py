@@ -1,4 +1,4 @@
-"""What a worker does: one bag from beginning to end. The same on this machine and on a cluster."""
+"""Work on one bag, from opening it to its complete results, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from bevviz.support.text import path_text
 
 
 class WithdrawnError(Exception):
-    """The batch does not want the result any more: it was interrupted."""
+    """Error of a job whose batch was interrupted and does not want the result."""
 
     def __init__(self) -> None:
         super().__init__("its unfinished recording was removed")
@@ -42,16 +42,18 @@ class WithdrawnError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class BagTask:
-    """One bag of a batch, as a task of an engine."""
+    """Task of an engine: one bag of a batch."""
 
     job: Job
 
     @property
     def name(self) -> str:
+        """Name of the job."""
         return self.job.name
 
     @property
     def identity(self) -> str:
+        """Folder, name and key of the job."""
         return f"{self.job.folder}-{self.job.name}-{self.job.key}"
 
     def run(self, threads: int, on_frame: Callable[[], None]) -> JobResult:
@@ -60,21 +62,21 @@ class BagTask:
 
 
 def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
-    """Run the pipeline over a bag. Recording and table get their names when both are complete.
+    """Run the pipeline over a bag. Recording and table get their final names when both are complete.
 
     Args:
-        job: what to do.
-        threads: at most so many for the network, where the configuration does not say.
+        job: the bag and its settings.
+        threads: largest number of threads of the network, unless the configuration has one.
         on_frame: called after each frame.
 
     Raises:
         WithdrawnError: the unfinished recording was removed.
     """
-    if info := job.complete():  # by a worker that died before it could say so
+    if info := job.complete():  # A worker that died before its report has completed it.
         return JobResult(job.name, info.frames, info.seconds)
     detector = job.config.detector
     detector = detector.model_copy(update={"threads": detector.threads or threads})
-    config = job.config.model_copy(update={"detector": detector})  # of the stages alone
+    config = job.config.model_copy(update={"detector": detector})  # used by the stages only
     with Output(job) as output:
         try:
             with job.selection.source([job.bag], job.config) as source:
@@ -90,9 +92,9 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
 
 
 class Output(Closing):
-    """What is made of a bag: unfinished, until it is complete. It is removed where it does not come to that.
+    """Unfinished results of a bag. They are deleted if they do not get complete.
 
-    The unfinished recording is a licence to go on: whoever removes it ends the job.
+    Deleting the unfinished recording ends the job.
     """
 
     def __init__(self, job: Job) -> None:
@@ -103,11 +105,12 @@ class Output(Closing):
         self._evaluation: Evaluation | None = None
 
     def close(self) -> None:
+        """Delete the unfinished files."""
         for path in (self._recording, *unfinished_files(self._recording), self._table):
             path.unlink(missing_ok=True)
 
     def opened(self, source: BagSource) -> AbstractContextManager[Sinks]:
-        """The recording."""
+        """Open the recording."""
         self._recording.parent.mkdir(parents=True, exist_ok=True)
         return open_recording(
             source.scene,
@@ -126,14 +129,14 @@ class Output(Closing):
         on_frame: Callable[[], None],
         pictures: Pictures,
     ) -> list[Observer[FrameResult]]:
-        """Of every frame, in order.
+        """Return the observers of the run.
 
         Args:
             source: the bag.
-            sinks: the recording.
-            recorder: what writes to it.
+            sinks: outputs of the recording.
+            recorder: writes to the recording.
             on_frame: called after each frame.
-            pictures: of a frame.
+            pictures: makes the pictures of a frame.
         """
         observers: list[Observer[FrameResult]] = [recorder]
         if self._job.truth is not None:
@@ -145,17 +148,20 @@ class Output(Closing):
 
     @property
     def frames(self) -> int:
+        """Number of frames so far."""
         return 0 if self._rows is None else len(self._rows.rows)
 
     @property
     def seconds(self) -> float:
+        """Run time so far."""
         return time.perf_counter() - self._start
 
     def failed(self, error: UserError) -> JobResult:
+        """Return the outcome of a run that ended with an error."""
         return JobResult(self._job.name, self.frames, self.seconds, str(error))
 
     def complete(self, source: BagSource) -> JobResult:
-        """When all frames were observed and the recording is closed.
+        """Complete the results after the last frame, with the recording closed.
 
         Raises:
             UserError: there was no frame.
@@ -176,7 +182,7 @@ class Output(Closing):
             file_hash(self._recording),
         )
         write(self._table, self._rows.rows, info)
-        job.table.unlink(missing_ok=True)  # of an older result: it must not vouch for the new recording
+        job.table.unlink(missing_ok=True)  # An older table must not vouch for the new recording.
         self._recording.replace(job.recording)
         self._table.replace(job.table)
         return JobResult(job.name, info.frames, info.seconds)
@@ -184,11 +190,11 @@ class Output(Closing):
 
 Pictures: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
 
-WIDTH, ABOVE = 240, 150  # pixels of a camera's picture, of the bird's-eye view's
+WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's-eye view's
 
 
 def pictures(result: FrameResult) -> Mapping[str, bytes]:
-    """Two JPEGs of a frame, by column of the table: the first camera's, and the bird's-eye view."""
+    """Return JPEGs of the first camera and of the bird's-eye view, by column of the table."""
     found = {}
     cameras = (camera_picture(camera, WIDTH) for camera in result.cameras)
     if (picture := next((c for c in cameras if c is not None), None)) is not None:
@@ -199,13 +205,13 @@ def pictures(result: FrameResult) -> Mapping[str, bytes]:
 
 
 class _Worst:
-    """Pictures of the worst frames so far."""
+    """Collector of the pictures of the worst frames so far."""
 
     COUNT = 12
 
     def __init__(self, pictures: Pictures) -> None:
         self._pictures = pictures
-        self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap: badness, row, pictures
+        self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def see(self, badness: float, row: int, result: FrameResult) -> None:
         place = (badness, -row)
@@ -222,7 +228,7 @@ class _Worst:
 
 
 class _Rows(Observer[FrameResult]):
-    """A row of the table for each frame; ends the run where its recording was removed."""
+    """Observer that makes a row for each frame. It ends the run if the recording was removed."""
 
     def __init__(
         self,

@@ -1,1 +1,1 @@
-"""What runs tasks: processes of this machine, or the workers of a cluster."""
+"""Engines that run tasks: processes of this machine, or workers of a cluster."""

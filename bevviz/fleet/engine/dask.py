@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster, which share the file system with this machine."""
+"""Engine on a Dask cluster that shares the file system with this machine."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from bevviz.fleet.engine.task import JobResult, JobResults, Task
 from bevviz.recording.ports import answers
 from bevviz.support.contexts import Closing
 
-WAITING = 2  # jobs for each thread of the cluster, so that none waits for us
+WAITING = 2  # jobs for each thread of the cluster, so that no thread has to wait for the next one
 TICK = 0.2  # seconds
 
 
 class Cluster(Closing):
-    """An existing cluster. A job whose worker dies is run again on another one, as often as its setting
-    ``distributed.scheduler.allowed-failures`` has it.
+    """Existing Dask cluster.
+
+    If a worker dies, the cluster runs its job again on another one. Its setting
+    ``distributed.scheduler.allowed-failures`` limits how often.
 
     Args:
         address: of the scheduler, tcp://host:8786.
 
     Raises:
-        UserError: Dask is not installed, or nobody answers at the address.
+        UserError: Dask is not installed, or no scheduler answers at the address.
     """
 
     def __init__(self, address: str) -> None:
@@ -41,11 +43,12 @@ class Cluster(Closing):
             raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
 
     def close(self) -> None:
+        """Disconnect from the cluster."""
         self._client.close()
 
     @property
     def count(self) -> int:
-        """Threads of all workers that are there now."""
+        """Number of threads of the current workers."""
         return max(1, sum(map(int, self._client.nthreads().values())))
 
     def run(
@@ -55,13 +58,13 @@ class Cluster(Closing):
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """See ``Engine``. The frames of a job are told when it has ended."""
+        """Run tasks as ``Engine.run`` does. The frames of a job are reported when it has ended."""
         from distributed import wait
 
         coming, running = iter(jobs), dict[Any, Task]()
 
         def submit(count: int) -> None:
-            # The scheduler runs nothing twice that has the same key, not even for two clients.
+            # The scheduler runs a key once, even if two clients submit it.
             for job in islice(coming, count):
                 key = f"bevviz-{job.identity}"
                 running[self._client.submit(_work, job, key=key, retries=retries)] = job
@@ -97,7 +100,7 @@ def _result(job: Task, future: Any) -> JobResult:
 
 
 def _work(job: Task) -> JobResult:
-    """On the worker."""
+    """Run a job on the worker."""
     from distributed import get_worker
 
     return job.run(get_worker().state.nthreads, lambda: None)

@@ -1,4 +1,4 @@
-"""Worker processes on this machine. One that dies takes no other job with it, and its own is run again."""
+"""Engine of worker processes on this machine. A worker that dies costs no other job; its own is run again."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from bevviz.fleet.engine.task import JobResult, JobResults, Task
 from bevviz.support import progress
 from bevviz.support.contexts import Closing
 
-# concurrent.futures is of no use here: a worker that dies breaks the pool and every job that was on its way.
+# concurrent.futures does not fit: a worker that dies breaks the pool and all its jobs.
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 TICK = 0.2  # seconds
-SAFE_PATH = "PYTHONSAFEPATH"  # variable of Python itself
+SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
 
 
 @dataclass
 class _Worker:
+    """Worker process with its pipe and its job."""
+
     process: SpawnProcess
     pipe: Connection
     job: Task | None = None
 
 
 class Processes(Closing):
-    """Worker processes, which start at once.
+    """Worker processes, started at once.
 
     Args:
         count: number of processes that run at the same time.
@@ -50,7 +52,7 @@ class Processes(Closing):
             raise
 
     def close(self) -> None:
-        """Those without a job end."""
+        """End the idle processes."""
         while self._idle:
             _end(self._idle.pop())
 
@@ -61,9 +63,9 @@ class Processes(Closing):
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """See ``Engine.run``; a job whose process died is run again, too, and whoever is left is ended.
+        """Run tasks as ``Engine.run`` does. A job whose process died is run again, too.
 
-        ``tick`` is called every ``TICK`` seconds and oftener.
+        ``tick`` is called at least every ``TICK`` seconds. Busy workers are ended at the end.
         """
         coming = iter(jobs)
         again: deque[Task] = deque()
@@ -76,7 +78,7 @@ class Processes(Closing):
         try:
             while len(busy) < self.count and (job := following()) is not None:
                 busy.append(self._given(self._idle.pop() if self._idle else self._start(), job))
-            self.close()  # there are fewer jobs than processes
+            self.close()  # There are fewer jobs than processes.
             while busy:
                 ready = wait([worker.pipe for worker in busy], TICK)
                 tick()
@@ -110,23 +112,23 @@ class Processes(Closing):
             self.close()
 
     def _start(self, *, speaks: bool = False) -> _Worker:
-        context = get_context("spawn")  # a fork would copy threads of Rerun and onnxruntime in midst of work
+        context = get_context("spawn")  # A fork would copy threads of Rerun and onnxruntime amid their work.
         ours, theirs = context.Pipe()
         given = (theirs, self._threads, speaks)
         process = context.Process(target=_work, args=given, name="bevviz batch", daemon=True)
-        # Inherited: signals of the terminal are for the batch alone, which ends its workers. It must not be
-        # interrupted itself between a worker's start and its name.
+        # The worker inherits the signal mask: the batch alone handles signals of the terminal and ends its
+        # workers. The batch must not be interrupted between the start of a worker and its storage.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             with _safe_path():
                 process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        theirs.close()  # so that its end is seen as soon as the process has gone
+        theirs.close()  # Without this, the pipe would not report the end of the process.
         return _Worker(process, ours)
 
     def _given(self, worker: _Worker, job: Task) -> _Worker:
-        """The same process with a job; a new one where it has gone."""
+        """Send a job to a worker. If its process has ended, send it to a new one."""
         if worker.process.exitcode is None:
             try:
                 worker.pipe.send(job)
@@ -142,7 +144,7 @@ class Processes(Closing):
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Let a new process look for Python's own modules where they are, not in the working directory first."""
+    """Let a new process look for Python's own modules first, not for files of the working directory."""
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -158,7 +160,7 @@ _FRAME = "frame"
 
 
 def _judge(process: SpawnProcess, job: Task, message: JobResult | str | None) -> tuple[bool, JobResult]:
-    """Whether a job may go better another time, and how it ended."""
+    """Return whether to try a job again, and how it ended."""
     if isinstance(message, JobResult):
         return False, message
     if message is not None:
@@ -171,18 +173,18 @@ def _judge(process: SpawnProcess, job: Task, message: JobResult | str | None) ->
 
 
 def _end(worker: _Worker) -> None:
-    """At once: what it was to make is made, or not wanted."""
+    """End a worker at once. Its result is complete, or not needed."""
     worker.pipe.close()
     worker.process.kill()
     worker.process.join()
 
 
 def _work(pipe: Connection, threads: int, speaks: bool) -> None:
-    """The process: one job after another, until the other end of the pipe is closed."""
-    # Of all that compile the stages at the same time one says so.
+    """Run jobs in the worker process until the other end of the pipe is closed."""
+    # Workers compile the stages at the same time. Only one of them reports it.
     progress.to((lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    os.environ["OMP_NUM_THREADS"] = str(threads)  # before Open3D is loaded
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # Open3D reads it when it is loaded.
     import cv2
 
     cv2.setNumThreads(threads)
@@ -194,7 +196,7 @@ def _work(pipe: Connection, threads: int, speaks: bool) -> None:
         try:
             result: JobResult | str = job.run(threads, lambda: pipe.send(_FRAME))
         except BrokenPipeError:
-            return  # the batch has gone
+            return  # The batch has ended.
         except Exception as error:
             result = f"{type(error).__name__}: {error}"
         pipe.send(result)

@@ -1,4 +1,4 @@
-"""What the engine runs: tasks, each by one process at a time, and how they end."""
+"""Interfaces of the engine: tasks, how they end, and what runs them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol, TypeAlias
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """How a job ended. ``error`` is empty where its results are complete."""
+    """Outcome of a job. ``error`` is empty if its results are complete."""
 
     name: str
     frames: int = 0
@@ -21,31 +21,38 @@ JobResults: TypeAlias = Generator[JobResult, None, None]
 
 
 class Task(Protocol):
-    """A piece of work that another process, or another machine, can do by itself. It can be pickled."""
+    """Picklable work for another process or machine. One process runs one task at a time."""
 
     @property
     def name(self) -> str:
-        """No two tasks of a run have the same."""
+        """Name that is unique in the run."""
         ...
 
     @property
     def identity(self) -> str:
-        """No two tasks anywhere have the same, unless they make the same."""
+        """Name that is unique everywhere. Two tasks share it only if they make the same result."""
         ...
 
     def run(self, threads: int, on_frame: Callable[[], None], /) -> JobResult:
-        """Do it. ``threads``: at most so many; ``on_frame`` is called after each frame."""
+        """Run the task.
+
+        Args:
+            threads: largest number of threads.
+            on_frame: called after each frame.
+        """
         ...
 
 
 class Engine(Protocol):
-    """What runs tasks: ``local.Processes`` or ``dask.Cluster``. It is closed in the end, or before."""
+    """Runner of tasks: ``local.Processes`` or ``dask.Cluster``. The caller closes it."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """End the workers."""
+        ...
 
     @property
     def count(self) -> int:
-        """Tasks that are run at the same time."""
+        """Number of tasks that run at the same time."""
         ...
 
     def run(
@@ -55,12 +62,12 @@ class Engine(Protocol):
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """Run the tasks, each once, and yield how they ended, as they end.
+        """Run each task once and yield its outcome as soon as it ends.
 
         Args:
-            jobs: what to do; the first ones first. Each is asked for when a worker is free, or nearly so.
-            retries: how often a task is run again that failed for no fault of its input.
-            on_frame: called for each frame of any of them.
-            tick: called every now and then; what it raises ends all.
+            jobs: the tasks, in order. Each is taken when a worker is free, or nearly so.
+            retries: how often a task is run again if its input is not the cause of the failure.
+            on_frame: called for each frame of any task.
+            tick: called regularly. An exception in it ends the run.
         """
         ...
