@@ -1,4 +1,4 @@
-"""See what a LiDAR-camera perception pipeline saw, made and decided, frame by frame, in Rerun.
+"""Debugger for LiDAR-camera perception: shows frame by frame, in Rerun, what each stage computed and decided.
 
 >>> import bevviz
 >>> drive = bevviz.open("drive.mcap", model="yolo11n.onnx")
@@ -10,7 +10,7 @@ import sys
 
 from bevviz.support.version import __version__
 
-# Neither ``typing`` nor ``__future__``: to an interrupt among these imports Python gives a traceback.
+# Do not import ``typing`` or ``__future__`` here: Python prints a traceback for an interrupt during them.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "__version__", "open", "simulate"]
 
-# onnxruntime stores a number for this machine when it is imported, unless it is told not to before.
+# onnxruntime stores an ID of this machine at its import, unless telemetry is disabled before.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 _HOMES = {
@@ -57,7 +57,7 @@ sys.meta_path.insert(0, _FormerNames)
 
 
 def __getattr__(name: str) -> "Any":
-    """Imported when it is asked for, so that ``bevviz --help`` is instant."""
+    """Import a public name when it is used, so that ``bevviz --help`` is instant."""
     if name not in _HOMES:
         raise AttributeError(f"module 'bevviz' has no attribute '{name}'")
     from importlib import import_module

@@ -1,4 +1,4 @@
-"""A recording and what becomes of it, from Python: the same session that the commands use."""
+"""Drives in Python: the session that the commands use, too."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ if TYPE_CHECKING:
     from bevviz.why import Answer, Questioner
 
 Settings = Mapping[str, Any] | Sequence[str]
-KEPT = 8  # results of single frames that are kept for those who ask again
+KEPT = 8  # number of single frames whose results are kept for further questions
 
 
 class Drive(Closing):
-    """A drive that is open: its frames, in order or one by one, and what the stages make of them.
+    """Open drive: its frames, in order or one by one, and the results of the stages.
 
     Use it as a context manager, or call ``close``.
 
     Args:
-        frames: where they come from.
-        config: how they are run.
-        notes: what is to be said of them beforehand, one sentence each.
+        frames: source of the frames.
+        config: configuration of the runs.
+        notes: warnings about the source, one sentence each.
 
     Attributes:
         frames: the source.
-        session: that single frames are run in; a run over the whole drive has one of its own.
+        session: session for single frames. A run over the whole drive has a session of its own.
 
     Raises:
-        UserError: the detector's model or somebody's function cannot be used.
+        UserError: the detector's model or a user-defined function cannot be used.
     """
 
     def __init__(self, frames: Frames, config: Config, notes: Sequence[str] = ()) -> None:
@@ -57,17 +57,18 @@ class Drive(Closing):
         self._shown: NotebookViewer | None = None
 
     def close(self) -> None:
+        """Close the source."""
         self.frames.close()
 
     def __repr__(self) -> str:
         seconds = f"{self.times[-1]:.1f} s" if len(self) else "empty"
         return f"<Drive {self.scene.name}: {len(self)} scans, {seconds}, preset {self.config.preset}>"
 
-    # --- what is there -------------------------------------------------------------------------
+    # --- properties ----------------------------------------------------------------------------
 
     @property
     def config(self) -> Config:
-        """The configuration that is in force."""
+        """Current configuration."""
         return self.session.config
 
     @property
@@ -77,17 +78,17 @@ class Drive(Closing):
 
     @property
     def warnings(self) -> list[str]:
-        """What was lost or looked wrong so far, one sentence each."""
+        """Losses and irregularities so far, one sentence each."""
         return [*self._notes, *self.frames.warnings]
 
     @property
     def times(self) -> F64:
-        """(N,) seconds from the first scan to each, by log time."""
+        """(N,) seconds from the first scan to each scan, by log time."""
         scans = self.frames.scans
         return np.asarray((scans - scans[0]) * 1e-9, np.float64) if len(scans) else np.zeros(0)
 
     def __len__(self) -> int:
-        """Scans of the recording."""
+        """Return the number of scans in the recording."""
         return len(self.frames.scans)
 
     # --- one frame -----------------------------------------------------------------------------
@@ -99,14 +100,14 @@ class Drive(Closing):
     def at(self, *, frame: int) -> FrameResult: ...
 
     def at(self, time: str | float | None = None, *, frame: int | None = None) -> FrameResult:
-        """What the stages make of one scan, without what needs the frames before it (tracks, anomalies).
+        """Return the results of one scan, without tracks and anomalies, which need the frames before it.
 
         Args:
-            time: the scan nearest to it: seconds from the start (12.5), since 1970, or ISO 8601.
-            frame: or the scan of this number, counted from 0; -1 is the last.
+            time: selects the nearest scan: seconds from the start (12.5), since 1970, or ISO 8601.
+            frame: or the number of the scan, counted from 0; -1 is the last.
 
         Raises:
-            UserError: a time outside the recording, no such scan, or one that cannot be read.
+            UserError: the time is outside the recording, there is no such scan, or it cannot be read.
         """
         number = self._number(time, frame)
         key = number, id(self.config)
@@ -118,10 +119,10 @@ class Drive(Closing):
         return self._results[key]
 
     def raw(self, frame: int) -> Frame:
-        """A scan with all that belongs to its time, before any stage.
+        """Return a scan with all messages of its time, before any stage.
 
         Raises:
-            UserError: no such scan, or one that cannot be read.
+            UserError: there is no such scan, or it cannot be read.
         """
         found = self.frames.frame(frame)
         if found is None:
@@ -144,26 +145,30 @@ class Drive(Closing):
         hints: int = 5,
         everything: bool = False,
     ) -> list[Answer]:
-        """Why objects of a frame were reported, or were not: what ``bevviz why`` answers.
+        """Explain why objects of a frame were reported or missed, as ``bevviz why`` does.
+
+        Without a time and a frame, the notebook's viewer selects the frame. Without a selection as well, the
+        last click in it selects the object, too.
 
         Args:
-            time, frame: which scan, as for ``at``; neither: the one that the notebook's viewer shows, and
-                with no selection what was clicked there last.
-            cls: all of that class; with no selection at all: whatever went wrong.
-            box: what is at the pixel u, v, or in the image box u0, v0, u1, v1.
-            point: what is at x, y, z, in metres of the points' frame.
+            time: as in ``at``.
+            frame: as in ``at``.
+            cls: all objects of this class. With no selection at all: everything that went wrong.
+            box: the object at the pixel u, v, or in the image box u0, v0, u1, v1.
+            point: the object at x, y, z, in metres of the points' frame.
             radius: metres around that point or cell.
-            cell: what is in that row and column of the bird's-eye view.
-            cluster, detection: that one, by its row in the frame's result.
-            camera: of the pixel or detection, where there are several.
-            hints: for how many answers it is tried what would change them.
-            everything: also what went well, and what nothing could be done about.
+            cell: row and column of a cell of the bird's-eye view.
+            cluster: row of a cluster in the frame's result.
+            detection: row of a detection in the frame's result.
+            camera: of the pixel or detection, if there are several cameras.
+            hints: number of answers for which parameter changes are tried.
+            everything: also explain correct results, and errors that no parameter could prevent.
 
         Returns:
-            Worst first.
+            The answers, worst first.
 
         Raises:
-            UserError: as ``at``; no such class, camera, pixel, cell, cluster or detection.
+            UserError: as ``at``. Or there is no such class, camera, pixel, cell, cluster or detection.
         """
         from bevviz.why import Selection
 
@@ -190,7 +195,7 @@ class Drive(Closing):
 
     @property
     def selected(self) -> Selected | None:
-        """What was clicked last in the notebook's viewer, see ``show``; None: nothing."""
+        """Last click in the notebook's viewer, see ``show``. None: nothing was clicked."""
         viewer = self._shown
         if viewer is None or viewer.clicked is None:
             return None
@@ -200,10 +205,11 @@ class Drive(Closing):
         return viewer.selected(as_shown.alone(self.raw(viewer.clicked)))
 
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
-        """Answers any number of questions about one scan; what they have in common is worked out once.
+        """Return an object that answers questions about one scan. It computes shared results once.
 
         Args:
-            time, frame: which scan, as for ``at``.
+            time: as in ``at``.
+            frame: as in ``at``.
 
         Raises:
             UserError: as ``at``.
@@ -222,17 +228,17 @@ class Drive(Closing):
         return self._questioner
 
     def configure(self, *settings: str, **more: Any) -> dict[str, ParameterChange]:
-        """Change parameters for what is asked from now on.
+        """Change parameters from now on.
 
         Args:
             settings: ``"clustering.eps=0.6"``, as after ``--set``.
             more: the same as ``clustering={"eps": 0.6}``.
 
         Returns:
-            What has changed.
+            The changed parameters.
 
         Raises:
-            UserError: an unknown key or a wrong value; nothing is changed then.
+            UserError: an unknown key or a wrong value. No parameter is changed then.
         """
         from bevviz.config import revised
         from bevviz.config.trust import USER
@@ -250,28 +256,28 @@ class Drive(Closing):
     # --- the whole drive -----------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[FrameResult]:
-        """Every frame in order, with tracks and anomalies; the next ones are made meanwhile."""
+        """Yield the result of every frame in order, with tracks and anomalies. Results are computed ahead."""
         return results(self.frames, self.new_session())
 
     def new_session(self) -> Session:
-        """For a run over the whole drive, which remembers what came before; networks are shared."""
+        """Return a session for a run over the whole drive. It has its own tracks and shares the networks."""
         return Session(self.config, loader=self.session.loader)
 
     def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
-        """Show every frame in order to the observers, see ``bevviz.pipeline.run.run``."""
+        """Run every frame in order and pass the results to the observers, see ``bevviz.pipeline.run.run``."""
         return run(self.frames, self.new_session(), observers)
 
     def evaluate(
         self, *, truth: str | None = None, kitti_labels: str | PathLike[str] | None = None
     ) -> Evaluation:
-        """Run the whole drive and hold every frame to what is really there.
+        """Run the whole drive and compare every frame with the ground truth.
 
         Args:
-            truth: a Detection3DArray topic that states it; default: the one called ground truth.
+            truth: Detection3DArray topic of the ground truth; default: the one called ground truth.
             kitti_labels: or a folder of KITTI's labels, one file for each scan.
 
         Raises:
-            UserError: there is no truth.
+            UserError: there is no ground truth.
 
         Example:
             >>> drive.evaluate().metrics["recall.person@0-10"]
@@ -288,7 +294,7 @@ class Drive(Closing):
         """Run the whole drive into a Rerun recording.
 
         Args:
-            path: of the file, .rrd.
+            path: .rrd file to write.
             blueprint: layout.
 
         Raises:
@@ -309,8 +315,7 @@ class Drive(Closing):
     def show(self, blueprint: str | Blueprint | None = None) -> None:
         """Run the whole drive into a viewer: in a notebook into the cell, else into a window.
 
-        What is clicked in a notebook's viewer is ``selected`` in the cells that are run next, and what
-        ``why()`` answers about; that is then marked in the viewer.
+        ``selected`` returns the last click in a notebook's viewer. ``why()`` explains it and marks it there.
 
         Args:
             blueprint: layout; None: ``workbench`` in a notebook, else ``debug``.
@@ -330,7 +335,7 @@ class Drive(Closing):
             self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
 
     def to_pandas(self) -> DataFrame:
-        """Run the whole drive into a table: a row a frame, with counts, times and what went wrong."""
+        """Run the whole drive and return a row for each frame: counts, times and problems."""
         from bevviz.fleet.table import row
         from bevviz.model.frame import data_frame
 
@@ -341,7 +346,7 @@ def open_drive(
     path: str | PathLike[str] | Sequence[str | PathLike[str]],
     *,
     model: str | PathLike[str] = "",
-    set: Settings = (),  # as the command's option
+    set: Settings = (),  # named as the command's option
     config: str | PathLike[str] | None = None,
     preset: Preset | None = None,
     start: str | float | None = None,
@@ -354,18 +359,19 @@ def open_drive(
 
     Args:
         path: bag file or folder (MCAP, sqlite3, ROS 1); several are one drive. Or the folder of a data set,
-            see docs/inputs.md. Or a recording (.rrd), which stands for the bag that it was made from and for
-            its configuration.
+            see docs/inputs.md. Or a recording (.rrd), which stands for its bag and its configuration.
         model: detector, as ``detector.model``.
         set: parameters: ``{"clustering.eps": 0.6}``, or ``["clustering.eps=60 cm"]`` as after ``--set``.
         config: YAML file, as ``bevviz config`` prints it.
         preset: ``default``, or ``reference``: as the ROS 2 tutorial pipeline.
-        start, end, every, frames: which scans a run over the whole drive takes, as the options of
-            ``bevviz bag``; any scan can be asked for one by one.
-        bag: of a recording, where it is not found by itself.
+        start: first time of a run over the whole drive. Single frames ignore this and the next three.
+        end: last time of such a run.
+        every: number N to run each N-th scan only.
+        frames: numbers A, B to run scans A to B - 1.
+        bag: bag of a recording, if it is not found automatically.
 
     Raises:
-        UserError: no bag, nothing in it, an unknown parameter, or a model that cannot be used.
+        UserError: there is no bag, or it is empty. Or a parameter is unknown, or a model cannot be used.
 
     Example:
         >>> import bevviz
@@ -408,13 +414,16 @@ def simulate(
     config: str | PathLike[str] | None = None,
     preset: Preset | None = None,
 ) -> Drive:
-    """The synthetic drive, with ground truth and its own detector: what ``bevviz demo`` shows.
+    """Return the synthetic drive of ``bevviz demo``, with ground truth and its own detector.
 
     Args:
         frames: scans, at 10 Hz.
-        seed: another seed is another street.
+        seed: selects the street.
         plant: faults to plant, see ``bevviz demo --help``.
-        model, set, config, preset: as for ``bevviz.open``.
+        model: as in ``bevviz.open``.
+        set: as in ``bevviz.open``.
+        config: as in ``bevviz.open``.
+        preset: as in ``bevviz.open``.
 
     Raises:
         UserError: no such fault, an unknown parameter, or a model that cannot be used.
@@ -425,7 +434,7 @@ def simulate(
 
 
 def _given(model: str | PathLike[str], settings: Settings) -> list[str]:
-    """``key=value`` each."""
+    """Return the settings as ``key=value``."""
     given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
     return [*([f"detector.model={model}"] if model else []), *given]
 
@@ -435,7 +444,7 @@ def _file(config: str | PathLike[str] | None) -> Path | None:
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:
-    """``key=value`` of dotted keys, or of sections, as ``--set`` takes them."""
+    """Return dotted keys, or keys in sections, as ``key=value`` for ``--set``."""
     import json
 
     flat: list[str] = []

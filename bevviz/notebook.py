@@ -1,4 +1,4 @@
-"""Rerun's viewer in the cell of a notebook, and what is clicked in it."""
+"""Rerun's viewer in the cell of a notebook, and the clicks in it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.why import Answer, Selection
 
-MARKED = 5  # answers that are drawn at once
+MARKED = 5  # number of answers marked at once
 
 
 def in_notebook() -> bool:
-    """Whether a cell could show a viewer: a plain IPython terminal cannot."""
+    """Return whether a cell can show a viewer. A plain IPython terminal cannot."""
     try:
         from IPython.core.getipython import get_ipython
     except ImportError:
@@ -42,14 +42,14 @@ def in_notebook() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Selected:
-    """What was clicked in the viewer.
+    """Click in the viewer.
 
     Attributes:
-        frame: number of the scan that was shown.
-        pick: the thing or the place; None: nothing that could be asked about.
+        frame: number of the scan shown.
+        pick: the object or the position; None: it cannot be asked about.
         path: entity that was clicked.
-        place: of a thing that is known by its row: its middle, x, y, z in metres of the points' frame, or
-            u, v in pixels.
+        place: centre of an object identified by its row: x, y, z in metres of the points' frame, or u, v in
+            pixels.
     """
 
     frame: int
@@ -58,10 +58,13 @@ class Selected:
     place: tuple[float, ...] = ()
 
     def selection(self, same: bool) -> Selection:
-        """What to ask about it; ``same``: of results with the rows that were shown, else about its place.
+        """Return the selection to ask about.
+
+        Args:
+            same: whether results have the rows that were shown. If not, the selection uses the position.
 
         Raises:
-            UserError: nothing can be asked about it.
+            UserError: the click cannot be asked about.
         """
         if self.pick is None:
             raise UserError(f"nothing can be asked about {self.path}: click on a box, a point or a pixel")
@@ -74,6 +77,8 @@ class Selected:
 
 @dataclass(frozen=True, slots=True)
 class _Click:
+    """Raw event of a click."""
+
     frame: int
     path: str
     instance: int | None
@@ -82,12 +87,13 @@ class _Click:
 
 @dataclass(slots=True)
 class _Times:
-    """Where each frame is on the timelines."""
+    """Times of each frame on the timelines."""
 
     numbers: list[int] = field(default_factory=list)
     at: dict[str, list[int]] = field(default_factory=dict)
 
     def add(self, result: FrameResult) -> None:
+        """Add a frame."""
         frame = result.frame
         self.numbers.append(frame.index)
         for timeline, value in (
@@ -98,7 +104,7 @@ class _Times:
             self.at.setdefault(timeline, []).append(value)
 
     def number(self, timeline: str, time: float) -> int | None:
-        """Of the frame that a viewer shows there; None: none."""
+        """Return the number of the frame that a viewer shows at this time. None: there are no frames."""
         values = np.array(self.at.get(timeline, ()), np.float64)
         before = np.flatnonzero(values <= time + entities.SLACK * (timeline != entities.FRAME))
         if not len(values):
@@ -108,7 +114,7 @@ class _Times:
 
 
 class NotebookViewer(Recorder):
-    """A viewer in the current cell that a drive is run into; it remembers what is clicked.
+    """Viewer in the current cell. It shows a run and remembers the last click.
 
     Args:
         scene: names of the sensors.
@@ -116,8 +122,8 @@ class NotebookViewer(Recorder):
         blueprint: layout.
 
     Attributes:
-        viewer: Rerun's own.
-        config: what its rows are rows of.
+        viewer: Rerun's viewer.
+        config: configuration of the shown rows.
 
     Raises:
         UserError: rerun-notebook is not installed, or there is no such blueprint.
@@ -139,6 +145,7 @@ class NotebookViewer(Recorder):
         self.viewer.display()
 
     def see(self, result: FrameResult) -> None:
+        """Log a frame and store its times and tracks."""
         super().see(result)
         self._frames.add(result)
         if result.tracks is not None:
@@ -147,16 +154,16 @@ class NotebookViewer(Recorder):
 
     @property
     def frame(self) -> int | None:
-        """Number of the scan that is shown; None: none was run."""
+        """Number of the scan shown. None: none was run."""
         return self._frames.number(self._timeline, self._time)
 
     @property
     def clicked(self) -> int | None:
-        """Number of the scan in which something was clicked last; None: nothing was."""
+        """Number of the scan that was clicked last. None: there was no click."""
         return None if self._click is None else self._click.frame
 
     def selected(self, result: FrameResult) -> Selected | None:
-        """What was clicked last.
+        """Return the last click.
 
         Args:
             result: of the frame ``clicked``, made with ``config``.
@@ -168,7 +175,7 @@ class NotebookViewer(Recorder):
         return Selected(click.frame, found, click.path, _place(result, found))
 
     def mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
-        """Show what answers are about, and the frame that they are of."""
+        """Mark the objects of answers in the viewer, and show their frame."""
         frame = result.frame
         if frame.index not in self._frames.numbers:
             return
@@ -179,7 +186,7 @@ class NotebookViewer(Recorder):
             self.viewer.set_time_ctrl(timeline=entities.STAMP, timestamp=when)
 
     def _told(self, event: ViewerEvent) -> None:
-        """An event of the viewer: between two cells, as the notebook hands it on."""
+        """Handle an event of the viewer. The notebook passes it on between two cells."""
         if event.type == "timeline_change":
             self._timeline, self._time = event.timeline, event.time
         elif event.type == "time_update":
@@ -205,7 +212,7 @@ def _viewer(recording: rr.RecordingStream, layout: Blueprint) -> Viewer:
 
 
 def _place(result: FrameResult, found: Pick | None) -> tuple[float, ...]:
-    """The middle of a thing that is known by its row in a result."""
+    """Return the centre of an object identified by its row in a result. Empty for any other pick."""
     if found is None:
         return ()
     if found.kind == "object" and result.objects is not None:
