@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import textwrap
 from collections import defaultdict
 from dataclasses import replace
@@ -198,8 +197,6 @@ def test_installed_beside_the_package(tmp_path: Path, monkeypatch: pytest.Monkey
     """As in the wheel: blueprints/ inside the package's folder goes first."""
     package = tmp_path / "bevviz"
     (package / "blueprints").mkdir(parents=True)
-    (package / "__init__.py").touch()
     (package / "blueprints" / "mine.py").write_text("")
-    bevviz = importlib.import_module("bevviz")
-    monkeypatch.setattr(bevviz, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(blueprints, "PACKAGE", package)
     assert blueprints.names() == ["mine"]

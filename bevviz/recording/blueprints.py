@@ -10,12 +10,13 @@ from pathlib import Path
 import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
-import bevviz
 from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.model.frame import Scene
 from bevviz.recording.decoding import check_decodes
 from bevviz.recording.retention import is_whole
+
+PACKAGE = Path(__file__).parents[1]
 
 
 def _folder() -> Path:
@@ -23,9 +24,8 @@ def _folder() -> Path:
 
     It is inside the package in an installation, and next to the package folder in a checkout.
     """
-    package = Path(bevviz.__file__).parent
-    installed = package / "blueprints"
-    return installed if installed.is_dir() else package.parent / "blueprints"
+    installed = PACKAGE / "blueprints"
+    return installed if installed.is_dir() else PACKAGE.parent / "blueprints"
 
 
 def names() -> list[str]:
