@@ -17,7 +17,7 @@ NOWHERE = """
 from numba.core.caching import CacheImpl
 CacheImpl._locator_classes = []  # as where neither the package nor a home can be written
 import numpy as np
-from bevviz.stages import kernel
+from bevviz.support import kernel
 from bevviz.stages.clustering import dbscan
 assert not kernel.CACHED
 points = np.array([[0, 0, 0], [0.1, 0, 0], [9, 0, 0]], np.float32)

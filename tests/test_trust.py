@@ -520,13 +520,13 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         "cli/options.py",
         "cli/tune.py",
         "config/loading.py",
+        "config/reloading.py",
         "drive.py",
-        "live/settings.py",
-        "recorded.py",
+        "recording/source_lookup.py",
         "report/check.py",
     }
     finding = {file for file, call in calls("find") if ast.unparse(call.func) == "plugins.find"}
-    assert finding == {"config/foreign.py"}
+    assert finding == {"config/user_stages.py"}
 
 
 def test_a_recorded_detector_is_refused_with_a_preset_too(received: Path) -> None:
