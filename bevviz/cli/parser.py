@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -13,9 +12,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from bevviz.cli import style
-from bevviz.support.text import printable
+from bevviz.support.text import did_you_mean, printable
 
 COMMAND = "COMMAND"
+CUTOFF = 0.66  # least similarity of a name to suggest
 _CHOICE = re.compile(r"invalid choice: '(?P<given>.*)' \(choose from (?P<known>.*)\)$", re.DOTALL)
 
 
@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
             name = option.partition("=")[0]
             known = self._option_string_actions
             if name not in known and not any(one.startswith(name) for one in known):
-                self.error(f"unknown option {name}{nearest(name, known)}")
+                self.error(f"unknown option {name}{did_you_mean(name, known, CUTOFF)}")
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"{unknown[0]}: nothing is expected here")
@@ -51,7 +51,7 @@ class Parser(argparse.ArgumentParser):
                 message = _no_command(given, known)
             else:
                 message = f"{message[: choice.start()]}'{given}' is none of {', '.join(known)}"
-                message += nearest(given, known)
+                message += did_you_mean(given, known, CUTOFF)
         print(f"{style.error('bevviz: error:')} {printable(message)}\n{self.short_usage()}", file=sys.stderr)
         self.exit(2)
 
@@ -73,16 +73,6 @@ class Parser(argparse.ArgumentParser):
         return f"usage: {' '.join(words)} [OPTION ...]    '{self.prog} --help' explains"
 
 
-def nearest(given: str, known: Iterable[str]) -> str:
-    """Return a hint with the most similar name, as the end of a sentence. Empty if none is similar.
-
-    >>> nearest("--modle", ["--model", "--set"])
-    "; did you mean '--model'?"
-    """
-    near = difflib.get_close_matches(given, list(known), 1, 0.66)
-    return f"; did you mean '{near[0]}'?" if near else ""
-
-
 def _no_command(given: str, known: Iterable[str]) -> str:
     """Return the message for an argument that is neither a command nor an existing file."""
     path = Path(given)
@@ -90,5 +80,5 @@ def _no_command(given: str, known: Iterable[str]) -> str:
         there: list[str] = []
         with suppress(OSError, ValueError):
             there = [str(other) for other in path.parent.iterdir()]
-        return f"{given}: no such file or folder{nearest(given, there)}"
-    return f"'{given}' is no command, nor a file{nearest(given, known)}"
+        return f"{given}: no such file or folder{did_you_mean(given, there, CUTOFF)}"
+    return f"'{given}' is no command, nor a file{did_you_mean(given, known, CUTOFF)}"

@@ -13,7 +13,6 @@ wins over the preset.
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -37,7 +36,7 @@ from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.pillars import is_network
 from bevviz.config.trust import USER, NamedCode, trust_in
 from bevviz.errors import UserError
-from bevviz.support.text import shown
+from bevviz.support.text import did_you_mean, shown
 
 NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
@@ -124,9 +123,7 @@ def _read_layers(path: Path) -> list[Layer]:
     known = [*ProjectFile.model_fields, *Config.model_fields, *TUTORIAL_NAMES]
     for name in sections:
         if name not in known and "." not in name:
-            nearest = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
-            raise UserError(f"{path}: unknown key '{name}'{hint}")
+            raise UserError(f"{path}: unknown key '{name}'{did_you_mean(name, known)}")
     own_values = flattened(sections)
     if project.preset is not None:
         own_values["preset"] = project.preset

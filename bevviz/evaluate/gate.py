@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from xml.etree import ElementTree
 
 from bevviz.errors import UserError
 from bevviz.evaluate.metric_names import METRICS, base_of
+from bevviz.support.text import did_you_mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +51,10 @@ def _limit(side: Literal["min", "max"], text: str) -> Limit:
     name = name.strip()
     if base_of(name) is None:
         base = name.partition("@")[0]
-        near = difflib.get_close_matches(base.partition(".")[0], METRICS, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(base.partition(".")[0], METRICS) or ";"
         known = ", ".join(METRICS)
         raise UserError(
-            f"--{side} {text}: no metric '{base}'; {hint}There are {known}; each may have .CLASS and @RANGE"
+            f"--{side} {text}: no metric '{base}'{hint} There are {known}; each may have .CLASS and @RANGE"
         )
     try:
         value = float(number)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Scene
 from bevviz.recording.decoding import check_decodes
 from bevviz.recording.retention import is_whole
+from bevviz.support.text import did_you_mean
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -57,9 +57,8 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
         return _from_python(_folder() / f"{name_or_path}.py", scene)
     path = Path(name_or_path)
     if path.suffix not in (".py", ".rbl"):
-        close_names = difflib.get_close_matches(name_or_path, names(), 1, 0.4)
-        hint = f"did you mean '{close_names[0]}'?" if close_names else f"there are {', '.join(names())}"
-        raise UserError(f"--blueprint {name_or_path}: unknown; {hint} (or give a .py or .rbl file)")
+        hint = did_you_mean(name_or_path, names(), 0.4) or f"; there are {', '.join(names())}"
+        raise UserError(f"--blueprint {name_or_path}: unknown{hint} (or give a .py or .rbl file)")
     if not path.is_file():
         raise UserError(f"--blueprint {path}: no such file")
     if path.suffix == ".py":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from reprlib import Repr
 
@@ -66,3 +68,18 @@ def fenced(text: str, language: str = "") -> str:
     runs = re.findall(r"`{3,}", text)
     fence = "`" * (max(map(len, runs), default=2) + 1)
     return f"{fence}{language}\n{text.removesuffix(chr(10))}\n{fence}"
+
+
+def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the end of a sentence about an unknown name: the nearest known name, or an empty string.
+
+    Args:
+        name: the unknown name.
+        known: names to choose from.
+        cutoff: least similarity from 0 to 1, see ``difflib.get_close_matches``.
+
+    >>> did_you_mean("--modle", ["--model", "--set"])
+    "; did you mean '--model'?"
+    """
+    nearest = difflib.get_close_matches(name, list(known), 1, cutoff)
+    return f"; did you mean '{nearest[0]}'?" if nearest else ""

@@ -6,13 +6,13 @@ world as it is, but its stated mounting or its stated time is wrong.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bevviz.errors import UserError
+from bevviz.support.text import did_you_mean
 from bevviz.synthetic import models
 from bevviz.synthetic.world import SceneArea
 
@@ -123,9 +123,8 @@ def find_scenes(names: Sequence[str], duration: float) -> list[Fault]:
             continue
         if name not in FAULTS:
             known = [*FAULTS, *SENSOR_FAULTS]
-            near = difflib.get_close_matches(name, known, 1, 0.4)
-            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}"
-            raise UserError(f"plant {name}: unknown; {hint}")
+            hint = did_you_mean(name, known, 0.4) or f"; there are {', '.join(known)}"
+            raise UserError(f"plant {name}: unknown{hint}")
         fault = FAULTS[name]
         if fault.time > duration:
             raise UserError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
 from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
+from bevviz.support.text import did_you_mean
 from bevviz.why.frame_index import FEW, Traces, detection_subject, joined
 from bevviz.why.outcome import OVERLAP
 from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, one_of, projected
@@ -61,9 +61,9 @@ def select_subjects(traces: Traces, selection: Selection) -> list[Subject]:
     known = dict.fromkeys([*traces.classes, *(truth.labels if truth is not None else ()), *object_names])
     wanted = selection.label.lower()
     if not any(wanted == name.lower() or wanted in accepted_names(name, ()) for name in known):
-        near = difflib.get_close_matches(selection.label, known, 1, 0.5)
-        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known)) or 'none'}"
-        raise UserError(f"--class {selection.label}: no such class; {hint}")
+        names = ", ".join(sorted(known)) or "none"
+        hint = did_you_mean(selection.label, known, 0.5) or f"; there are {names}"
+        raise UserError(f"--class {selection.label}: no such class{hint}")
     return [subject for subject in subjects if subject.label.lower() == wanted or _is_called(subject, wanted)]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from bevviz.stages.detector.names import metadata_names, read_names
 from bevviz.stages.detector.providers import open_session
 from bevviz.stages.detector.session import NetworkSession, listed, reading
 from bevviz.stages.detector.suppression import nms
+from bevviz.support.text import did_you_mean
 
 DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
 MIN_SIDE, MAX_SIDE = 8, 4096  # pixels of the input: one cell of a grid, and the widest cameras of vehicles
@@ -246,8 +246,7 @@ class Detector:
         """Return the ids of the configured classes, None for all classes."""
         for name in self._config.classes:
             if name not in self.names:
-                near = difflib.get_close_matches(name, self.names, 1)
-                hint = f"; did you mean '{near[0]}'?" if near else ""
+                hint = did_you_mean(name, self.names)
                 raise UserError(f"detector.classes: the model has no class '{name}'{hint}")
         if not self._config.classes:
             return None
