@@ -14,7 +14,7 @@ from bevviz.messages.clouds import MOST_POINTS, SCALARS
 from bevviz.messages.decoders import Decoder
 from bevviz.messages.encode import make
 
-LEAST, LONGEST = 1 << 24, 1 << 30  # limits in bytes of a decompressed cloud, whatever size its message states
+LEAST, LONGEST = 1 << 24, 1 << 30  # limits in bytes of a decompressed cloud; its message may state any size
 DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 

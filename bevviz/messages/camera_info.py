@@ -15,24 +15,25 @@ _DISTORTION = {
     "rational_polynomial": "rational_polynomial",
     "equidistant": "equidistant",
     "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",  # foxglove's name
-    "kannala_brandt4": "equidistant",  # librealsense's
+    "kannala_brandt": "equidistant",  # name in Foxglove's messages
+    "kannala_brandt4": "equidistant",  # name in librealsense
 }
 
 
 def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
-    """The camera model of a sensor_msgs/CameraInfo, for images as they are published.
+    """Return the camera model of a sensor_msgs/CameraInfo, for images as they are published.
 
-    The region of interest and binning are applied as image_geometry does: first the offset, then the
-    scale. K of a message is for the full sensor.
+    K of a message is for the full sensor. The region of interest and the binning are applied as
+    image_geometry does: first the offset, then the scale.
 
     Args:
-        msg: ROS 1 (upper-case K, D, P) or ROS 2.
-        rectified: the images are rectified: the left 3 x 3 of P and no distortion. Without P, K.
-        topic: for the error messages.
+        msg: message of ROS 1 (upper-case K, D, P) or ROS 2.
+        rectified: whether the images are rectified. Then the left 3 x 3 of P is used without distortion; K if
+            there is no P.
+        topic: topic of the message, for errors.
 
     Raises:
-        MessageError: an uncalibrated camera, or a distortion model that is not known.
+        MessageError: the camera is not calibrated, or its distortion model is not supported.
     """
     K, D, P = (np.asarray(either(msg, n, n.lower()), np.float64) for n in "KDP")
     matrix, baseline = K.reshape(3, 3), (0.0, 0.0)
@@ -54,7 +55,7 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
 
 
 def _is_fisheye(name: str) -> bool:
-    """Whether coefficients of zero are a lens all the same: r = f theta."""
+    """Return whether a model is a fisheye lens (r = f theta), also with all coefficients at zero."""
     return _DISTORTION.get(name.lower()) == "equidistant"
 
 

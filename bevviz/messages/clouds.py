@@ -10,33 +10,26 @@ from numpy.typing import NDArray
 from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
 from bevviz.model.frame import F32, Cloud
 
-MOST_POINTS = 100_000_000  # of a cloud
-MOST_FIELDS = 1024  # of a point; each element of a field counts
+MOST_POINTS = 100_000_000  # largest cloud
+MOST_FIELDS = 1024  # fields of a point; each element of a field counts
 # Metres from the cloud's origin. No sensor measures so far, and coordinates on Earth are smaller (UTM: 1e7).
 # Stages compute squares and higher powers, which do not fit into float32 for larger numbers.
 FARTHEST = 1e8
 
 _AXES = ("x", "y", "z")
-SCALARS = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    8: "f8",
-}  # by the datatype of a PointField
+# By datatype of a PointField.
+SCALARS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
-    """Points and extra fields of a sensor_msgs/PointCloud2.
+    """Decode points and further fields of a sensor_msgs/PointCloud2.
 
-    Any field types, offsets, padding and byte order; organised clouds are flattened row by row. Points
-    with a coordinate that is NaN or infinite are dropped, and so are those beyond ``FARTHEST``, those at
-    (0, 0, 0), by which drivers mean a beam without a return, and those that the header announces but cut
-    data no longer holds; all are counted in ``Cloud.dropped``. A field of several elements becomes one
-    field for each: ``name_0``, ``name_1`` ...
+    Fields may have any type, offset, padding and byte order. Organised clouds are flattened row by row. A
+    field of several elements becomes one field for each element: ``name_0``, ``name_1`` ...
+
+    These points are dropped and counted in ``Cloud.dropped``: points with a coordinate that is NaN, infinite
+    or beyond ``FARTHEST``; points at (0, 0, 0), which drivers send for beams without a return; and points
+    that the header announces but the data do not hold.
 
     Raises:
         MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
@@ -49,11 +42,13 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         )
     layout = _point_layout(msg, topic)
     grid = _point_grid(msg, layout)
-    with np.errstate(over="ignore", invalid="ignore"):  # a float64 beyond float32 is infinite, and dropped
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # float64 values beyond float32 become infinite and are dropped
         xyz = _positions(grid)
         x, y, z = xyz.T
         squared = x * x + y * y + z * z
-        usable = squared <= np.float32(FARTHEST**2)  # false for NaN and for what overflows
+        usable = squared <= np.float32(FARTHEST**2)  # false for NaN and for overflow
     if not squared.all():
         usable &= xyz.any(axis=1)
     kept = None if usable.all() else np.flatnonzero(usable)
@@ -61,7 +56,7 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
     for name in layout.fields or ():
         if name not in _AXES:
             values = grid[name].reshape(-1)
-            # Copied: a view would be unaligned, read-only, and keep the whole message in memory.
+            # A copy, because a view would be unaligned and read-only and keep the whole message in memory.
             values = values.copy() if kept is None else values.take(kept)
             fields[name] = np.asarray(values, values.dtype.newbyteorder("="))
     if kept is not None:
@@ -78,12 +73,12 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
 
 
 def _positions(grid: NDArray[np.void]) -> F32:
-    """(N, 3) coordinates of the points, a copy."""
+    """Return a copy of the (N, 3) coordinates of the points."""
     layout = grid.dtype
     assert layout.fields is not None
     formats, offsets = zip(*(layout.fields[name][:2] for name in _AXES), strict=True)
     if set(formats) == {np.dtype(np.float32)} and np.diff(offsets).tolist() == [4, 4]:
-        # Side by side, as most drivers have them, they are copied in one piece.
+        # Most drivers store x, y and z side by side: copy them in one piece.
         together = np.dtype(
             {"names": ["xyz"], "formats": ["V12"], "offsets": offsets[:1], "itemsize": layout.itemsize}
         )
@@ -95,7 +90,7 @@ def _positions(grid: NDArray[np.void]) -> F32:
 
 
 def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
-    """The structured dtype of one point; ``itemsize`` is point_step."""
+    """Return the structured dtype of a point. Its ``itemsize`` is point_step."""
     if not 0 < msg.point_step < 1 << 31:
         raise MessageError(f"{topic}: a point of {msg.point_step} bytes cannot be")
     if sum(max(int(field.count), 1) for field in msg.fields) > MOST_FIELDS:
@@ -107,7 +102,7 @@ def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
         if field.datatype not in SCALARS:
             raise MessageError(f"{topic}: field '{field.name}' has the unknown datatype {field.datatype}")
         scalar = np.dtype(order + SCALARS[field.datatype])
-        count = max(int(field.count), 1)  # old drivers leave it at 0
+        count = max(int(field.count), 1)  # old drivers send 0
         if field.offset + count * scalar.itemsize > msg.point_step:
             raise MessageError(
                 f"{topic}: field '{field.name}' ends at byte {field.offset + count * scalar.itemsize} "
@@ -133,11 +128,11 @@ def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
 
 
 def _point_grid(msg: Any, layout: np.dtype[np.void]) -> NDArray[np.void]:
-    """(rows, columns) view of the points that are whole in the data."""
+    """Return a (rows, columns) view of the points that the data hold completely."""
     data = np.frombuffer(msg.data, np.uint8)
     rows, columns, step = int(msg.height), int(msg.width), layout.itemsize
     row_bytes = columns * step
-    row_step = max(int(msg.row_step), row_bytes)  # some drivers leave it at 0
+    row_step = max(int(msg.row_step), row_bytes)  # some drivers send 0
     if row_step == row_bytes or rows == 1:
         rows, columns = 1, min(rows * columns, data.size // step)
     else:

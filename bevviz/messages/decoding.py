@@ -1,10 +1,9 @@
-"""What decoding ROS messages into arrays has in common.
+"""Common parts of the message decoders: stamps, headers, texts, and the error for unusable messages.
 
-``clouds``, ``images``, ``cameras``, ``transforms`` and ``detections`` read only attributes, never types, so
-that what rosbags deserialises and what rclpy delivers are both welcome, whichever the ROS version. They raise
-MessageError for content that contradicts itself, and any other exception for fields that are missing or
-wrong: ``guard``, which calls them, makes a MessageError of it. None takes more memory than a message of
-reasonable size asks for.
+The decoders (``clouds``, ``images``, ``camera_info``, ``transforms``, ``detections``) read attributes and
+never check types. They therefore take messages of rosbags and of rclpy, and of any ROS version. A decoder
+raises MessageError for contradictory content, and any other exception for missing or wrong fields; ``guard``
+turns that into a MessageError. No decoder takes more memory than a message of reasonable size needs.
 """
 
 from __future__ import annotations
@@ -14,20 +13,24 @@ from typing import Any
 
 from bevviz.errors import UserError
 
-LATEST = 2**63 - 1  # nanoseconds that a stamp can have
+LATEST = 2**63 - 1  # nanoseconds; the largest stamp that 64 bits hold
 
 
 class MessageError(UserError):
-    """A message that cannot be used: its topic, what is wrong with it, and what would be accepted."""
+    """Error for a message that cannot be used. It names the topic, the fault and the supported values."""
 
 
 def stamp_ns(stamp: Any) -> int:
-    """Nanoseconds of a builtin_interfaces/Time."""
+    """Return the nanoseconds of a builtin_interfaces/Time."""
     return nanoseconds(stamp.sec, stamp.nanosec)
 
 
 def nanoseconds(seconds: Any, rest: Any) -> int:
-    """Add up a stamp. Raise ValueError if it is later than any clock of 64 bits."""
+    """Convert a stamp to nanoseconds.
+
+    Raises:
+        ValueError: the stamp does not fit into 64 bits.
+    """
     found = int(seconds) * 1_000_000_000 + int(rest)
     if abs(found) > LATEST:
         raise ValueError(f"a stamp of {seconds} s is too large")
@@ -35,19 +38,20 @@ def nanoseconds(seconds: Any, rest: Any) -> int:
 
 
 def text_of(value: Any) -> str:
-    """Return a field that must be a text. Raise TypeError if it is something else."""
+    """Return a field that must be a text. Raise TypeError if it is not."""
     if not isinstance(value, str):
         raise TypeError(f"a text is a {type(value).__name__}")
     return value
 
 
 def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, str]:
-    """Stamp in nanoseconds and frame_id of a serialised message that begins with a Header.
+    """Return stamp (nanoseconds) and frame_id of a serialised message that begins with a Header.
 
     Args:
-        data: from four bytes before the stamp: the encoding of CDR, or the seq of ROS 1.
-        order: ``<`` or ``>``, of the bytes.
-        topic: for the error message.
+        data: message from four bytes before the stamp on: the encapsulation header of CDR, or the seq of ROS
+            1.
+        order: byte order, ``<`` or ``>``.
+        topic: topic of the message, for errors.
 
     Raises:
         MessageError: there is no header.
@@ -61,14 +65,15 @@ def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, 
 
 
 def frame_name(name: str) -> str:
-    return name.removeprefix("/")  # ROS 1 knew both spellings
+    """Return a frame name without the leading slash of ROS 1."""
+    return name.removeprefix("/")  # ROS 1 used both spellings
 
 
 def either(msg: Any, *names: str) -> Any:
-    """Return the first attribute that exists: message definitions differ between versions of ROS.
+    """Return the first attribute that exists, because names of fields differ between ROS versions.
 
     Raises:
-        AttributeError: there is none of them.
+        AttributeError: none of the attributes exists.
     """
     for name in names:
         if hasattr(msg, name):

@@ -1,6 +1,6 @@
-"""What a message type is made of: rosbags' definitions and those known here, else the installed package's.
+"""Definitions of message types.
 
-Else what its publisher said, see ``type_sources``.
+They come from rosbags, from bevviz, from installed packages, or from a publisher (``type_sources``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bevviz.messages.encode import typestore
 
 
 def definition(name: str) -> str | None:
-    """Of ``package/msg/Name`` and all that it contains (``ros2msg``); None: nobody knows it here."""
+    """Return the definition of ``package/msg/Name`` and the types in it (``ros2msg``); None: not known."""
     try:
         return str(store_of(name).generate_msgdef(name, ros_version=2)[0])
     except (UserError, TypesysError, KeyError):
@@ -29,10 +29,10 @@ def definition(name: str) -> str | None:
 
 @cache
 def store_of(name: str) -> Typestore:
-    """One that has ``package/msg/Name`` and all that it contains.
+    """Return a type store with ``package/msg/Name`` and the types in it.
 
     Raises:
-        UserError: it is neither among those known here nor in an installed package.
+        UserError: neither rosbags, bevviz nor an installed package defines the type.
     """
     known = typestore()
     if name in known.types:
@@ -57,18 +57,19 @@ def store_of(name: str) -> Typestore:
     return store
 
 
-_learned: dict[str, Typestore] = {}  # type -> what is known of it since a publisher was asked
+_learned: dict[str, Typestore] = {}  # type stores made from the definitions that publishers sent, by type
 
 
 def learn(name: str, sources: Mapping[str, tuple[str, str]], digest: str) -> None:
-    """What ``package/msg/Name`` is made of, from somebody who has it.
+    """Add the definition of ``package/msg/Name`` that a publisher sent.
 
     Args:
-        sources: of each type that it contains, itself among them, the encoding (``msg`` or ``idl``) and text.
-        digest: the type's hash, ``RIHS01_...``.
+        name: message type.
+        sources: encoding (``msg`` or ``idl``) and text, for the type and for each type in it.
+        digest: hash of the type, ``RIHS01_...``.
 
     Raises:
-        UserError: they are of another type, incomplete or cannot be read.
+        UserError: the sources are incomplete, cannot be read, or define another type.
     """
     store = Typestore()
     try:
@@ -86,7 +87,7 @@ def learn(name: str, sources: Mapping[str, tuple[str, str]], digest: str) -> Non
 
 
 def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:
-    """The types of an installed package's .msg file and of those that it names."""
+    """Parse the .msg file of an installed package, and those of the types in it."""
     package, _, short = name.split("/")
     for prefix in (*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix):
         path = Path(prefix, "share", package, "msg", f"{short}.msg")
@@ -103,7 +104,7 @@ def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named(field: Any) -> str | None:
-    """The message type of a field, or of its elements, as rosbags describes fields."""
+    """Return the message type of a field, or of its elements; None for basic types."""
     kind, content = field
     if kind.name == "NAME":
         return str(content)

@@ -1,4 +1,4 @@
-"""Boxes of ROS messages: what a robot has found, or what is known to be there."""
+"""Boxes in ROS messages: detections of a robot and ground truth."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from bevviz.model.frame import (
 
 
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:
-    """The image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
+    """Decode the image boxes of a vision_msgs/Detection2DArray, of ROS 1 or any version of ROS 2.
 
-    A turned box becomes the upright one around it. Boxes that are not finite, or of a negative size, are left
-    out, and told in ``unusable``.
+    A rotated box becomes the upright box around it. Boxes that are not finite or have a negative size are
+    left out and listed in ``unusable``.
     """
 
     def row(detection: Any) -> tuple[float, ...]:
         center, box = detection.bbox.center, detection.bbox
-        position = getattr(center, "position", center)  # flat up to ROS 2 Galactic
+        position = getattr(center, "position", center)  # without the position up to ROS 2 Galactic
         return position.x, position.y, center.theta, box.size_x, box.size_y
 
     def why(values: Sequence[float]) -> str:
@@ -53,10 +53,10 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
 
 
 def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
-    """The boxes of a Detection3DArray, or of another message, see ``bevviz.messages.foreign_boxes``.
+    """Decode the boxes of a Detection3DArray or of another message, see ``bevviz.messages.foreign_boxes``.
 
     Raises:
-        MessageError: they cannot be found in it.
+        MessageError: the message has no boxes that can be found.
     """
     if hasattr(msg, "detections") and not stated:
         return decode_detections_3d(msg, topic, received)
@@ -64,10 +64,10 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
 
 
 def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D:
-    """The boxes of a vision_msgs/Detection3DArray, of ROS 1 or any version of ROS 2, or of bevviz_msgs.
+    """Decode the boxes of a Detection3DArray: vision_msgs of ROS 1 or any version of ROS 2, or bevviz_msgs.
 
-    An orientation left at zero is none. Boxes that are not finite, or of a negative size, are left out, and
-    told in ``unusable``. Where the array's header states no frame, those of the detections count.
+    An orientation of zero is no rotation. Boxes that are not finite or have a negative size are left out and
+    listed in ``unusable``. If the header of the array has no frame, the frames of the detections are used.
     """
 
     def row(detection: Any) -> tuple[float, ...]:
@@ -95,7 +95,7 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
 
 
 def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
-    """What a data set says of the image, see ``encode_labels``; None: it says nothing."""
+    """Return the labels of the image, see ``encode_labels``; None if the message has none."""
     if not hasattr(msg, "image_boxes") or len(msg.truncated) != len(usable):
         return None
     return ImageLabels(
@@ -107,21 +107,28 @@ def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
 
 
 class _Rows(NamedTuple):
-    """The usable detections of a message."""
+    """Usable detections of a message, as columns."""
 
     values: F64  # (K, width)
     labels: tuple[str, ...]
     scores: F32
     ids: tuple[str, ...]
     frames: tuple[str, ...]
-    usable: Bool  # of all detections
-    unusable: tuple[str, ...]  # a sentence for each of the others
+    usable: Bool  # whether each detection is usable
+    unusable: tuple[str, ...]  # a sentence for each detection that is not
 
 
 def _rows(
     msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, why: Callable[[Sequence[float]], str]
 ) -> _Rows:
-    """Read the detections of a message; ``why`` says why the numbers of one cannot be used."""
+    """Read the detections of a message.
+
+    Args:
+        msg: message with a list ``detections``.
+        row: returns the ``width`` numbers of a detection.
+        width: how many numbers a detection has.
+        why: returns the reason why the numbers cannot be used; empty if they can.
+    """
     rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
     reasons = [why(values) for values, *_ in rows]
     unusable = [
@@ -146,16 +153,18 @@ def _frame(detection: Any) -> str:
 
 
 def _identity(detection: Any) -> str:
-    return str(getattr(detection, "id", getattr(detection, "tracking_id", "")))  # the latter up to ROS 2 Foxy
+    # Tracking_id up to ROS 2 Foxy.
+    return str(getattr(detection, "id", getattr(detection, "tracking_id", "")))
 
 
 def _hypothesis(results: Iterable[Any]) -> tuple[str, float]:
-    """Label and score of the best result.
+    """Return label and score of the best result.
 
-    Fusion nodes append the class to the hypotheses of the cluster, whose own ``cluster_<i>`` has score 1:
-    such a name counts only where there is no other.
+    Fusion nodes append the class to the results of the cluster. The cluster's own label ``cluster_<i>`` has
+    score 1. It counts only if there is no other label.
     """
-    hypotheses = [getattr(result, "hypothesis", result) for result in results]  # flat up to ROS 2 Foxy
+    # Without the hypothesis up to ROS 2 Foxy.
+    hypotheses = [getattr(result, "hypothesis", result) for result in results]
     if not hypotheses:
         return "", 0.0
     labels = [(str(either(h, "class_id", "id")), float(h.score)) for h in hypotheses]

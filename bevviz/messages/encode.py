@@ -1,4 +1,4 @@
-"""Arrays into ROS 2 messages, as objects that rosbags serialises: the other way round than ``messages``."""
+"""Encoders of arrays into ROS 2 messages, as objects that rosbags serialises."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bevviz.model.frame import (
     Intrinsics,
 )
 
-# A vision_msgs/Detection3DArray that also says what was labelled in an image, see frame.ImageLabels.
+# A vision_msgs/Detection3DArray with labels of an image, see frame.ImageLabels.
 _LABELLED = """std_msgs/Header header
 vision_msgs/Detection3D[] detections
 float32[] image_boxes
@@ -38,7 +38,7 @@ string[] unusable
 
 @cache
 def typestore() -> Typestore:
-    """The definitions of ROS 2 Jazzy, those that it lacks, and what labelled data sets say beyond."""
+    """Return the type store of ROS 2 Jazzy with the definitions that bevviz adds."""
     store = get_typestore(Stores.ROS2_JAZZY)
     vision_msgs.register(store)
     grid_map_msgs.register(store)
@@ -47,11 +47,11 @@ def typestore() -> Typestore:
     return store
 
 
-Hypotheses = Sequence[tuple[str, float]]  # class and score, the first one being the box's own
+Hypotheses = Sequence[tuple[str, float]]  # class and score; the first one is that of the box itself
 
 
 def encode_cloud(cloud: Cloud) -> Any:
-    """A sensor_msgs/PointCloud2 with the points' own fields."""
+    """Make a sensor_msgs/PointCloud2 with all fields of a cloud."""
     columns = dict(zip("xyz", cloud.xyz.T, strict=True)) | dict(cloud.fields)
     layout = np.dtype([(name, values.dtype) for name, values in columns.items()], align=True)
     points = np.zeros(len(cloud.xyz), layout)
@@ -61,13 +61,13 @@ def encode_cloud(cloud: Cloud) -> Any:
 
 
 def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Any:
-    """A sensor_msgs/PointCloud2 of (N,) points with fields of numbers, which is not copied.
+    """Make a sensor_msgs/PointCloud2 of (N,) structured points. The points are not copied.
 
     Args:
         stamp: nanoseconds.
-        frame_id: of the header.
-        points: what there is of the cloud.
-        announced: points that it says to have, where that is more: the rest counts as lost.
+        frame_id: frame of the header.
+        points: structured array with fields of numbers.
+        announced: number of points that the message states, if larger than N. The difference counts as lost.
     """
     layout, width = points.dtype, max(len(points), announced)
     fields = [
@@ -94,12 +94,12 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced
     )
 
 
-# Datatypes of a PointField.
+# Datatype of a PointField, by dtype.
 POINT_FIELD: Mapping[str, int] = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def encode_image(image: Image) -> Any:
-    """A sensor_msgs/Image in bgr8."""
+    """Make a sensor_msgs/Image in bgr8."""
     height, width = image.bgr.shape[:2]
     return make(
         "sensor_msgs/msg/Image",
@@ -114,7 +114,7 @@ def encode_image(image: Image) -> Any:
 
 
 def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str) -> Any:
-    """A sensor_msgs/CompressedImage of the bytes of a file; ``kind``: png, jpeg."""
+    """Make a sensor_msgs/CompressedImage from the bytes of a file. ``kind`` is png or jpeg."""
     return make(
         "sensor_msgs/msg/CompressedImage",
         header=_header(stamp, frame_id),
@@ -124,12 +124,12 @@ def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str
 
 
 def encode_camera_info(image: Image, intrinsics: Intrinsics) -> Any:
-    """The sensor_msgs/CameraInfo that belongs to an image."""
+    """Make the sensor_msgs/CameraInfo of an image."""
     return encode_intrinsics(image.stamp, image.frame_id, intrinsics)
 
 
 def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
-    """The same by stamp and frame."""
+    """Make a sensor_msgs/CameraInfo with a stamp and a frame."""
     k, size = intrinsics.K, (intrinsics.width, intrinsics.height)
     p = np.column_stack([k, np.zeros(3)]).reshape(-1)
     d = np.asarray(intrinsics.D, np.float64)
@@ -137,7 +137,16 @@ def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
 
 
 def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64, p: F64) -> Any:
-    """A sensor_msgs/CameraInfo of numbers that are stated; ``size``: width and height."""
+    """Make a sensor_msgs/CameraInfo.
+
+    Args:
+        header: std_msgs/Header.
+        size: width and height, pixels.
+        model: distortion model.
+        d: coefficients of the distortion model.
+        k: (9,) camera matrix, row by row.
+        p: (12,) projection matrix, row by row; zeros are written for another size.
+    """
     region = make(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
     )
@@ -165,14 +174,15 @@ def encode_boxes_3d(
     pose: F64 | None = None,
     ids: Sequence[str] = (),
 ) -> Any:
-    """A vision_msgs/Detection3DArray.
+    """Make a vision_msgs/Detection3DArray.
 
     Args:
-        stamp, frame_id: of the header.
-        boxes: in a frame of theirs.
-        results: the hypotheses of each box.
-        pose: (4, 4) frame_id from the frame of the boxes; None: it is the same.
-        ids: of each box; (): they have none.
+        stamp: nanoseconds.
+        frame_id: frame of the header.
+        boxes: boxes in a frame of their own.
+        results: hypotheses of each box.
+        pose: (4, 4) frame_id from the frame of the boxes; None: both are the same.
+        ids: id of each box; empty: the boxes have none.
     """
     turn = np.eye(4) if pose is None else pose
     about = _header(stamp, frame_id)
@@ -185,14 +195,14 @@ def encode_boxes_3d(
         half = float(yaw) / 2 if turned else 0.0
         place = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
         box = encode_box_3d(about, place, size, hypotheses, name)
-        if not turned:  # for whoever reads the message to tell
+        if not turned:  # marks an unknown orientation for readers of the message
             box.bbox.center.orientation.w = np.nan
         detections.append(box)
     return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
 
 
 def encode_box_3d(header: Any, pose: F64, size: Iterable[float], results: Hypotheses, name: str = "") -> Any:
-    """A vision_msgs/Detection3D; ``pose``: (4, 4) the header's frame from the box."""
+    """Make a vision_msgs/Detection3D. ``pose`` is (4, 4), the header's frame from the box."""
     place = _pose(pose)
     box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
     return make(
@@ -209,9 +219,18 @@ def encode_labels(
     image: ImageLabels | None = None,
     unusable: Sequence[str] = (),
 ) -> Any:
-    """What somebody has labelled: a vision_msgs/Detection3DArray, with ``image`` one of bevviz_msgs.
+    """Make a message of labelled boxes.
 
-    ``unusable``: a sentence for each label that was left out, with ``image``.
+    It is a Detection3DArray of vision_msgs, or of bevviz_msgs if there is an ``image``.
+
+    Args:
+        stamp: nanoseconds.
+        frame_id: frame of the header.
+        boxes: labelled boxes.
+        labels: class of each box.
+        ids: id of each box; empty: the boxes have none.
+        image: labels in the image; None: there are none.
+        unusable: a sentence for each label that was left out. It is written only with an ``image``.
     """
     results = [[(label, 1.0)] for label in labels]
     message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
@@ -232,9 +251,19 @@ def encode_labels(
 def encode_markers(
     stamp: int, frame_id: str, boxes: Boxes3D, velocity: F32, ids: I64, texts: Iterable[str], pose: F64 | None
 ) -> Any:
-    """A visualization_msgs/MarkerArray: of each box a cube, its way within a second, and its text.
+    """Make a visualization_msgs/MarkerArray.
 
-    They go by themselves where no others follow. Arguments as of ``encode_boxes_3d``; velocity: (N, 3) m/s.
+    Each box becomes a cube, an arrow for its way in one second, and a text. The markers expire by themselves
+    after half a second.
+
+    Args:
+        stamp: nanoseconds.
+        frame_id: frame of the header.
+        boxes: boxes in a frame of their own.
+        velocity: (N, 3) m/s.
+        ids: number of each box, for its colour and its marker.
+        texts: text of each box.
+        pose: (4, 4) frame_id from the frame of the boxes; None: both are the same.
     """
     turn, markers = np.eye(4) if pose is None else pose, []
     about = _header(stamp, frame_id)
@@ -287,12 +316,12 @@ def encode_markers(
 
 
 def _hue(number: int) -> tuple[float, float, float]:
-    """Colours of neighbouring numbers are far apart."""
+    """Return a colour. Consecutive numbers get colours that differ strongly."""
     return colorsys.hsv_to_rgb(number * 0.618034 % 1, 0.6, 1.0)
 
 
 def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypotheses]) -> Any:
-    """A vision_msgs/Detection2DArray; ``results`` has the hypotheses of each box."""
+    """Make a vision_msgs/Detection2DArray. ``results`` are the hypotheses of each box."""
     about, nowhere = _header(stamp, frame_id), _pose(np.eye(4))
     detections = []
     for (x0, y0, x1, y1), hypotheses in zip(xyxy.tolist(), results, strict=True):
@@ -328,12 +357,12 @@ def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
 
 
 def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
-    """A tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
+    """Make a tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
     return encode_pose_edges((_header(stamp, parent), child, pose) for parent, child, pose in edges)
 
 
 def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
-    """The same of (header, child, header.frame_id from child)."""
+    """Make a tf2_msgs/TFMessage of (header, child, header.frame_id from child)."""
     transforms = [
         make(
             "geometry_msgs/msg/TransformStamped",
@@ -353,7 +382,7 @@ def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
 def encode_odometry(
     stamp: int, parent: str, child: str, parent_from_child: F64, later: F64, dt: float
 ) -> Any:
-    """A nav_msgs/Odometry, its velocities being those of the way to the pose ``dt`` seconds later."""
+    """Make a nav_msgs/Odometry. Its velocities lead to the pose ``later``, which is ``dt`` seconds later."""
     step = geometry.inverse(parent_from_child) @ later
     turn = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
     twist = make(
@@ -375,7 +404,7 @@ def encode_odometry(
 
 
 def make(kind: str, **values: Any) -> Any:
-    """A message of a type that ``typestore`` has."""
+    """Make a message of a type in ``typestore``."""
     return typestore().types[kind](**values)
 
 

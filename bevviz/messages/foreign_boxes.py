@@ -1,7 +1,4 @@
-"""Boxes in messages other than vision_msgs': Autoware's, radars', markers, and private ones by stated fields.
-
-What a message is made of is read from the bag; here are only the names of the fields, as paths of attributes.
-"""
+"""Boxes in messages other than vision_msgs': Autoware's, radars', markers, and types of the user."""
 
 from __future__ import annotations
 
@@ -21,22 +18,35 @@ from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D
 
 T = TypeVar("T")
 
-CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # of visualization_msgs/Marker
-POLYGON = 2  # of Autoware's Shape
-LARGEST = 1e9  # metres of a coordinate or size; what is larger is no number that anybody has measured
-LEAN = math.radians(1)  # a box that leans by less is upright
+CUBE, CYLINDER, TEXT, ADD = 1, 3, 9, 0  # values of visualization_msgs/Marker
+POLYGON = 2  # value of Autoware's Shape
+LARGEST = 1e9  # metres; no measured coordinate or size is larger
+LEAN = math.radians(1)  # radians; a box that leans less is upright
 
 
 @dataclass(frozen=True, slots=True)
 class Fields:
-    """Where things are in a message: paths ``a.b.c``, with ``|`` between names that versions differ in."""
+    """Paths of the fields that describe a box.
 
-    objects: str = ""  # the list, in the message; "": the message's only list of messages
-    center: str = "pose.position"  # with x, y, z
-    size: str = "size"  # with x, y, z, or three numbers: lengths along the box's own axes
-    orientation: str = ""  # quaternion; "": what is beside the centre, else none
-    yaw: str = ""  # radians, instead
-    label: str = ""  # a text, or a number that the definition names
+    A path is ``a.b.c``. ``|`` separates names of different versions.
+
+    Attributes:
+        objects: list of objects in the message; empty: the message's only list of messages.
+        center: centre, with x, y and z.
+        size: lengths along the box's axes, with x, y and z, or as three numbers.
+        orientation: quaternion; empty: the field ``orientation`` beside the centre, or no rotation.
+        yaw: rotation about z in radians, in place of the quaternion.
+        label: text, or a number that is a constant of the message definition.
+        score: score of the box.
+        id: identity of the box.
+    """
+
+    objects: str = ""
+    center: str = "pose.position"
+    size: str = "size"
+    orientation: str = ""
+    yaw: str = ""
+    label: str = ""
     score: str = ""
     id: str = ""
 
@@ -56,15 +66,15 @@ TYPES = re.compile(
 
 
 def holds_boxes(msgtype: str) -> bool:
-    """Whether the boxes in a message of that type are known."""
+    """Return whether the fields of a message type's boxes are known."""
     return TYPES.search(msgtype) is not None
 
 
 def check(stated: Mapping[str, str]) -> None:
-    """Of ``source.boxes``.
+    """Check the setting ``source.boxes``.
 
     Raises:
-        UserError: a name that is none, or something is missing.
+        UserError: a key is unknown, or the topic is missing.
     """
     known = ["topic", *(field.name for field in fields(Fields))]
     for name in stated:
@@ -77,18 +87,20 @@ def check(stated: Mapping[str, str]) -> None:
 
 
 def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:
-    """The boxes of a message that is no Detection3DArray.
+    """Decode the boxes of a message that is no Detection3DArray.
 
-    Of markers, each CUBE or CYLINDER that is added is a box; its label is the text of a TEXT_VIEW_FACING
-    marker with the same id, in its namespace or in one that has no boxes, else its namespace.
+    In a MarkerArray each added CUBE or CYLINDER is a box. Its label is the text of a TEXT_VIEW_FACING marker
+    with the same id, in the same namespace or in a namespace without boxes. Without such a marker the
+    namespace is the label.
 
     Args:
-        msg: with a header, or objects that have one.
-        topic, received: for the result.
-        stated: ``source.boxes`` where it is of this topic; empty: known kinds alone.
+        msg: message that has a header, or objects that have one.
+        topic: topic of the message.
+        received: time of receipt, nanoseconds.
+        stated: ``source.boxes`` if it is for this topic; empty: only known types are decoded.
 
     Raises:
-        ValueError: a field is missing; which, and what there is.
+        ValueError: a field is missing. The error lists the fields that exist.
     """
     paths = {name: path for name, path in stated.items() if name != "topic"}
     if hasattr(msg, "markers") and not paths:
@@ -118,7 +130,7 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
 
 
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
-    """Centre, size and quaternion."""
+    """Return centre, size and quaternion of an object."""
     holder, _ = _follow(item, where.center)
     x, y, z = _read(_vector, item, where.center)
     turn = 0.0, 0.0, 0.0, 1.0
@@ -133,7 +145,7 @@ def _row(item: Any, where: Fields) -> tuple[float, ...]:
     shape = getattr(item, "shape", None)
     if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
         outline = np.array([(p.x, p.y) for p in shape.footprint.points], np.float64).reshape(-1, 2)
-        if len(outline):  # in the object's own axes
+        if len(outline):  # in the axes of the object
             low, high = outline.min(axis=0), outline.max(axis=0)
             (length, width), (dx, dy) = (high - low).tolist(), ((low + high) / 2).tolist()
             yaw = float(_yaw(np.array(turn)))
@@ -174,7 +186,7 @@ def _boxes(
     ids: list[str],
     unusable: list[str],
 ) -> LabelledBoxes3D:
-    """``headers``: of each row; the first one's stamp counts."""
+    """Make the result of columns. The stamp is that of the first header."""
     boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
     header = next(iter(headers), None)
     stamp = received if header is None else stamp_ns(header.stamp)
@@ -195,9 +207,9 @@ def _boxes(
 
 
 def why_unusable(row: Sequence[float]) -> str:
-    """Say what is wrong with the centre, size and quaternion of a box; empty: it can be used."""
+    """Return why centre, size and quaternion of a box cannot be used; empty if they can."""
     for name, values in (("centre", row[:3]), ("size", row[3:6]), ("orientation", row[6:])):
-        if not all(abs(value) < LARGEST for value in values):  # NaN is not, either
+        if not all(abs(value) < LARGEST for value in values):  # false for NaN, too
             return f"its {name} is not finite: {_numbers(values)}"
     if min(row[3:6]) < 0:
         return f"its size is negative: {_numbers(row[3:6])}"
@@ -205,7 +217,7 @@ def why_unusable(row: Sequence[float]) -> str:
 
 
 def name_box(number: int, label: str, identity: str) -> str:
-    """Name a box of a message: ``box 3 (Car, id 17)``; numbers count from 0."""
+    """Return a name for a box of a message: ``box 3 (Car, id 17)``. Numbers count from 0."""
     words = [label, f"id {identity}" if identity else ""]
     about = ", ".join(filter(None, words))
     return f"box {number}{f' ({about})' if about else ''}"
@@ -216,9 +228,9 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:
-    """Boxes of (K, 10) centre, size and quaternion, and the quaternions where some of them lean.
+    """Convert (K, 10) centres, sizes and quaternions to boxes. Return the quaternions, too, if a box leans.
 
-    A quaternion left at zero is no turn.
+    A quaternion of zero is no rotation.
     """
     turns = values[:, 6:].copy()
     turns[~turns.any(axis=1)] = 0, 0, 0, 1
@@ -232,7 +244,10 @@ def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:
 
 
 def _follow(item: Any, path: str) -> tuple[Any, Any]:
-    """What has the last attribute of a path, and its value; of a list the likeliest is followed."""
+    """Follow a path. Return the object that holds its last attribute, and the attribute's value.
+
+    Within a list the object with the highest probability or score is followed.
+    """
     holder, value = item, item
     for name in path.split("."):
         holder = _likeliest(value)
@@ -246,10 +261,10 @@ def _follow(item: Any, path: str) -> tuple[Any, Any]:
 
 
 def _read(kind: Callable[[Any], T], item: Any, path: str) -> T:
-    """Return the field at a path as what it must be.
+    """Return the field at a path, converted by ``kind``.
 
     Raises:
-        ValueError: it is not there, or something else.
+        ValueError: the field does not exist or cannot be converted.
     """
     value = _follow(item, path)[1]
     try:
@@ -295,16 +310,16 @@ def _quaternion(q: Any) -> tuple[float, float, float, float]:
 
 
 def _yaw(turns: F64) -> F64:
-    """(...) turns about z of (..., 4) quaternions xyzw of any length; one of zero is none."""
+    """Return the (...) rotations about z of (..., 4) quaternions xyzw of any length; 0 for a zero one."""
     x, y, z, w = np.moveaxis(turns, -1, 0)
     yaw: F64 = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
     return yaw
 
 
 def _label(item: Any, path: str) -> str:
-    """A text as it is; a number by the constant of that value beside the field, in lower case."""
+    """Return a text as it is, and a number as the name of its constant in the definition, in lower case."""
     if not _has(item, path):
-        return ""  # of a list of classes that is empty
+        return ""  # the list of classes is empty
     holder, value = _follow(item, path)
     if not isinstance(value, int | np.integer):
         return str(value)

@@ -1,6 +1,6 @@
-"""Foxglove's messages, in protobuf, JSON or ROS, as the ROS messages that they stand for.
+"""Conversion of Foxglove's messages (protobuf, JSON or ROS) to ROS messages.
 
-What a protobuf message is made of is in the file; here are the names of fields alone
+A bag contains the schema of protobuf messages. Only field names are defined here
 (https://docs.foxglove.dev/docs/visualization/message-schemas).
 """
 
@@ -24,7 +24,7 @@ from bevviz.model.frame import F64, U8
 
 ENCODINGS = ("protobuf", "json")
 TYPE = re.compile(r"^foxglove(?:_msgs)?[./](?:msg/)?(\w+)$")
-KINDS = {  # what each is read as
+KINDS = {  # kind of ROS message by Foxglove's type
     "PointCloud": "PointCloud2",
     "CompressedImage": "CompressedImage",
     "CompressedVideo": "CompressedVideo",
@@ -34,30 +34,32 @@ KINDS = {  # what each is read as
     "FrameTransforms": "TFMessage",
     "SceneUpdate": "Detection3DArray",
 }
-_POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # to PointField's: uint8 to float64
+# Datatype of a PointField by Foxglove's type: uint8 to float64.
+_POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 _AXES = ["x", "y", "z"]
 _FLOATS = {7: "<f4", 8: "<f8"}
-_LABELS = ("category", "label", "class", "class_name", "type", "name")  # of metadata, the first that is there
+# Keys of metadata; the first that exists is the class.
+_LABELS = ("category", "label", "class", "class_name", "type", "name")
 _MODELS = {"kannala_brandt": "equidistant"}
 
 
 def short_of(msgtype: str) -> str:
-    """``PointCloud`` of ``foxglove.PointCloud`` and of ``foxglove_msgs/msg/PointCloud``; else empty."""
+    """Return ``PointCloud`` for ``foxglove.PointCloud`` and ``foxglove_msgs/msg/PointCloud``; else ""."""
     found = TYPE.match(msgtype)
     return found.group(1) if found and found.group(1) in KINDS else ""
 
 
 def parse(data: bytes | memoryview, msgtype: str, encoding: str, schema: str) -> Any:
-    """A serialised message as an object with its fields.
+    """Parse a serialised message into an object with its fields.
 
     Args:
-        data: the message.
-        msgtype: ``foxglove.PointCloud``.
+        data: serialised message.
+        msgtype: message type, such as ``foxglove.PointCloud``.
         encoding: protobuf or json.
-        schema: of protobuf, the FileDescriptorSet, a character for each byte.
+        schema: FileDescriptorSet of protobuf, one character for each byte.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the data cannot be parsed.
     """
     if encoding == "json":
         return json.loads(bytes(data), object_hook=_Fields)
@@ -79,7 +81,7 @@ def _message_class(msgtype: str, schema: str) -> Callable[[], Any]:
 
 
 def _in_order(files: Iterable[Any]) -> list[Any]:
-    """Each behind those that it needs."""
+    """Sort files so that each comes after the files that it needs."""
     waiting = {file.name: file for file in files}
     ordered: list[Any] = []
     while waiting:
@@ -93,7 +95,7 @@ def _in_order(files: Iterable[Any]) -> list[Any]:
 
 
 class _Fields(SimpleNamespace):
-    """A JSON object; what is left out is None, as protobuf's defaults are."""
+    """Object of JSON. A missing field is None."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(**values)
@@ -103,16 +105,16 @@ class _Fields(SimpleNamespace):
 
 
 def as_ros(message: Any, msgtype: str) -> Any:
-    """The ROS message that a message of Foxglove's stands for.
+    """Convert a message of Foxglove to the ROS message of the same meaning.
 
     Raises:
-        ValueError: it lacks what that needs.
+        ValueError: a field that the ROS message needs is missing or wrong.
     """
     return _CONVERT[short_of(msgtype)](message)
 
 
 def header(message: Any, msgtype: str) -> tuple[int, str]:
-    """Stamp in nanoseconds and frame_id; of several, those of the first."""
+    """Return stamp (nanoseconds) and frame_id; those of the first part if the message has several."""
     kind = short_of(msgtype)
     if kind in ("FrameTransforms", "SceneUpdate"):
         first = next(
@@ -138,7 +140,7 @@ def _stamp(message: Any) -> int:
 
 
 def _first(message: Any, *names: str) -> Any:
-    """The first of these fields that there is."""
+    """Return the first of these fields that exists."""
     return next((v for n in names if (v := getattr(message, n, None)) is not None), None)
 
 
@@ -146,7 +148,7 @@ def _data(message: Any) -> bytes:
     data = message.data
     if data is None:
         return b""
-    if isinstance(data, int | float):  # of which bytes() would make as many zeros
+    if isinstance(data, int | float):  # bytes() of a number would allocate that many zeros
         raise ValueError(f"the field 'data' is the number {data}")
     return base64.b64decode(data) if isinstance(data, str) else bytes(data)
 
@@ -189,7 +191,7 @@ def _cloud(message: Any) -> Any:
 
 
 def _moved(data: U8, step: int, fields: Iterable[Any], pose: F64) -> U8:
-    """Points of so many bytes, their coordinates turned into the frame of the message."""
+    """Transform points of ``step`` bytes into the frame of the message."""
     at = {field.name: field for field in fields if field.name in _AXES and field.datatype in _FLOATS}
     if len(at) < len(_AXES):
         raise ValueError("a cloud with a pose needs x, y and z as floats")
@@ -242,7 +244,7 @@ def _calibration(message: Any) -> Any:
 
 
 def _matrix_of(message: Any, name: str) -> F64:
-    """The numbers of a field that ROS 2 spells in lower case."""
+    """Return the numbers of a field, which the ROS definition spells in lower case."""
     return np.array(_first(message, name, name.lower()) or [], np.float64)
 
 
@@ -258,7 +260,7 @@ def _transforms(message: Any) -> Any:
 
 
 def _scene(message: Any) -> Any:
-    """Boxes: cubes, and cylinders by what encloses them; each in the frame of its entity."""
+    """Convert cubes and cylinders to boxes in the frame of their entity. Boxes enclose the cylinders."""
     found = []
     for entity in message.entities or ():
         for solid in (*(entity.cubes or ()), *(entity.cylinders or ())):
@@ -271,14 +273,14 @@ def _scene(message: Any) -> Any:
 
 
 def _label(entity: Any) -> str:
-    """What the metadata say, else the first text, else nothing."""
+    """Return the class in the metadata of an entity; else its first text; else an empty text."""
     stated = {str(pair.key).lower(): str(pair.value) for pair in entity.metadata or ()}
     told = next((stated[name] for name in _LABELS if name in stated), "")
     return told or next((str(text.text) for text in entity.texts or ()), "")
 
 
 def _given(message: Any, name: str) -> bool:
-    """Whether a field that is a message itself was set."""
+    """Return whether a field that is a message was set."""
     if isinstance(message, _Fields) or not hasattr(message, "HasField"):
         return getattr(message, name, None) is not None
     return bool(message.HasField(name))
@@ -295,7 +297,7 @@ def _pose_of(position: Any, orientation: Any) -> F64:
 
 
 def _numbers(message: Any, names: str) -> list[float]:
-    """The fields of a message; 0 where they, or all of it, are left out."""
+    """Return fields of a message as numbers; 0 for a field or a message that is missing."""
     return [_number(message, name, float) for name in names]
 
 
@@ -304,7 +306,7 @@ def _whole(message: Any, name: str) -> int:
 
 
 def _number(message: Any, name: str, kind: Callable[[Any], float]) -> float:
-    """Return a field as a number; 0 if the field, or the message, is left out."""
+    """Return a field as a number; 0 if the field or the message is missing."""
     value = (None if message is None else getattr(message, name)) or 0
     try:
         return kind(value)

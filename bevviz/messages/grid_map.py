@@ -1,4 +1,4 @@
-"""Maps with layers around a robot (grid_map_msgs), as surfaces."""
+"""Grid maps with layers (grid_map_msgs) as surfaces."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from bevviz.messages.decoding import MessageError
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Surface
 
-HEIGHT = "elevation"  # layer
-LARGEST = 250_000  # cells that are shown; of a larger map every n-th row and column
+HEIGHT = "elevation"  # name of the layer with heights
+LARGEST = 250_000  # cells that are shown; larger maps are reduced to every n-th row and column
 
 
 def decode_grid_map(msg: Any, pose: F64, topic: str) -> Surface | None:
-    """The layer ``elevation`` as heights, else the first one, which may be no height, as colours of a plane.
+    """Decode a layer of a map: ``elevation`` as heights, or the first layer as colours of a plane.
 
-    Rows of a layer go against x and columns against y, from the corner where both are greatest; both begin
-    anywhere, as the map moves with its robot in a ring (https://github.com/ANYbotics/grid_map).
+    Rows of a layer run against x and columns against y, from the corner where both are greatest. The map is a
+    ring buffer in both directions, because it moves with the robot (https://github.com/ANYbotics/grid_map).
 
     Args:
         msg: a grid_map_msgs/GridMap.
         pose: (4, 4) frame of the map from its centre.
-        topic: for errors.
+        topic: topic of the message, for errors.
 
     Returns:
-        None: no cell is known.
+        The surface; None if no cell is known.
 
     Raises:
-        MessageError: it contradicts itself.
+        MessageError: the message contradicts itself.
     """
     if not msg.layers or len(msg.layers) != len(msg.data):
         raise MessageError(f"{topic}: {len(msg.layers)} names of {len(msg.data)} layers")
@@ -49,7 +49,7 @@ def decode_grid_map(msg: Any, pose: F64, topic: str) -> Surface | None:
 
 
 def _layer(array: Any, what: str) -> F32:
-    """(rows, columns), as Eigen's matrix has them, which is stored by columns unless it says otherwise."""
+    """Return the (rows, columns) of a layer. Eigen stores them by columns unless the layer says otherwise."""
     values, dims = np.asarray(array.data, np.float32), array.layout.dim
     if len(dims) != 2 or dims[0].size * dims[1].size != len(values) - array.layout.data_offset:
         sizes = " x ".join(str(dim.size) for dim in dims)

@@ -1,4 +1,4 @@
-"""Definitions of grid_map_msgs (ROS 2 Humble to Jazzy), which rosbags' type stores lack."""
+"""Definitions of grid_map_msgs (ROS 2 Humble to Jazzy), which rosbags lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place where messages are handed to decoders: whatever a decoder raises becomes a MessageError."""
+"""Guard around all decoders: it turns the exceptions of a decoder into a MessageError."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bevviz.messages.decoding import MessageError
 from bevviz.messages.encode import typestore
 from bevviz.support.loggers import logger
 
-NO_FIELD = "structure_needs_at_least_one_member"  # as ROS calls the byte of an empty message
+NO_FIELD = "structure_needs_at_least_one_member"  # ROS's name for the byte of an empty message
 _log = logger(__name__)
 
 C = TypeVar("C")
@@ -25,13 +25,17 @@ R = TypeVar("R")
 
 
 class TypedMessage(Protocol):
-    """What an error says of a message."""
+    """Topic and type of a message, for errors."""
 
     @property
-    def topic(self) -> str: ...
+    def topic(self) -> str:
+        """Topic of the message."""
+        ...
 
     @property
-    def type(self) -> str: ...
+    def type(self) -> str:
+        """Type of the message."""
+        ...
 
 
 def guard(
@@ -41,18 +45,19 @@ def guard(
     *args: P.args,
     **kwargs: P.kwargs,
 ) -> R:
-    """Return ``decoder(content, ...)``, for a message that may hold anything, even other fields.
+    """Return ``decoder(content, ...)``. The content may be anything, even a message with other fields.
 
     Args:
         message: names the topic and the type in the error.
-        decoder: turns the content into something of ours.
+        decoder: decodes the content.
         content: the message, serialised or as an object with its fields.
-        args, kwargs: further arguments of the decoder.
+        *args: further arguments of the decoder.
+        **kwargs: further keyword arguments of the decoder.
 
     Raises:
-        MessageError: the decoder has raised any exception. The error names the topic, the type and, where
-            that can be told, the field that is missing or wrong.
-        UserError: the decoder has raised this one.
+        MessageError: the decoder raised an exception. The error names the topic, the type and, if it can be
+            found, the field that is missing or wrong.
+        UserError: the decoder raised it.
     """
     try:
         return decoder(content, *args, **kwargs)
@@ -92,7 +97,7 @@ def decode_message(
 
 
 def _reason(error: Exception, content: Any, msgtype: str) -> str:
-    """Say what is wrong with the content of a message, in a few words."""
+    """Describe the fault in the content of a message, in a few words."""
     if isinstance(error, AttributeError) and (names := field_names(error.obj)) is not None:
         there = ", ".join(names) or "none"
         part = "it" if error.obj is content else f"a {_type_of(error.obj) or 'message'} in it"
@@ -107,7 +112,7 @@ def field_names(content: Any) -> list[str] | None:
     """Return the field names of a message of rosbags, rclpy or protobuf; None for any other object."""
     if (descriptor := getattr(content, "DESCRIPTOR", None)) is not None:
         return [field.name for field in descriptor.fields]
-    if is_dataclass(content):  # of rosbags, which has constants as fields with a default
+    if is_dataclass(content):  # rosbags' classes have constants as fields with a default
         return [
             field.name for field in fields(content) if field.default is MISSING and field.name != NO_FIELD
         ]
@@ -121,13 +126,13 @@ def _type_of(content: Any) -> str:
     return str(getattr(content, "__msgtype__", "") or getattr(descriptor, "full_name", ""))
 
 
-# --- fields that are not as ROS defines them ---------------------------------------------------
+# --- fields that differ from their definition ---------------------------------------------------
 
 
 def _wrong_fields(content: Any, msgtype: str, path: str) -> Iterator[str]:
-    """Compare a message with the definition that is known here. Yield a sentence for each difference.
+    """Compare a message with the known definition of its type. Yield a sentence for each difference.
 
-    A field that the definition does not have is none. ROS 1 spells some fields in upper case.
+    Additional fields are no difference. ROS 1 spells some fields in upper case.
     """
     definition = typestore().fielddefs.get(msgtype)
     if definition is None or field_names(content) is None:
@@ -141,7 +146,7 @@ def _wrong_fields(content: Any, msgtype: str, path: str) -> Iterator[str]:
 
 
 def _wrong_values(values: Iterable[Any], kind: tuple[Any, Any], path: str) -> Iterator[str]:
-    """Do the same for the values of a field."""
+    """Compare the values of a field with its type. Yield a sentence for each difference."""
     node, about = kind
     for value in values:
         if node == Nodetype.NAME:
@@ -166,7 +171,7 @@ def _name_of(kind: tuple[Any, Any]) -> str:
 
 
 def _is_base(value: Any, name: str) -> bool:
-    """Whether a value can be one of a basic type of ROS."""
+    """Return whether a value can be one of a basic type of ROS."""
     if name in ("string", "wstring"):
         return isinstance(value, str)
     if name.startswith("float"):
@@ -175,7 +180,7 @@ def _is_base(value: Any, name: str) -> bool:
 
 
 def kind_of(value: Any) -> str:
-    """Name the kind of a value, for the middle of a sentence."""
+    """Return the name of a value's kind, for the middle of a sentence."""
     if field_names(value) is not None:
         return f"a {_type_of(value) or 'message'}"
     if isinstance(value, bool | np.bool_):

@@ -15,14 +15,14 @@ from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
 from bevviz.messages.topics import VIDEO
 from bevviz.model.frame import U8, Image
 
-MOST_PIXELS = 100_000_000  # of an image
+MOST_PIXELS = 100_000_000  # largest image
 
 
 class _Encoding(NamedTuple):
-    to_bgr: int | None  # OpenCV's conversion
+    to_bgr: int | None  # conversion code of OpenCV; None: it is BGR already
     channels: int = 1
     scalar: str = "u1"
-    rows: float = 1.0  # rows of data for each row of pixels
+    rows: float = 1.0  # rows of data per row of pixels
 
 
 _ENCODINGS: Mapping[str, _Encoding] = {
@@ -54,12 +54,13 @@ _ENCODINGS: Mapping[str, _Encoding] = {
 
 
 def decode_image(msg: Any, topic: str, received: int) -> Image:
-    """A sensor_msgs/Image as BGR; bgr8 without row padding is a view of the message's data.
+    """Decode a sensor_msgs/Image to BGR. bgr8 without row padding is a view of the message's data.
 
-    Images of 16 bits are reduced to 8 as ``to_8_bits`` says.
+    Images of 16 bits are reduced to 8 bits, see ``to_8_bits``.
 
     Raises:
-        MessageError: unknown encoding, no pixels, or less data than the size asks for.
+        MessageError: the encoding is not supported, the image has no pixels, or it has fewer data than its
+            size needs.
     """
     encoding = _ENCODINGS.get(msg.encoding)
     if encoding is None:
@@ -101,10 +102,10 @@ def decode_image(msg: Any, topic: str, received: int) -> Image:
 
 
 def to_8_bits(pixels: NDArray[np.uint16]) -> U8:
-    """16 bit pixels as 8 bit ones, by the bit depth that the brightest pixel asks for.
+    """Scale 16 bit pixels to 8 bits, by the bit depth that the brightest pixel needs.
 
-    Sensors of 10, 12 and 14 bits are published in 16, mostly unshifted: the full scale is taken as the
-    smallest of 8, 10, 12, 14 and 16 bits that holds every pixel.
+    Images of sensors with 10, 12 and 14 bits are published with 16 bits, mostly not shifted. The full scale
+    is the smallest of 8, 10, 12, 14 and 16 bits that holds every pixel.
     """
     brightest = int(pixels.max())
     depth = next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
@@ -112,26 +113,26 @@ def to_8_bits(pixels: NDArray[np.uint16]) -> U8:
     return scaled
 
 
-_MEDIA_TYPES = {  # by what the data begins with
+_MEDIA_TYPES = {  # by the first bytes
     "image/jpeg": re.compile(rb"\xff\xd8\xff"),
     "image/png": re.compile(rb"\x89PNG\r\n\x1a\n"),
     "image/webp": re.compile(rb"RIFF.{4}WEBP", re.DOTALL),
 }
-# Compressed as it is, by compressed_image_transport; "mono8" or "bgr8" behind it say what was made of it.
+# Raw Bayer pixels that compressed_image_transport compressed. A following "mono8" or "bgr8" names its result.
 _MOSAIC = re.compile(r"(bayer_(?:rggb|bggr|gbrg|grbg)(?:8|16)); \w+ compressed\s*$")
-_ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # what every unit of an H.264 or H.265 stream begins with
+_ANNEX_B = (b"\0\0\0\1", b"\0\0\1")  # start code of every unit of an H.264 or H.265 stream
 
 
 def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
-    """A JPEG, PNG or WebP in a sensor_msgs/CompressedImage, decoded.
+    """Decode a JPEG, PNG or WebP in a sensor_msgs/CompressedImage.
 
-    The kind is taken from the data, as the format field has many spellings. The encoded bytes are kept
-    beside, untouched, but of WebP, which Rerun does not read, of a PNG of 16 bits: it is reduced as
-    ``to_8_bits`` says, and would look different, and of a colour sensor's raw pixels (bayer).
+    The data tell the kind, because the format field has many spellings. The encoded bytes are kept unless
+    Rerun cannot show them: WebP; PNG of 16 bits, which would look different from the image that ``to_8_bits``
+    scaled; and the raw pixels of a colour sensor (Bayer).
 
     Raises:
-        MessageError: depth images, other kinds, data that is damaged or cut, and more than ``MOST_PIXELS``
-            pixels, which is known before they are decoded.
+        MessageError: the image is a depth image, of another kind, damaged, cut, or larger than
+            ``MOST_PIXELS``. The size is checked before the pixels are decoded.
     """
     if "compressedDepth" in msg.format:
         raise MessageError(f"{topic}: '{msg.format}' is a depth image; choose a topic with colour images")
@@ -152,8 +153,8 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
         )
     cut = not width or not height
     if media_type == "image/jpeg" and encoded.rfind(b"\xff\xd9") < 0:
-        cut = True  # decoders would fill the rest with grey
-    # Orientation: the calibration belongs to the pixels as they are stored, not as EXIF would turn them.
+        cut = True  # OpenCV would fill the missing part with grey
+    # EXIF's orientation is ignored: the calibration is for the pixels as they are stored.
     mosaic = _MOSAIC.match(msg.format)
     demosaic = _ENCODINGS[mosaic[1]].to_bgr if mosaic else None
     channels = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
@@ -181,12 +182,12 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
 
 
 def _size_of(encoded: bytes) -> tuple[int, int]:
-    """Width and height in the header of a PNG, JPEG or WebP; 0 where there is none, or the data is cut."""
+    """Return width and height from the header of a PNG, JPEG or WebP; 0 if the header is missing or cut."""
     if encoded.startswith(b"RIFF"):
         return _size_of_webp(encoded)
     if encoded.startswith(b"\x89PNG"):
         at = 8
-        while encoded[at + 4 : at + 8] != b"IEND":  # a decoder makes room for a part before it reads it
+        while encoded[at + 4 : at + 8] != b"IEND":  # a decoder allocates a chunk before it reads it
             at += 12 + int.from_bytes(encoded[at : at + 4], "big")
             if at + 8 > len(encoded):
                 return 0, 0
@@ -194,7 +195,7 @@ def _size_of(encoded: bytes) -> tuple[int, int]:
     at = 2
     while at + 9 <= len(encoded):
         marker, size = encoded[at + 1], int.from_bytes(encoded[at + 2 : at + 4], "big")
-        if encoded[at] != 0xFF or marker == 0xFF:  # between segments there may be anything
+        if encoded[at] != 0xFF or marker == 0xFF:  # any bytes may stand between segments
             at += 1
         elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
             height, width = struct.unpack_from(">HH", encoded, at + 5)
@@ -207,11 +208,11 @@ def _size_of(encoded: bytes) -> tuple[int, int]:
 
 
 def _size_of_webp(encoded: bytes) -> tuple[int, int]:
-    """As RFC 9649 has it."""
+    """Return width and height from the header of a WebP (RFC 9649)."""
     if len(encoded) < max(30, 8 + int.from_bytes(encoded[4:8], "little")):
         return 0, 0
     first, bits = encoded[12:16], int.from_bytes(encoded[21:25], "little")
-    if first == b"VP8X":  # with alpha, a profile or several pictures
+    if first == b"VP8X":  # with alpha, a colour profile or several pictures
         return 1 + int.from_bytes(encoded[24:27], "little"), 1 + int.from_bytes(encoded[27:30], "little")
     if first == b"VP8L":  # lossless
         return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)

@@ -1,4 +1,4 @@
-"""A robot's description (URDF): its links as simple solids, and the meshes whose files are here."""
+"""Robot descriptions (URDF) as simple solids, with the meshes that are on this machine."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from bevviz.messages.decoding import MessageError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, MeshFile, Shape, Solids
 
-JOINT = 0.02  # metres, half of the mark of a link that has no simple geometry
+JOINT = 0.02  # metres; half of the size of the mark for a link without simple geometry
 
 
-MESHES = {".stl", ".dae", ".obj", ".glb", ".gltf", ".ply"}  # files that a viewer can show
-LARGEST = 50_000_000  # bytes of one
+MESHES = {".stl", ".dae", ".obj", ".glb", ".gltf", ".ply"}  # formats that the viewer shows
+LARGEST = 50_000_000  # bytes of the largest mesh
 
 
 def links(text: str, topic: str) -> Iterator[Shape]:
-    """Every link of a URDF where the transforms have it: its solids and meshes, or a small mark.
+    """Yield the solids and meshes of each link of a URDF; a small mark for a link without both.
 
-    See http://wiki.ros.org/urdf/XML/link. A mesh is a file of the robot's,
-    and is shown where it is found here.
+    See http://wiki.ros.org/urdf/XML/link. Meshes are files of the robot. Only those that are on this machine
+    are used.
 
     Raises:
-        MessageError: it is no URDF.
+        MessageError: the text is no URDF.
     """
     try:
         root = ElementTree.fromstring(text)
@@ -54,7 +54,7 @@ def links(text: str, topic: str) -> Iterator[Shape]:
 
 
 def _visual(visual: ElementTree.Element) -> tuple[F64, tuple[float, ...]] | None:
-    """(4, 4) link from the geometry, and half of its size."""
+    """Return (4, 4) link from the geometry, and half of the geometry's size; None for meshes."""
     pose = _origin(visual)
     for shape in visual.iterfind("geometry/*"):
         if shape.tag == "box":
@@ -66,7 +66,7 @@ def _visual(visual: ElementTree.Element) -> tuple[F64, tuple[float, ...]] | None
 
 
 def _meshes(visual: ElementTree.Element) -> Iterator[MeshFile]:
-    """Those of a visual whose file is here."""
+    """Yield the meshes of a visual that are on this machine."""
     for mesh in visual.iterfind("geometry/mesh"):
         path = mesh_file(mesh.get("filename", ""))
         if path is not None:
@@ -75,9 +75,10 @@ def _meshes(visual: ElementTree.Element) -> Iterator[MeshFile]:
 
 
 def mesh_file(name: str) -> Path | None:
-    """The file of ``package://NAME/PATH`` or ``file:///PATH`` on this machine; None: it is not here.
+    """Return the file of ``package://NAME/PATH`` or ``file:///PATH``; None if it is not on this machine.
 
-    Packages are looked for as ROS does: in AMENT_PREFIX_PATH, in this environment, and in ROS_PACKAGE_PATH.
+    Packages are searched as ROS does: in AMENT_PREFIX_PATH, in the Python environment, and in
+    ROS_PACKAGE_PATH.
     """
     parts = urlsplit(name)
     place = unquote(parts.path)
@@ -95,7 +96,7 @@ def mesh_file(name: str) -> Path | None:
 
 
 def _is_mesh(path: Path) -> bool:
-    # A description comes from anywhere: no other file of this machine is opened for it.
+    # A description may come from anywhere: do not open other files of this machine for it.
     try:
         return path.suffix.lower() in MESHES and path.is_file() and 0 < path.stat().st_size <= LARGEST
     except (OSError, ValueError):
@@ -107,7 +108,7 @@ def _paths(variable: str) -> list[Path]:
 
 
 def _origin(visual: ElementTree.Element) -> F64:
-    """(4, 4) link from the geometry."""
+    """Return (4, 4) link from the geometry."""
     origin = visual.find("origin")
     place, angles = (_floats(origin, name) for name in ("xyz", "rpy"))
     (cr, cp, cy), (sr, sp, sy) = np.cos(np.divide(angles, 2)), np.sin(np.divide(angles, 2))

@@ -1,4 +1,4 @@
-"""Which topic plays which role: found by type, name and frame, or set by hand."""
+"""Roles of topics: found by type, name and frame, or set by the configuration."""
 
 from __future__ import annotations
 
@@ -31,37 +31,59 @@ from bevviz.model.frame import Scene
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """The topics that play. ``notes`` says of every topic, in a few words, why it does or does not."""
+    """Topics by their role.
+
+    Attributes:
+        lidars: clouds of the LiDARs.
+        lidar_names: entity name of each LiDAR.
+        cameras: topics of the cameras.
+        tf: moving transforms.
+        tf_static: static transforms.
+        tf_held: topics of ``tf`` whose transforms hold until the next one, as Foxglove's do.
+        odometry: topic of the odometry; empty: there is none.
+        imus: topics that give the gravity direction if the transforms do not.
+        robot_detections_2d: the robot's own image boxes.
+        robot_detections_3d: the robot's own 3D boxes.
+        robot_clouds: the robot's obstacle points, if the ground stage is the robot's.
+        stages: the robot's results that replace our stages.
+        truth: topic of the ground truth; empty: there is none.
+        boxes: setting ``source.boxes``.
+        around: topic, kind and type of the messages that are shown around perception.
+        camera_infos: all topics of CameraInfo, also unused ones.
+        no_lidar: why there is no LiDAR, and what would help; empty: there is one.
+        no_camera: why there is no camera, and what would help; empty: there is one.
+        notes: for every topic, in a few words, why it has its role or none.
+    """
 
     lidars: tuple[str, ...] = ()
-    lidar_names: tuple[str, ...] = ()  # entity name of each
+    lidar_names: tuple[str, ...] = ()
     cameras: tuple[CameraRole, ...] = ()
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
-    tf_held: tuple[str, ...] = ()  # of tf, those whose transforms hold until there are others, as Foxglove's
+    tf_held: tuple[str, ...] = ()
     odometry: str = ""
-    imus: tuple[str, ...] = ()  # tell which way is up, where transforms do not
+    imus: tuple[str, ...] = ()
     robot_detections_2d: tuple[str, ...] = ()
     robot_detections_3d: tuple[str, ...] = ()
-    robot_clouds: tuple[str, ...] = ()  # of obstacles, where the ground stage is the robot's
-    stages: tuple[str, ...] = ()  # the robot's results that our stages are taken from
+    robot_clouds: tuple[str, ...] = ()
+    stages: tuple[str, ...] = ()
     truth: str = ""
-    boxes: Mapping[str, str] = field(default_factory=dict)  # as source.boxes has it
-    around: tuple[tuple[str, str, str], ...] = field(default=(), compare=False)  # topic, what it tells, type
-    # What follows is for sentences: it changes with topics that play no role.
-    camera_infos: tuple[str, ...] = field(default=(), compare=False)  # all of them, whoever uses them
-    no_lidar: str = field(default="", compare=False)  # why there is none, and what would help
-    no_camera: str = field(default="", compare=False)  # the same of cameras
+    boxes: Mapping[str, str] = field(default_factory=dict)
+    around: tuple[tuple[str, str, str], ...] = field(default=(), compare=False)
+    # The following fields are for sentences. They also depend on topics without a role.
+    camera_infos: tuple[str, ...] = field(default=(), compare=False)
+    no_lidar: str = field(default="", compare=False)
+    no_camera: str = field(default="", compare=False)
     notes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def driver(self) -> str:
-        """The topic whose messages make the frames: the first LiDAR's, without one the first camera's."""
+        """Topic whose messages make the frames: the first LiDAR's, or the first camera's without a LiDAR."""
         return next(iter((*self.lidars, *(camera.topic for camera in self.cameras))), "")
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """``key=value`` each, which give the sensors' topics the same roles whatever others there are."""
+        """Settings ``key=value`` that give the sensors' topics the same roles beside any other topics."""
         infos = {camera.topic: camera.info_topic for camera in self.cameras if camera.info_topic}
         chosen = {
             "lidar_topics": list(self.lidars),
@@ -72,7 +94,7 @@ class Roles:
         return tuple(f"source.{key}={json.dumps(value)}" for key, value in chosen.items() if value)
 
     def scene(self, name: str) -> Scene:
-        """What a source with these topics delivers."""
+        """Return the scene that a source with these topics delivers."""
         lidars = self.lidar_names
         return Scene(
             name=name,
@@ -85,15 +107,15 @@ class Roles:
         )
 
 
-MANY = 12  # topics; more are not listed in a sentence
-MARK = "bevviz/mark"  # topic, in the namespace of the node
+MANY = 12  # longest list of topics in a sentence
+MARK = "bevviz/mark"  # topic within the namespace of the node
 _MARK = re.compile(rf"(^|/){MARK}$")
 
 Kind = Literal["mark", "status", "shape"]
 SHAPES = frozenset(
     {"LaserScan", "Path", "PoseStamped", "OccupancyGrid", "GridMap", "MarkerArray", "Marker", "NavSatFix"}
 )
-RESULTS = {  # of the robot's own pipeline, shown where nothing of ours is
+RESULTS = {  # results of the robot's pipeline that are shown unless ours use them
     "PointCloud2": re.compile(r"(^|/)lidar/points_no_ground$"),
     "Image": re.compile(r"(^|/)visualization/bev_image$"),
 }
@@ -104,7 +126,7 @@ _AROUND = {
     "shape": "around perception",
 }
 
-STAGE_KINDS = {  # what the robot publishes as the result of a stage
+STAGE_KINDS = {  # type of the robot's result, by the stage that it replaces
     "ground.method": "PointCloud2",
     "clustering.method": "Detection3DArray",
     "detector.model": "Detection2DArray",
@@ -121,20 +143,20 @@ def find_roles(
 ) -> Roles:
     """Give each topic its role.
 
-    Topics that are stated in the configuration are taken as they are. Otherwise one frame is one sensor:
-    of several clouds, or several images, with the same frame_id the one nearest to the sensor is taken
-    (images: the rectified one, as the others of a pipeline are made from it).
+    Topics that the configuration states are taken. Otherwise each frame_id is one sensor. Of several clouds,
+    or several images, with the same frame_id the one nearest to the sensor is taken; of images the rectified
+    one, because pipelines make their other images from it.
 
     Args:
-        topics: all that there are.
-        config: which topics are stated.
-        stages: the robot's topics that stages are taken from, by the dotted key that names each.
-        results: the robot's bird's-eye view and obstacles are shown, too.
+        topics: all topics.
+        config: states topics.
+        stages: topics of the robot's results that replace stages, by the dotted key that names each.
+        results: whether the robot's bird's-eye view and obstacles are shown, too.
 
     Raises:
-        UserError: a stated topic does not exist, or is of another type.
+        UserError: a stated topic does not exist, or has another type.
     """
-    topics = sorted(topics, key=lambda t: t.name)  # the order of a bag's or a graph's topics is chance
+    topics = sorted(topics, key=lambda t: t.name)  # topics of a bag or graph have no fixed order
     topics = _with_boxes(topics, config)
     notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: stated_topic(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
@@ -207,9 +229,9 @@ def find_roles(
 
 
 def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topic]) -> bool:
-    """Whether a namespace has transforms and sensors of its own, and none of these is used.
+    """Return whether the namespace of transforms has sensors, and none of them is used.
 
-    Robots of one kind name their frames alike: their transforms are not to be mixed.
+    Robots of one kind have equal frame names, so their transforms must not be mixed.
     """
     namespace = topic.name.rpartition("/")[0] + "/"
     own = [t for t in of_kind(topics, "PointCloud2", *IMAGES) if t.name.startswith(namespace)]
@@ -217,7 +239,7 @@ def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topi
 
 
 def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
-    """The topic that ``source.boxes`` is of is read as boxes."""
+    """Mark the topic that ``source.boxes`` names."""
     check(config.boxes)
     name = config.boxes.get("topic", "")
     if name and name not in names_of(topics):
@@ -269,7 +291,7 @@ def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[st
 
 
 def kind_of(topic: str, short: str) -> Kind | None:
-    """What a topic tells, by its name and its type without the package; None: nothing of this."""
+    """Return the kind of a topic around perception, by its name and its type without the package."""
     if short == "String" and _MARK.search(topic):
         return "mark"
     if short == "DiagnosticArray":

@@ -1,4 +1,4 @@
-"""Which topics are a robot's LiDARs and cameras, by type, name and frame."""
+"""LiDARs and cameras among the topics, by type, name and frame."""
 
 from __future__ import annotations
 
@@ -21,13 +21,21 @@ from bevviz.messages.topics import (
 
 @dataclass(frozen=True, slots=True)
 class CameraRole:
-    """The topics of a camera."""
+    """Topics of a camera.
 
-    name: str  # of its entities
+    Attributes:
+        name: name of its entities.
+        topic: topic of its images.
+        info_topic: topic of its CameraInfo; empty: there is none.
+        rectified: whether the images are rectified.
+        kind: Image, CompressedImage or CompressedVideo.
+    """
+
+    name: str
     topic: str
-    info_topic: str  # "": there is none
+    info_topic: str
     rectified: bool
-    kind: str  # Image, CompressedImage or CompressedVideo
+    kind: str
 
 
 # --- LiDARs ------------------------------------------------------------------------------------
@@ -38,14 +46,14 @@ _DERIVED_CLOUD = re.compile(
     r"|crop|downsample|object|debug|feature|plane|merged|concat|keypoint|matched|odom|slam"
     r"|radar|mmwave|sonar"
 )
-_FIXED = ("map", "odom", "world", "camera_init")  # no sensor moves with them
+_FIXED = ("map", "odom", "world", "camera_init")  # frames in which no sensor moves
 
 
 def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
-    """The clouds of LiDARs, by name; ``notes`` gets why each cloud is one or is not.
+    """Return the clouds of LiDARs, sorted by name. Add the reason for each cloud to ``notes``.
 
     Raises:
-        UserError: source.lidar_topics names what is no cloud.
+        UserError: source.lidar_topics names a topic that is no cloud.
     """
     clouds = of_kind(topics, "PointCloud2")
     if config.lidar_topics:
@@ -61,13 +69,13 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
     note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
     if best in (2, 3):
-        candidates = candidates[:1]  # results are no sensors to be merged
+        candidates = candidates[:1]  # results are not merged like sensors
     chosen = _one_a_frame(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")
     return sorted(chosen, key=lambda t: t.name)
 
 
 def _lidar_tier(topic: Topic, base_frame: str) -> int:
-    """0: named like a LiDAR, 1: other cloud, 2: derived one, 3: in a fixed frame, 4: without messages."""
+    """Return 0: named like a LiDAR, 1: other cloud, 2: derived, 3: in a fixed frame, 4: without messages."""
     name, frame = topic.name.lower(), topic.frame_id.lower()
     if topic.count == 0:
         return 4
@@ -80,14 +88,14 @@ def _lidar_tier(topic: Topic, base_frame: str) -> int:
 
 
 def _is_moved(topic: Topic, base_frame: str) -> bool:
-    """Whether points are in the robot's own frame: beside a LiDAR's raw ones they would be the same twice."""
+    """Return whether points are in the robot's frame: with a LiDAR's raw points they would appear twice."""
     return topic.frame_id.lower() in (base_frame, "base_link", "base_footprint")
 
 
 def _one_a_frame(
     candidates: Iterable[Topic], sensor: Callable[[Topic], str], notes: dict[str, str], why: str
 ) -> list[Topic]:
-    """The first candidate of each sensor."""
+    """Choose the first candidate of each sensor. Add the reason for each candidate to ``notes``."""
     chosen: dict[str, Topic] = {}
     for topic in candidates:
         first = chosen.setdefault(sensor(topic), topic)
@@ -102,17 +110,17 @@ def _one_a_frame(
 _DERIVED_IMAGE = re.compile(
     r"depth(?!ai)|disparity|confidence|annotat|debug|dbg|bev|mask|overlay|detect|visuali[sz]|segment|semantic"
     r"|label|heat_?map|costmap|stereo(_raw)?/image|track|result|infra|normal|cloud|side_by_side"
-    r"|radar|sonar|(range|signal|reflec|nearir)_image"  # the latter Ouster's driver makes of its scans
+    r"|radar|sonar|(range|signal|reflec|nearir)_image"  # images of Ouster's scans
 )
 _COLOURLESS = re.compile(r"gray|mono|(?<![a-z])ir(?![a-z])")
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
 
 def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
-    """One topic of images for each camera, by name; ``notes`` gets why each is one or is not.
+    """Return one topic of images for each camera, sorted by name. Add the reason for each topic to ``notes``.
 
     Raises:
-        UserError: source.camera_topics or source.camera_info_topics name what is no image.
+        UserError: source.camera_topics or source.camera_info_topics name a topic that is no image.
     """
     images = of_kind(topics, *IMAGES)
     for name in config.camera_info_topics:
@@ -139,7 +147,7 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
             not _RECTIFIED.search(name),
             bool(_COLOURLESS.search(name)),
             not _info_topic(topic, topics),
-            IMAGES.index(topic.kind),  # what the robot's detector saw is mostly the first one
+            IMAGES.index(topic.kind),  # the robot's detector mostly uses the first kind
             len(name),
             name,
         )
@@ -150,17 +158,17 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
 
 
 def _stem(topic: str) -> str:
-    """What all variants of a camera's image have in common: the topic without raw, rect, gray or color."""
+    """Return the common part of the topics of a camera's images, without raw, rect, gray, color and mono."""
     return "/".join(re.sub(r"_(raw|rect|gray|color|mono)$", "", part) for part in device(topic))
 
 
 def camera_role(
     topic: Topic, name: str, topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]
 ) -> CameraRole:
-    """The topics of a camera of that name whose images are on ``topic``.
+    """Return the topics of the camera whose images are on ``topic``.
 
     Raises:
-        UserError: source.camera_info_topics names what is no CameraInfo.
+        UserError: source.camera_info_topics names a topic that is no CameraInfo.
     """
     stated = config.camera_info_topics.get(topic.name)
     if stated is None:
@@ -175,7 +183,10 @@ def camera_role(
 
 
 def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:
-    """The CameraInfo beside the image, as ROS has it; else one in its frame or a namespace above; else ""."""
+    """Return the CameraInfo of an image; empty if there is none.
+
+    ROS puts it beside the image. Otherwise one in the same frame or in a namespace above is used.
+    """
     base = TRANSPORT.sub("", image.name)
     infos = [t for t in of_kind(topics, "CameraInfo") if t.count != 0]
     beside = [base.rpartition("/")[0] + "/camera_info", base + "/camera_info"]

@@ -1,4 +1,4 @@
-"""What a robot publishes around its perception: marks, diagnostics, and what has a place in the world."""
+"""Messages of a robot around its perception: marks, diagnostics, and shapes in the world."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def decode_statuses(msg: Any) -> list[Status]:
 
 
 def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
-    """Of any type in ``SHAPES``. A stamp is 0 where the message has none.
+    """Return the shapes of a message of any type in ``SHAPES``. A stamp is 0 if the message has none.
 
     Raises:
-        MessageError: it contradicts itself.
+        MessageError: the message contradicts itself.
     """
     if short == "MarkerArray":
         return _markers(msg.markers, topic)
@@ -65,9 +65,8 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
     if short == "Image":
         image = decode_image(msg, topic, 0)
         return [Shape(topic, image.frame_id.lstrip("/"), image.stamp, picture=image.bgr)]
-    header = (
-        msg.info.header if short == "GridMap" and not hasattr(msg, "header") else msg.header
-    )  # as in ROS 1
+    # In ROS 1 the header is within the info.
+    header = msg.info.header if short == "GridMap" and not hasattr(msg, "header") else msg.header
     about = topic, header.frame_id.lstrip("/"), stamp_ns(header.stamp)
     if short == "GridMap":
         surface = decode_grid_map(msg, _pose(msg.info.pose), topic)
@@ -103,7 +102,7 @@ _CUBE, _SPHERE, _CYLINDER, _STRIP, _LINES, _CUBES, _SPHERES, _POINTS, _TEXT = 1,
 
 
 def _markers(markers: Sequence[Any], topic: str) -> list[Shape]:
-    """One shape of each marker that is added. What is deleted goes with the next array that lacks it."""
+    """Return a shape for each marker with the action ADD. A deleted marker disappears with the next array."""
     found = []
     for marker in markers:
         if marker.action == 0:
@@ -152,5 +151,5 @@ def _pose(pose: Any) -> F64:
     turn = pose.orientation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
     if not np.isfinite(quaternion).all() or not quaternion.any():
-        quaternion = np.array([0.0, 0.0, 0.0, 1.0])  # as RViz takes what nobody has set
+        quaternion = np.array([0.0, 0.0, 0.0, 1.0])  # RViz does the same with an orientation that is not set
     return geometry.transform(np.array(_xyz(pose.position)), quaternion)

@@ -1,4 +1,4 @@
-"""Topics: what they are read as, by type, and what the entities of their sensors are called."""
+"""Topics: their kind, by type, and the names of their sensors' entities."""
 
 from __future__ import annotations
 
@@ -13,35 +13,47 @@ from bevviz.messages.foreign_boxes import holds_boxes
 
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
-NOT_LIDAR = "packets of an Ouster's IMU"  # Topic.aside of packets that are no part of a scan
+NOT_LIDAR = "packets of an Ouster's IMU"  # Topic.aside of packets that belong to no scan
 
-# Entities that a recording has beside those of its sensors (docs/recordings.md). No sensor may be called so.
+# Entities of recordings beside those of the sensors (docs/recordings.md). No sensor may have these names.
 RESERVED = frozenset(
-    {"fused", "fusion", "frustums", "bev", "ground_truth", "tracks"}  # of /world
-    | {"missed", "false", "unnamed"}  # of /world, too
-    | {"about", "log", "states", "objects", "count"}  # of /compare
-    | {"pipeline", "marks"}  # of /explain/states
-    | {"lidars"}  # the merged cloud of several LiDARs
+    {"fused", "fusion", "frustums", "bev", "ground_truth", "tracks"}  # in /world
+    | {"missed", "false", "unnamed"}  # in /world, too
+    | {"about", "log", "states", "objects", "count"}  # in /compare
+    | {"pipeline", "marks"}  # in /explain/states
+    | {"lidars"}  # merged cloud of several LiDARs
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a bag or of a live graph, as far as it is known."""
+    """Topic of a bag or of a live graph.
+
+    Attributes:
+        name: topic name.
+        type: message type, as sensor_msgs/msg/PointCloud2 or in the shorter spelling of ROS 1.
+        count: number of messages; None: not known, as on a live graph.
+        frame_id: frame of its first message; empty: not known.
+        rate: messages per second, Hz; None: not known.
+        aside: reason why it plays no role unless it is stated; empty: it may play one.
+        boxes: whether ``source.boxes`` describes its messages.
+        video: whether its messages are video packets, although their type is CompressedImage.
+        scans: whether its messages are LiDAR packets that the source groups into scans.
+    """
 
     name: str
-    type: str  # sensor_msgs/msg/PointCloud2, or the shorter spelling of ROS 1
-    count: int | None = None  # messages; None: not known, as on a live graph
-    frame_id: str = ""  # of its first message; "": not known
-    rate: float | None = None  # Hz
-    aside: str = ""  # why it plays no role unless it is stated
-    boxes: bool = False  # source.boxes says where in its messages they are
-    video: bool = False  # its messages are packets of video, whatever their type says
-    scans: bool = False  # its messages are packets of a LiDAR that scans can be made of
+    type: str
+    count: int | None = None
+    frame_id: str = ""
+    rate: float | None = None
+    aside: str = ""
+    boxes: bool = False
+    video: bool = False
+    scans: bool = False
 
     @property
     def kind(self) -> str:
-        """What it is read as: the type without its package, but for types that stand for others."""
+        """Type that the messages are handled as, without package: PointCloud2 for a LiDAR's packets."""
         decoder = find_decoder(self.type)
         if decoder is not None and (self.scans or decoder.metadata_topic is None):
             return decoder.kind
@@ -56,7 +68,7 @@ class Topic:
         return decoder.metadata_topic(self.name) if decoder and decoder.metadata_topic else ""
 
 
-_FOREIGN = (  # what holds points or pixels in a form that nothing here reads, and what would help
+_FOREIGN = (  # sensor, type, and what would help: points or pixels in forms that are not supported
     ("camera", re.compile(r"video|ffmpeg|theora|h26[45]", re.IGNORECASE), VIDEO),
     (
         "LiDAR",
@@ -79,7 +91,12 @@ _FOREIGN = (  # what holds points or pixels in a form that nothing here reads, a
 
 
 def foreign(topic: Topic, sensor: str = "") -> str:
-    """What a topic that nothing here reads holds and what would help; empty where it is not known."""
+    """Return what an unsupported topic holds and what would help; empty if that is not known.
+
+    Args:
+        topic: the topic.
+        sensor: ``LiDAR`` or ``camera`` for topics of this sensor only; empty: any.
+    """
     if topic.kind == "PointCloud2":
         return ""
     decoder = declared_decoder(topic.type)
@@ -91,25 +108,25 @@ def foreign(topic: Topic, sensor: str = "") -> str:
 
 
 def names_of(topics: Iterable[Topic]) -> tuple[str, ...]:
-    """In their order."""
+    """Return the names of topics, in their order."""
     return tuple(topic.name for topic in topics)
 
 
 def note(notes: dict[str, str], topics: Iterable[Topic], text: str) -> None:
-    """Say the same of all of them, in place of what was said before."""
+    """Set the same note for several topics."""
     notes.update({topic.name: text for topic in topics})
 
 
 def of_kind(topics: Iterable[Topic], *kinds: str) -> list[Topic]:
-    """Those that are read as one of these."""
+    """Return the topics of these kinds."""
     return [topic for topic in topics if topic.kind in kinds]
 
 
 def stated_topic(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> Topic:
-    """The topic that the configuration names under ``key``.
+    """Return the topic that the configuration names under ``key``.
 
     Raises:
-        UserError: there is none of that name, or it is of no such kind.
+        UserError: there is no such topic, or it is of another kind.
     """
     fitting = of_kind(topics, *kinds)
     for topic in topics:
@@ -134,10 +151,10 @@ _WEAK = {"left", "right", "front", "rear", "back", "center", "camera", "cam", "s
 
 
 def entity_name(topic: str, frame_id: str = "") -> str:
-    """Name of a sensor's entities: its frame's, or without one its topic's.
+    """Return the name of a sensor's entities: its frame, or a part of its topic if it has no frame.
 
-    LiDARs are named by their frame. Cameras, whose frames have long names, by the part of the topic that
-    tells the device, with the side where there is one.
+    LiDARs are named by their frame. The frames of cameras have long names, so cameras are named by the part
+    of the topic that names the device, with the side if there is one.
 
     >>> entity_name("/rslidar_points", "rslidar")
     'rslidar'
@@ -154,19 +171,19 @@ def entity_name(topic: str, frame_id: str = "") -> str:
 
 
 def device(topic: str) -> list[str]:
-    """The parts of a topic that name a device."""
+    """Return the parts of a topic that name a device."""
     parts = TRANSPORT.sub("", topic).strip("/").split("/")
     kept = [part.removesuffix("_node") for part in parts if not _IMAGE_WORDS.fullmatch(part)]
     return kept or ["camera"]
 
 
 def _clean(name: str) -> str:
-    """A part of an entity path that needs no escapes."""
+    """Return a part of an entity path that needs no escapes."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "sensor"
 
 
 def unique_names(named: Sequence[tuple[str, Topic]]) -> list[str]:
-    """The short names where they are unique, else those of the whole topic, else with a number."""
+    """Return unique names: the short name, else the name of the whole topic, else with a number."""
     short = [name for name, _ in named]
     unique: list[str] = []
     for name, topic in named:

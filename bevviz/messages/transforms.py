@@ -15,19 +15,26 @@ from bevviz.model.frame import F64
 
 @dataclass(frozen=True, slots=True)
 class StampedTransform:
-    """One edge of the transform tree at one time."""
+    """Edge of the transform tree at one time.
 
-    stamp: int  # nanoseconds
+    Attributes:
+        stamp: nanoseconds.
+        parent: parent frame.
+        child: child frame.
+        parent_from_child: (4, 4) pose.
+    """
+
+    stamp: int
     parent: str
     child: str
-    parent_from_child: F64  # (4, 4)
+    parent_from_child: F64
 
 
 def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
-    """The transforms of a tf2_msgs/TFMessage; one that is no rigid transform is left out.
+    """Return the transforms of a tf2_msgs/TFMessage. Transforms that are not rigid are left out.
 
     Raises:
-        MessageError: none of them is one.
+        MessageError: no transform is rigid.
     """
     transforms, problems = [], []
     for item in msg.transforms:
@@ -44,10 +51,10 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
 
 
 def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
-    """The pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
+    """Return the pose of a nav_msgs/Odometry: header.frame_id from child_frame_id.
 
     Raises:
-        MessageError: no rigid transform, or no frame names.
+        MessageError: the transform is not rigid, or a frame name is missing.
     """
     pose = msg.pose.pose
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
@@ -58,18 +65,24 @@ Vector: TypeAlias = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Acceleration:
-    """What an Imu feels, in its own frame: at rest one g upwards."""
+    """Acceleration that an Imu measures in its own frame. At rest it is one g upwards.
+
+    Attributes:
+        stamp: nanoseconds.
+        frame_id: frame of the Imu.
+        acceleration: (3,) m/s^2, or g with some drivers.
+    """
 
     stamp: int
     frame_id: str
-    acceleration: F64  # (3,) m/s^2, or in g: drivers differ
+    acceleration: F64
 
 
 def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
-    """Of a sensor_msgs/Imu.
+    """Return the acceleration of a sensor_msgs/Imu.
 
     Raises:
-        MessageError: the message says that it has none.
+        MessageError: the message states that it has no acceleration.
     """
     if msg.linear_acceleration_covariance[0] == -1:
         raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
@@ -82,7 +95,7 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
 
 
 def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
-    """Rotation rate and acceleration of a sensor_msgs/Imu, NaN where it says it has none, and its stamp."""
+    """Return rotation rate, acceleration and stamp of a sensor_msgs/Imu. Missing values are NaN."""
     none = (math.nan, math.nan, math.nan)
     turn, felt = msg.angular_velocity, msg.linear_acceleration
     return (

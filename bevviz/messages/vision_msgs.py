@@ -1,6 +1,6 @@
-"""Definitions of vision_msgs 4 (ROS 2 Humble to Jazzy) and 2 (Foxy), which rosbags' type stores lack.
+"""Definitions of vision_msgs 4 (ROS 2 Humble to Jazzy) and 2 (Foxy), which rosbags lacks.
 
-Those of 3 (Galactic) have other names for the bytes of 4.
+Version 3 (Galactic) has other field names for the same bytes as version 4.
 """
 
 from __future__ import annotations
@@ -60,13 +60,14 @@ def _older() -> Typestore:
 
 
 def deserialize(store: Typestore, data: bytes | memoryview, msgtype: str) -> Any:
-    """A message of any type as the store defines it; one of vision_msgs that is none by that, as of Foxy.
+    """Deserialise a message of any type.
 
-    What is not empty is laid out so that it cannot be taken for the other.
+    A message of vision_msgs that does not fit the definition is read as Foxy's. The bytes of a message that
+    is not empty fit only one of the two definitions.
     """
     try:
         return store.deserialize_cdr(data, msgtype)
-    except Exception:  # generated decoders raise whatever the bytes lead them to
+    except Exception:  # rosbags' generated code raises any exception, depending on the bytes
         if msgtype.startswith("vision_msgs/msg/") and msgtype in _older().types:
             with suppress(Exception):
                 return _older().deserialize_cdr(data, msgtype)
