@@ -1,1 +1,1 @@
-"""Synchronisation of messages into frames. Imports `drivers` and below."""
+"""Synchronisation of messages into frames. Imports `drivers` and layers below it."""

@@ -1,4 +1,4 @@
-"""Images and calibrations as they come, and the camera of each frame that they make."""
+"""Buffers of images and calibrations, and the camera of each frame that is made from them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,18 @@ from bevviz.sync.topic_buffer import Track, too_far
 from bevviz.sync.transform_tree import TransformError
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
-MOST_OFF = 0.2  # of the image: how far from its middle a principal point may be before it is told
+MOST_OFF = 0.2  # farthest principal point from the image centre without a warning, as share of the image size
 
 
 @dataclass(frozen=True, slots=True)
 class Undecoded:
-    """The header of an image, and how to get the rest."""
+    """Image that is not decoded yet.
+
+    Attributes:
+        stamp: stamp of the header, nanoseconds.
+        frame_id: frame of the header.
+        load: decodes the image.
+    """
 
     stamp: int
     frame_id: str
@@ -34,19 +40,19 @@ class Undecoded:
 
 
 class Cameras:
-    """What the cameras of a robot have sent within the horizon.
+    """Buffer of the images and calibrations of all cameras.
 
     Args:
-        roles: which topic is what.
+        roles: roles of the topics.
         config: tolerances.
-        report: counts what is missing.
-        placing: knows where they are.
-        horizon: nanoseconds that images and calibrations are held for.
+        report: counts missing images.
+        placing: finds the poses of cameras.
+        horizon: nanoseconds of images and calibrations that are kept.
 
     Attributes:
-        images: by topic.
-        frames: image topic -> optical frame.
-        intrinsics: CameraInfo topic -> the newest.
+        images: images by topic.
+        frames: optical frame by image topic.
+        intrinsics: newest calibration by CameraInfo topic.
     """
 
     def __init__(
@@ -60,33 +66,33 @@ class Cameras:
         self.frames: dict[str, str] = {}
         self.intrinsics: dict[str, Intrinsics] = {}
         self._infos: dict[str, Track[Intrinsics]] = {}  # by topic
-        self._refused: dict[str, str] = {}  # topic -> why its calibration cannot be used
+        self._refused: dict[str, str] = {}  # why the calibrations of a topic cannot be used
         self._info_counts: Counter[str] = Counter()
         self._image_counts: Counter[str] = Counter()
 
     def take_over(self, former: Cameras) -> None:
-        """Go on with the calibrations of ``former``."""
+        """Continue with the calibrations of ``former``."""
         self._report, self._tf = former._report, former._tf
         self.intrinsics, self._infos, self._refused = former.intrinsics, former._infos, former._refused
 
     def add_image(self, topic: str, stamp: int, frame_id: str, load: Callable[[], Image]) -> bool:
-        """An image not yet decoded. Whether it takes the place of another one with that stamp."""
+        """Add an image. Return whether it replaces an image with the same stamp."""
         self.frames[topic] = frame_id
         self._image_counts[topic] += 1
         return self.images[topic].add(stamp, Undecoded(stamp, frame_id, load))
 
     def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics) -> None:
-        """A calibration; for an image the one that is nearest in stamp holds."""
+        """Add a calibration. An image uses the calibration with the nearest stamp."""
         self.intrinsics[topic] = intrinsics
         self._info_counts[topic] += 1
         self._infos.setdefault(topic, Track(self._horizon)).add(stamp, intrinsics)
 
     def refuse_info(self, topic: str, reason: str) -> None:
-        """A calibration that cannot be used."""
+        """Note why the calibrations of a topic cannot be used."""
         self._refused[topic] = reason
 
     def info_reaches(self, role: CameraRole, stamp: int, absent: Collection[str]) -> bool:
-        """Whether the calibration of the image of this time has come, where each image has one of its own."""
+        """Return whether the calibration of the image at a stamp has come, if each image has its own."""
         track, image = self._infos.get(role.info_topic), self.images[role.topic].nearest(stamp)
         if track is None or track.newest is None or image is None or role.info_topic in absent:
             return True
@@ -94,6 +100,7 @@ class Cameras:
         return not one_each or track.newest >= image[0]
 
     def at(self, role: CameraRole, place: Place) -> Camera:
+        """Return the camera of a frame: image, calibration and pose, with a sentence for each problem."""
         problems: list[str] = []
         image, stamp = self._image(role, place.stamp, problems)
         intrinsics = self._camera_intrinsics(role, image, stamp, problems)
@@ -138,10 +145,10 @@ class Cameras:
         )
 
     def _second_of_stereo(self, role: CameraRole, intrinsics: Intrinsics | None, frame: str) -> F64:
-        """(4, 4) frame of the image from its camera: the second of a stereo pair is in the first one's.
+        """Return (4, 4) frame of the image from its camera.
 
-        See P in sensor_msgs/CameraInfo. Many drivers give the second camera a frame of its own, and P all the
-        same; then it is where TF says.
+        The second camera of a stereo pair is in the frame of the first. See P in sensor_msgs/CameraInfo. Many
+        drivers give the second camera its own frame and nevertheless write P. Then the transforms count.
         """
         pose = np.eye(4)
         if intrinsics is None or intrinsics.baseline == (0.0, 0.0):
@@ -157,7 +164,7 @@ class Cameras:
         return pose
 
     def _image(self, role: CameraRole, stamp: int, problems: list[str]) -> tuple[Image | None, int]:
-        """The decoded image nearest to ``stamp``, and its stamp; without one, ``stamp``."""
+        """Return the decoded image nearest to ``stamp`` and its stamp; without one, None and ``stamp``."""
         nearest = self.images[role.topic].nearest(stamp)
         if nearest is None or abs(nearest[0] - stamp) > self._tolerance:
             self._report.without_image[role.name] += 1
@@ -204,11 +211,11 @@ class Cameras:
     def _fitted(
         self, role: CameraRole, intrinsics: Intrinsics, image: Image, problems: list[str]
     ) -> Intrinsics | None:
-        """The intrinsics for the image's own size."""
+        """Return the intrinsics scaled to the size of the image; None if they do not fit."""
         height, width = image.bgr.shape[:2]
         if (width, height) == (intrinsics.width, intrinsics.height):
             return intrinsics
-        if not intrinsics.width or not intrinsics.height:  # many drivers leave them empty
+        if not intrinsics.width or not intrinsics.height:  # many drivers send 0
             middle = intrinsics.K[:2, 2] / (width, height)
             if np.abs(middle - 0.5).max() > MOST_OFF:
                 cx, cy = intrinsics.K[:2, 2]
@@ -226,6 +233,6 @@ class Cameras:
                 f"the image has {width} x {height}: nothing can be projected into it",
             )
             return None
-        # Pixel (0, 0) is the centre of the corner pixel, so that the corner itself is at -0.5.
+        # Pixel (0, 0) is the centre of the corner pixel, so the corner itself is at -0.5.
         scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K)

@@ -1,7 +1,7 @@
-"""The clocks that stamp messages, held against the one that received them.
+"""Clocks that stamp messages, compared with the clock that received them.
 
-A camera with a clock of its own is fused with scans of another time, and nothing in its stamps tells.
-The time from a stamp to the receipt of its message does: of one robot's sensors it is the same but for delay.
+A camera with its own clock is fused with scans of another time, and its stamps do not show that. The lag from
+stamp to receipt does: apart from delays, it is equal for all sensors of a robot.
 """
 
 from __future__ import annotations
@@ -11,20 +11,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from statistics import median
 
-APART = 0.6  # seconds between the lags of two topics, from which on no delay is a likely reason
-ENOUGH, LAST = 3, 50  # messages of a topic that a lag is told from, at least and at most
+APART = 0.6  # seconds; a larger difference between the lags of two topics is hardly a delay
+ENOUGH, LAST = 3, 50  # least and most messages of a topic for its lag
 TAI = 37.0  # seconds that TAI is ahead of UTC since 2017
-EPOCH = (
-    10 * 365 * 86_400.0
-)  # seconds: no clock is off by ten years, but one may count from when it was started
+EPOCH = 10 * 365 * 86_400.0  # seconds; a clock that is off by ten years counts from its start
 
 
 class Clocks:
-    """Corrects stamps as configured, and remembers how far they are from the time of receipt.
+    """Correction of stamps, with the lags of the last messages.
 
     Args:
-        offsets: seconds to be added to the stamps, by topic.
-        by: ``stamp``, or ``received``: go by the time of receipt instead.
+        offsets: seconds to add to the stamps, by topic.
+        by: ``stamp``; or ``received`` to use the time of receipt in place of the stamp.
     """
 
     def __init__(self, offsets: Mapping[str, float], by: str) -> None:
@@ -33,27 +31,27 @@ class Clocks:
         self._lags: dict[str, deque[int]] = defaultdict(partial(deque, maxlen=LAST))
 
     def stamp(self, topic: str, stamp: int, received: int) -> int:
-        """The stamp to go by, nanoseconds."""
+        """Return the stamp to use, nanoseconds."""
         stamp = (received if self._received else stamp) + self._offsets.get(topic, 0)
         self._lags[topic].append(received - stamp)
         return stamp
 
     def lag(self, topic: str) -> float | None:
-        """Seconds from a stamp to its receipt, the median of the last ones; None: not known yet."""
+        """Return the median seconds from stamp to receipt; None if there are too few messages."""
         lags = self._lags.get(topic, ())
         return median(lags) * 1e-9 if len(lags) >= ENOUGH else None
 
     def apart(self, topic: str, other: str) -> float:
-        """Seconds that the clock of ``topic`` is behind that of ``other``; 0 where it may be a delay."""
+        """Return the seconds that ``topic``'s clock is behind that of ``other``; 0 if it may be a delay."""
         lag, others = self.lag(topic), self.lag(other)
         difference = 0.0 if lag is None or others is None else lag - others
         return difference if abs(difference) > APART else 0.0
 
     def doubts(self, topics: Iterable[str]) -> Iterator[str]:
-        """A sentence for each topic whose clock is off.
+        """Yield a sentence for each topic whose clock is wrong.
 
         Args:
-            topics: whose messages belong together.
+            topics: topics whose clocks must agree.
         """
         lags = {topic: lag for topic in topics if (lag := self.lag(topic)) is not None}
         right = min(lags, key=lambda topic: abs(lags[topic]), default="")

@@ -1,4 +1,4 @@
-"""From the messages of each role into the synchroniser: the same for a bag and a live robot."""
+"""Handlers that decode the messages of each role for the synchroniser, for bags and live robots."""
 
 from __future__ import annotations
 
@@ -30,13 +30,15 @@ from bevviz.sync.video import Rewind, Video, VideoLoader
 
 
 class Message(TypedMessage, Protocol):
-    """A serialised message as it was received."""
+    """Serialised message as it was received."""
 
     @property
-    def received(self) -> int: ...
+    def received(self) -> int:
+        """Time of receipt, nanoseconds."""
+        ...
 
     def header(self) -> tuple[int, str]:
-        """Stamp in nanoseconds and frame_id; may raise MessageError."""
+        """Return stamp (nanoseconds) and frame_id. Raise MessageError if there is no header."""
         ...
 
 
@@ -48,10 +50,12 @@ Handler = Callable[[M], None]
 
 @dataclass(frozen=True, slots=True)
 class Loader(Generic[M, T]):
-    """Decodes a message when a frame takes it.
+    """Function that decodes a message when a frame takes it. It can be pickled.
 
     Attributes:
-        read: what is made of the decoded message, its topic and its time of receipt; can be pickled.
+        message: serialised message.
+        decode: makes an object with the fields of the message.
+        read: makes the result from this object, its topic and its time of receipt.
     """
 
     message: M
@@ -59,6 +63,7 @@ class Loader(Generic[M, T]):
     read: Callable[[Any, str, int], T]
 
     def __call__(self) -> T:
+        """Decode the message."""
         message = self.message
         return guard(message, self.read, self.decode(message), message.topic, message.received)
 
@@ -66,11 +71,16 @@ class Loader(Generic[M, T]):
 def make_handlers(
     sync: Synchronizer, roles: Roles, decode: Callable[[M], Any], rewind: Rewind | None = None
 ) -> dict[str, Handler[M]]:
-    """What to do with a message, by topic: decode it and hand it on. An image is decoded when it is used.
+    """Return a handler for each topic, which decodes a message and adds it to the synchroniser.
 
-    ``rewind`` is where video that has gone by is to be had again, see ``Video``.
+    Images are decoded only when a frame takes them. The handlers and ``decode`` raise MessageError for
+    unusable messages.
 
-    The handlers raise MessageError for what cannot be used, and so does ``decode``.
+    Args:
+        sync: synchroniser that gets the messages.
+        roles: roles of the topics.
+        decode: makes an object with the fields of a message.
+        rewind: reads earlier packets of a video again, see ``Video``; None: they cannot be read.
     """
 
     def read(message: M, decoder: Callable[Concatenate[Any, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -84,7 +94,7 @@ def make_handlers(
             sync.add_transform(clocked(message, transform), static, held=message.topic in roles.tf_held)
 
     def clocked(message: M, transform: StampedTransform) -> StampedTransform:
-        """With the stamp to go by."""
+        """Return the transform with the corrected stamp."""
         stamp = sync.clocks.stamp(message.topic, transform.stamp, message.received)
         return transform if stamp == transform.stamp else replace(transform, stamp=stamp)
 
@@ -127,7 +137,7 @@ def make_handlers(
 
     def add_truth(message: M) -> None:
         topic, received = message.topic, message.received
-        if roles.boxes.get("topic") == topic:  # nobody says that it begins with a header
+        if roles.boxes.get("topic") == topic:  # such a message may lack a header
             boxes = read_boxes(message)
             sync.add_truth(topic, boxes.stamp, received, partial(replace, boxes))
         else:
@@ -171,7 +181,7 @@ def make_handlers(
 def make_around_handlers(
     sync: Synchronizer, roles: Roles, decode: Callable[[M], Any]
 ) -> dict[str, Handler[M]]:
-    """Of the topics that say something around perception."""
+    """Return a handler for each topic around perception."""
 
     def add(message: M, kind: str, short: str) -> None:
         content = decode(message)

@@ -1,13 +1,14 @@
-"""Which way is up at a LiDAR, so that ground, heights and boxes are not computed in a tilted frame.
+"""Estimation of the up direction at a LiDAR, so that ground and boxes are not computed in a tilted frame.
 
-REP 103 makes z the axis that points up in every body frame. The frame of a LiDAR that hangs upside down,
-is pitched towards the road or is a depth camera is none, and is turned upright. Who tells it, best first:
+REP 103 makes z of every body frame point up. The frame of a LiDAR that hangs upside down, of one that is
+pitched towards the road, and of a depth camera does not. Its points are turned upright. The sources of the
+direction, best first:
 
 1. the transforms to ``source.base_frame``, which is upright by definition (REP 105),
 2. the transforms to the fixed frame,
-3. gravity, as an accelerometer with transforms to the LiDAR feels it,
-4. the ground that the LiDAR sees,
-5. nobody: z of its frame is assumed to point up.
+3. gravity, by an accelerometer with transforms to the LiDAR,
+4. the ground in the scans of the LiDAR,
+5. none: z of the LiDAR's frame is assumed to point up.
 """
 
 from __future__ import annotations
@@ -23,22 +24,20 @@ from bevviz.messages.transforms import Acceleration
 from bevviz.model.frame import F32, F64, Cloud
 from bevviz.sync.transform_tree import TransformBuffer, TransformError
 
-TILT = math.radians(2.0)  # of a LiDAR on its robot, from which on it is turned
-SLOPE = math.radians(8.0)  # the same where nothing but the world tells it: a road may be as steep
-DISAGREEMENT = math.radians(12.0)  # between transforms and ground, from which on one of them is wrong
-GRAVITY_TIME = 2.0  # seconds that an acceleration is smoothed over: braking is no slope
-NEAR, POINTS, PLANES = 25.0, 4000, 400  # metres; points and planes that the ground is searched with
-LOW = 0.2  # of the points, by z, that as many planes more are drawn from
-THICKNESS = 0.12  # metres that the ground's points are from its plane
-SUPPORT, BELOW = 0.15, 0.02  # of the near points: in the ground at least, below it at most
-FLOOR, UNDER, LOWEST = (
-    0.05,
-    0.01,
-    0.5,
-)  # the same of the floor of a hall, and metres that it is below at least
-ASTRAY, SURE = math.radians(45.0), 0.25  # z of a frame, from which on a wall may be meant; its SUPPORT
+TILT = math.radians(2.0)  # least tilt of a LiDAR on its robot that is corrected
+SLOPE = math.radians(8.0)  # the same without a transform to the robot: a road may be as steep
+DISAGREEMENT = math.radians(12.0)  # between transforms and ground; more means that one of them is wrong
+GRAVITY_TIME = 2.0  # seconds of smoothing: braking is no slope
+# Metres from the LiDAR, points and planes of the search for the ground.
+NEAR, POINTS, PLANES = 25.0, 4000, 400
+LOW = 0.2  # share of points, the lowest by z, from which more planes are drawn
+THICKNESS = 0.12  # metres between the ground's points and its plane
+SUPPORT, BELOW = 0.15, 0.02  # shares of the near points: least in the ground, most below it
+# The same for the floor of a hall, and its least depth in metres.
+FLOOR, UNDER, LOWEST = 0.05, 0.01, 0.5
+ASTRAY, SURE = math.radians(45.0), 0.25  # angle to z at which a plane may be a wall, and its SUPPORT
 HEIGHTS = 0.15, 6.0  # metres from the ground to a LiDAR
-TRIES = 5  # scans that the ground is looked for in
+TRIES = 5  # scans that are searched for the ground
 
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # FLU from RDF (REP 103)
 _Z = np.array([0.0, 0.0, 1.0])
@@ -46,26 +45,31 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(slots=True)
 class Upright:
-    """Keeps what is known of the vertical during a drive.
+    """Estimate of the vertical during a drive.
 
     Args:
         tf: the transforms.
-        base_frame: of the robot.
+        base_frame: base frame of the robot.
         tolerance: seconds, see ``TransformBuffer.lookup``.
+
+    Attributes:
+        warnings: a sentence for each LiDAR frame with a doubtful vertical.
+        needs_gravity: whether an Imu could improve the estimate.
     """
 
     tf: TransformBuffer
     base_frame: str
     tolerance: float
-    warnings: dict[str, str] = field(default_factory=dict)  # by LiDAR frame
-    needs_gravity: bool = True  # whether an Imu could tell more than the transforms do
-    _gravity: dict[str, tuple[int, F64]] = field(default_factory=dict)  # by frame: stamp, mean acceleration
-    _ground: dict[str, F64] = field(default_factory=dict)  # up in a LiDAR's frame, where the ground is seen
+    warnings: dict[str, str] = field(default_factory=dict)
+    needs_gravity: bool = True
+    _gravity: dict[str, tuple[int, F64]] = field(default_factory=dict)  # stamp and mean acceleration by frame
+    _ground: dict[str, F64] = field(default_factory=dict)  # up direction by LiDAR frame, from the ground
     _tries: dict[str, int] = field(default_factory=dict)
-    _tilted: set[str] = field(default_factory=set)  # LiDAR frames once turned: they stay what they are
+    # LiDAR frames that are turned; they stay so during the drive.
+    _tilted: set[str] = field(default_factory=set)
 
     def add_acceleration(self, felt: Acceleration) -> None:
-        """Of an Imu: at rest it points up."""
+        """Add an acceleration of an Imu. At rest it points up."""
         norm = float(np.linalg.norm(felt.acceleration))
         if not math.isfinite(norm) or norm == 0:
             return
@@ -75,11 +79,11 @@ class Upright:
         self._gravity[frame] = felt.stamp, mean + share * (now - mean)
 
     def turn(self, cloud: Cloud, fixed_frame: str) -> F64 | None:
-        """(4, 4) that turns the points of a LiDAR upright about its origin; None: they are.
+        """Return the (4, 4) rotation that makes the points of a LiDAR upright; None if they are.
 
         Args:
-            cloud: in its own frame.
-            fixed_frame: above it in TF; empty: none is.
+            cloud: points in the LiDAR's frame.
+            fixed_frame: fixed frame above it in the transforms; empty: there is none.
         """
         frame = cloud.frame_id.lstrip("/")
         base = self._rotation(self.base_frame, frame, cloud.stamp)
@@ -102,7 +106,7 @@ class Upright:
         return _homogeneous(base if base is not None else _least_turn(frame, up))
 
     def _up(self, cloud: Cloud, frame: str, fixed_frame: str) -> tuple[F64 | None, str]:
-        """Up in a LiDAR's frame, by the fixed frame or by gravity, and who says so."""
+        """Return up in a LiDAR's frame, by the fixed frame or by gravity, and the name of the source."""
         world = self._rotation(fixed_frame, frame, cloud.stamp) if fixed_frame else None
         if world is not None:
             down = "ned" in re.split(r"[/_]", fixed_frame.lower())
@@ -115,6 +119,7 @@ class Upright:
         return None, ""
 
     def _by_ground(self, frame: str, ground: F64 | None) -> F64 | None:
+        """Return the rotation that makes the ground level. Warn, because no transform states it."""
         if ground is None:
             if self._tries[frame] == TRIES:
                 self.warnings[frame] = (
@@ -141,7 +146,7 @@ class Upright:
             return None
 
     def _seen_ground(self, cloud: Cloud, frame: str) -> F64 | None:
-        """Up by the ground, looked for in the first scans of a LiDAR only."""
+        """Return the up direction by the ground. Only the first scans of a LiDAR are searched for it."""
         if frame not in self._ground and self._tries.setdefault(frame, 0) < TRIES:
             self._tries[frame] += 1
             found = ground_normal(cloud.xyz)
@@ -151,34 +156,36 @@ class Upright:
 
 
 def ground_normal(points: F32) -> F64 | None:
-    """Up, as the ground under a LiDAR tells it, whatever way the LiDAR is turned.
+    """Estimate the up direction from the ground under a LiDAR with any orientation.
 
-    The ground is the plane through many of the near points that has almost nothing below it. Walls and
-    ceilings may have nothing behind them either, and in a hall most of the points. Of several planes it is
-    therefore one that z of the frame agrees with, where there is one, else the one with most points. One that
-    is turned as a wall is to z needs more of them, none like it opposite, and that not even few points are a
-    floor that z agrees with.
-    Planes are drawn at random (RANSAC: Fischler and Bolles 1981), always the same ones.
+    The ground is the plane through many of the near points that has almost no points below it. Walls and
+    ceilings may have no points behind them either, and in a hall they have most of the points. Therefore a
+    plane that z of the frame agrees with is preferred; if there is none, the plane with most points. A plane
+    that stands to z like a wall needs more points and no parallel plane opposite. Even a small floor that z
+    agrees with is preferred to it.
+
+    Planes are drawn at random (RANSAC: Fischler and Bolles 1981) with a fixed seed.
 
     Args:
         points: (N, 3) metres, the LiDAR at the origin.
 
     Returns:
-        (3,) unit vector; z, where a floor of few points agrees with it; None: no such plane.
+        (3,) unit vector; z if a small floor agrees with it; None if there is no ground.
     """
     near = points[np.einsum("ij,ij->i", points, points) < NEAR**2]
     if len(near) < 200:
         return None
     random = np.random.default_rng(0)
     sample = near[random.integers(0, len(near), POINTS)].astype(np.float64)
-    # Every third of a metre counts once: else the rings about the LiDAR are all that there is.
+    # Each cube of 0.3 m counts once. Otherwise the dense rings near the LiDAR would decide.
     _, first = np.unique(np.floor(sample / 0.3).astype(np.int64), axis=0, return_index=True)
     sample = sample[first]
-    low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]  # a floor of few points is not drawn else
+    # Otherwise few planes of a small floor are drawn.
+    low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]
     normals, heights = (
         np.concatenate(pair) for pair in zip(*(_planes(some, random) for some in (sample, low)), strict=True)
     )
-    distance = sample @ normals.T + heights  # (points, planes), above the plane
+    distance = sample @ normals.T + heights  # (points, planes) height above the plane
     support = (np.abs(distance) < THICKNESS).mean(axis=0)
     below = (distance < -2 * THICKNESS).mean(axis=0)
     floor = (support > FLOOR) & (below < UNDER) & (heights > LOWEST) & (heights < HEIGHTS[1])
@@ -200,25 +207,26 @@ def ground_normal(points: F32) -> F64 | None:
 
 
 def _planes(points: F64, random: np.random.Generator) -> tuple[F64, F64]:
-    """(P, 3) normals and (P,) distances of planes through three of the points; they face the origin."""
+    """Return (P, 3) normals, facing the origin, and (P,) distances of planes through three random points."""
     a, b, c = (points[random.integers(0, len(points), PLANES)] for _ in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     normals, origins = normals[lengths > 0.5] / lengths[lengths > 0.5, None], a[lengths > 0.5]
     height = np.einsum("ij,ij->i", normals, origins)
-    normals[height > 0] *= -1  # the LiDAR is above its ground
+    normals[height > 0] *= -1  # the LiDAR is above the ground
     return normals, np.abs(height)
 
 
 def _least_turn(frame: str, up: F64) -> F64:
-    """(3, 3) that turns ``up`` to z and else as little as it can, so that ahead stays ahead.
+    """Return the smallest (3, 3) rotation that turns ``up`` to z, so that ahead stays ahead.
 
-    The optical frame of a depth camera looks along z; it is made to look along x first.
+    The optical frame of a depth camera looks along z. It is turned to look along x first.
     """
     start = _OPTICAL if "optical" in frame.lower() else np.eye(3)
     x, y, z = start @ up
     if z < 0 and math.hypot(x, y) < 1e-6:
-        # Upside down every axis is as good: about x, ahead stays ahead. What is left is turned as ever.
+        # Upside down, every horizontal axis is equally good. A turn about x keeps the forward
+        # direction. The remaining turn follows.
         start = np.diag([1.0, -1.0, -1.0]) @ start
     axis = np.cross(start @ up, _Z)
     sine, cosine = float(np.linalg.norm(axis)), float((start @ up)[2])

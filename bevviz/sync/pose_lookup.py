@@ -1,4 +1,4 @@
-"""Where the points and sensors of one time are, to one another and in the world."""
+"""Poses of points, sensors and boxes at one time, to each other and in the world."""
 
 from __future__ import annotations
 
@@ -19,43 +19,53 @@ from bevviz.sync.report import SyncReport
 from bevviz.sync.transform_tree import Lookup, Origin, TransformError
 
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
-GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
-LEVEL = math.cos(math.radians(20))  # a frame that leans by less, as on a road, has upright boxes
+GLOBE_FRAMES = {"earth", "ecef", "utm"}  # their coordinates are too large for the float32 of a viewer
+LEVEL = math.cos(math.radians(20))  # boxes in a frame that leans less, as on a road, count as upright
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the points of a frame are, and how they hang together with the world."""
+    """Reference frames of the points of a frame.
+
+    Attributes:
+        stamp: stamp of the cloud, nanoseconds.
+        points_frame: frame of the points.
+        world_frame: fixed frame; empty: there is none.
+        inertial_frame: smoothest fixed frame, for motion compensation; empty: there is none.
+        upright: (4, 4) points from points_frame; None: points_frame is upright.
+        world_from_points: (4, 4) pose; None: not known.
+        tf_age: seconds from the stamp to the nearest transform.
+    """
 
     stamp: int
     points_frame: str
-    world_frame: str  # "" where there is none
-    inertial_frame: str  # the smoothest fixed frame, to compensate motion with; "" where there is none
-    upright: F64 | None = None  # (4, 4) points from points_frame; None: it is upright
+    world_frame: str
+    inertial_frame: str
+    upright: F64 | None = None
     world_from_points: F64 | None = None
     tf_age: float = float("nan")
 
     def points_from(self, frame: Lookup) -> Lookup:
-        """Of what was looked up in ``points_frame``."""
+        """Convert a transform to ``points_frame`` into one to the points."""
         return frame if self.upright is None else replace(frame, matrix=self.upright @ frame.matrix)
 
     def from_points(self, matrix: F64) -> F64:
-        """The same the other way round."""
+        """Convert a transform from ``points_frame`` into one from the points."""
         return matrix if self.upright is None else matrix @ geometry.inverse(self.upright)
 
 
 class Placing:
-    """Finds the frames of reference of each cloud, and what the transforms say of it.
+    """Finder of poses: the reference frames of each cloud, and the transforms to them.
 
     Args:
         config: source.base_frame, source.fixed_frame, source.extrinsics and the tolerances of ``sync``.
-        report: is told what is missing; its transforms are those that are asked.
-        upright: finds which way is up.
-        turned: whether clouds may have to be turned upright: there is a LiDAR.
-        merged: whether there are several, whose points are taken to source.base_frame.
+        report: counts missing transforms. It also holds the transforms.
+        upright: estimate of the vertical.
+        turned: whether clouds may need to be turned upright, because there is a LiDAR.
+        merged: whether the points of several LiDARs are merged in source.base_frame.
 
     Attributes:
-        odometry_frames: that Odometry is in.
+        odometry_frames: frames that odometry is in.
     """
 
     def __init__(
@@ -69,12 +79,12 @@ class Placing:
             self._tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
 
     def take_over(self, former: Placing) -> None:
-        """Go on with the transforms of ``former``."""
+        """Continue with the transforms of ``former``."""
         self._report, self._upright, self._tf = former._report, former._upright, former._tf
         self.odometry_frames = former.odometry_frames
 
     def of(self, cloud: Cloud, problems: list[str] | None = None) -> Place:
-        """Find the frames of reference; with ``problems``, also where the points are in the world."""
+        """Find the reference frames of a cloud. With ``problems``, also find its pose in the world."""
         points_frame = cloud.frame_id.lstrip("/")
         base = self._config.source.base_frame
         if self._merged and self._tf.knows(base, points_frame):
@@ -108,7 +118,7 @@ class Placing:
         return replace(place, world_from_points=place.from_points(found.matrix), tf_age=found.age)
 
     def fixed(self, points_frame: str) -> tuple[str, str]:
-        """The world's frame and the smoothest fixed frame above ``points_frame``; "" where there is none."""
+        """Return the world frame and the smoothest fixed frame above ``points_frame``; empty if none."""
         path = self._tf.ancestors(points_frame)
         fixed = [f for f in path if f in self.odometry_frames or _words(f) & FIXED_FRAMES]
         near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
@@ -116,7 +126,7 @@ class Placing:
         return given or (near[-1] if near else ""), near[0] if near else given
 
     def pose(self, frame: Frame, stamp: int) -> F64 | None:
-        """(4, 4) smoothest fixed frame from points, as far as the transforms reach so far."""
+        """Return (4, 4) smoothest fixed frame from points; None if the transforms do not reach the stamp."""
         inertial = self.fixed(frame.points_frame)[1]
         if not inertial:
             return None
@@ -127,7 +137,7 @@ class Placing:
         return found.matrix if frame.upright is None else found.matrix @ geometry.inverse(frame.upright)
 
     def moved(self, place: Place, stamp: int, frame: str) -> tuple[Lookup, bool]:
-        """points at the cloud's stamp from ``frame`` at ``stamp``, and whether motion is compensated."""
+        """Return points at the cloud's stamp from ``frame`` at ``stamp``; and if motion is compensated."""
         tolerance = self._config.sync.tf_tolerance
         if self.compensates(place):
             try:
@@ -136,14 +146,15 @@ class Placing:
                 )
                 return place.points_from(found), True
             except TransformError:
-                pass  # without motion is the next best
+                pass  # fall back to no motion compensation
         return place.points_from(self._tf.lookup(place.points_frame, frame, place.stamp, tolerance)), False
 
     def compensates(self, place: Place) -> bool:
+        """Return whether motion is to be compensated."""
         return self._config.sync.motion_compensation and bool(place.inertial_frame)
 
     def mounting(self, place: Place, frame: str) -> F64 | None:
-        """frame from points at the cloud's stamp, None where TF does not say."""
+        """Return (4, 4) frame from points at the cloud's stamp; None if they are not connected."""
         try:
             found = self._tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
         except TransformError:
@@ -151,7 +162,7 @@ class Placing:
         return geometry.inverse(place.points_from(found).matrix)
 
     def world_from(self, place: Place, frame: str) -> F64 | None:
-        """world from a frame at the cloud's stamp; None where TF does not say."""
+        """Return (4, 4) world from a frame at the cloud's stamp; None if they are not connected."""
         if not frame:
             return None
         from_points = self.mounting(place, frame)
@@ -161,16 +172,17 @@ class Placing:
         return world @ geometry.inverse(from_points)
 
     def placed(self, boxes: LabelledBoxes3D, place: Place, problems: list[str]) -> LabelledBoxes3D:
-        """The boxes with their place in the world.
+        """Return the boxes with their pose in the world.
 
-        Where they lean in the frame of the points, or are in several frames, they become upright ones in it.
+        Boxes that lean in the frame of the points, or are in several frames, become upright boxes in the
+        points' frame.
         """
         if not len(boxes.boxes):
-            return boxes  # without any there may be no frame, either
+            return boxes  # an empty message may lack a frame
         world = place.world_from_points
         stamp = place.stamp if world is None else boxes.stamp
         target = place.points_frame if world is None else place.world_frame
-        poses = dict[str, F64]()  # of what each frame is in, in the world
+        poses = dict[str, F64]()  # (4, 4) world from each frame of the boxes
         for frame in dict.fromkeys(boxes.frames or (boxes.frame_id,)):
             try:
                 found = self._tf.lookup(target, frame, stamp, self._config.sync.tf_tolerance)
@@ -189,7 +201,7 @@ class Placing:
 
 
 def _upright(boxes: LabelledBoxes3D, poses: Mapping[str, F64], place: Place) -> LabelledBoxes3D:
-    """The boxes in the frame of the points; those in frames that ``poses`` lacks are left out."""
+    """Return upright boxes in the frame of the points. Boxes in frames that ``poses`` lacks are left out."""
     frames = boxes.frames or (boxes.frame_id,) * len(boxes.boxes)
     rows = [row for row, frame in enumerate(frames) if frame in poses]
     kept = boxes.boxes.chosen(rows)

@@ -1,4 +1,4 @@
-"""What synchronising has counted and found odd, and its words."""
+"""Counts and oddities of the synchronisation, and their sentences."""
 
 from __future__ import annotations
 
@@ -19,35 +19,65 @@ from bevviz.sync.unusable_messages import Damage
 
 @dataclass(slots=True)
 class SyncReport:
-    """What arrived, what was lost and what looked wrong so far."""
+    """Counts of arrived and lost messages, and oddities, so far.
 
-    clouds: int = 0  # of every LiDAR
+    Attributes:
+        clouds: clouds of all LiDARs.
+        frames: frames that were delivered.
+        reordered: clouds that came out of order and were put back in order.
+        late: clouds that were dropped, because a newer one had been delivered.
+        duplicates: clouds that were dropped, because another one had the same stamp.
+        unwaited: clouds that were delivered early, because the queue was full.
+        resets: how often the stamps of the clouds jumped back.
+        gaps: how often the stamps of the clouds jumped forward, by a second and three usual steps or more.
+        longest_gap: seconds.
+        idle: topic of the driving LiDAR, if only others deliver.
+        unstamped: messages with stamp zero, by topic.
+        repeated: messages with the stamp of another message, by topic.
+        without_image: frames without an image, by camera.
+        images: decoded images of all cameras.
+        undecodable: images that cannot be decoded, by camera.
+        first_undecodable: reason for the first such image, by camera.
+        untold: gaps in video whose packets do not tell if one is lost, by topic and codec.
+        damage: ground truth that cannot be decoded.
+        boxes: boxes of ground truth and robot that cannot be used.
+        problems: frames with a missing transform or CameraInfo, by sentence.
+        tf: the transforms, with their problems.
+        upright: a sentence for each doubtful vertical, by LiDAR frame.
+        clocks: lags of the topics.
+        clocked: topics whose clocks must agree.
+        oddities: a sentence for each topic with suspicious content.
+        overtaken: results that came after their frame had been delivered, by topic.
+        slowest: longest delay of such a result after its stamp, seconds, by topic.
+    """
+
+    clouds: int = 0
     frames: int = 0
-    reordered: int = 0  # clouds that came out of order, put back in their place
-    late: int = 0  # clouds dropped: a newer one had been delivered already
-    duplicates: int = 0  # clouds dropped: same stamp as another
-    unwaited: int = 0  # clouds sent on early, the queue being full
-    resets: int = 0  # stamps of the clouds that jumped back
-    gaps: int = 0  # stamps of the clouds that jumped forward, by a second and three usual steps or more
-    longest_gap: float = 0.0  # seconds
-    idle: str = ""  # topic of the LiDAR that should drive, while only others deliver
-    unstamped: Counter[str] = field(default_factory=Counter)  # topic -> messages with stamp zero
-    repeated: Counter[str] = field(default_factory=Counter)  # topic -> messages with the stamp of another one
-    without_image: Counter[str] = field(default_factory=Counter)  # camera -> frames
-    images: int = 0  # of all cameras, decoded
-    undecodable: Counter[str] = field(default_factory=Counter)  # camera -> images
-    first_undecodable: dict[str, str] = field(default_factory=dict)  # camera -> why the first was
-    untold: Counter[tuple[str, str]] = field(default_factory=Counter)  # topic, codec -> gaps in its video
-    damage: Damage = field(default_factory=Damage)  # ground truth that could not be decoded
-    boxes: Damage = field(default_factory=partial(Damage, "box(es)"))  # of ground truth and the robot
-    problems: Counter[str] = field(default_factory=Counter)  # missing transforms and CameraInfo -> frames
-    tf: TransformBuffer = field(default_factory=TransformBuffer)  # for what looked wrong in the transforms
-    upright: Mapping[str, str] = field(default_factory=dict)  # for what is doubtful about the vertical
+    reordered: int = 0
+    late: int = 0
+    duplicates: int = 0
+    unwaited: int = 0
+    resets: int = 0
+    gaps: int = 0
+    longest_gap: float = 0.0
+    idle: str = ""
+    unstamped: Counter[str] = field(default_factory=Counter)
+    repeated: Counter[str] = field(default_factory=Counter)
+    without_image: Counter[str] = field(default_factory=Counter)
+    images: int = 0
+    undecodable: Counter[str] = field(default_factory=Counter)
+    first_undecodable: dict[str, str] = field(default_factory=dict)
+    untold: Counter[tuple[str, str]] = field(default_factory=Counter)
+    damage: Damage = field(default_factory=Damage)
+    boxes: Damage = field(default_factory=partial(Damage, "box(es)"))
+    problems: Counter[str] = field(default_factory=Counter)
+    tf: TransformBuffer = field(default_factory=TransformBuffer)
+    upright: Mapping[str, str] = field(default_factory=dict)
     clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
-    clocked: tuple[str, ...] = ()  # topics whose clocks must be one
-    oddities: dict[str, str] = field(default_factory=dict)  # topic -> what its messages should not say
-    overtaken: Counter[str] = field(default_factory=Counter)  # topic -> results whose frame had gone on
-    slowest: dict[str, float] = field(default_factory=dict)  # topic -> seconds after its stamp, at worst
+    clocked: tuple[str, ...] = ()
+    oddities: dict[str, str] = field(default_factory=dict)
+    overtaken: Counter[str] = field(default_factory=Counter)
+    slowest: dict[str, float] = field(default_factory=dict)
 
     def note_boxes(self, found: LabelledBoxes2D | LabelledBoxes3D) -> None:
         """Count the boxes of a message that were left out."""
@@ -55,16 +85,19 @@ class SyncReport:
             self.boxes.add(found.topic, why)
 
     def complain(self, problems: list[str], text: str) -> None:
-        """Tell a frame, and count here, where sentences that differ in a number are one."""
+        """Add a sentence to the problems of a frame.
+
+        Count it, too. Sentences that differ only in seconds count as one.
+        """
         problems.append(text)
         self.problems[re.sub(r"\d+\.\d+ s ", "", text)] += 1
 
     def doubts(self) -> tuple[str, ...]:
-        """One sentence for whatever may make every frame wrong: clocks, units, which way is up."""
+        """Return a sentence for each fault that may affect every frame: clocks, units, the vertical."""
         return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
 
     def losses(self) -> list[str]:
-        """Return one sentence for each camera and topic with content that could not be used."""
+        """Return a sentence for each camera and topic with content that could not be used."""
         images = [
             f"camera '{camera}': an image could not be decoded {_times(n)}, the first: "
             f"{self.first_undecodable[camera]}"
@@ -73,7 +106,7 @@ class SyncReport:
         return [*images, *self.damage.sentences, *self.boxes.sentences]
 
     def warnings(self) -> tuple[str, ...]:
-        """One sentence each."""
+        """Return all sentences."""
         counted = [
             (self.reordered, "{} came out of order and {} put back in order"),
             (self.late, "{} came after a newer one had gone on and {} dropped"),
@@ -117,16 +150,19 @@ class SyncReport:
 
 
 def _after(seconds: float) -> str:
-    """Of the latest one: stamps may be ahead of their receipt, too."""
+    """Describe the delay of the latest result. Stamps may be ahead of their receipt."""
     if seconds < 0.005:
         return "none of them later than its stamp"
     return f"at worst {seconds:.2f} s after the stamp"
 
 
 def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
-    """Why the detector's model was shown no image at all, in one sentence; empty where it was shown one.
+    """Return why the detector's model got no image, as one sentence in a list; empty if it got one.
 
-    ``report``: of the frames so far; None: there were none yet.
+    Args:
+        config: names the model.
+        roles: roles of the topics.
+        report: report of the frames so far; None: there were none.
     """
     model = config.detector.model
     if not model or model.startswith(TOPIC):

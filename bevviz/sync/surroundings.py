@@ -1,4 +1,4 @@
-"""What the robot says around its perception, until the next frame takes it along."""
+"""Buffer of the robot's messages around its perception, until the next frame takes them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bevviz.model.frame import F64, Around, Motion, Shape, Status
 
 _Sample: TypeAlias = tuple[int, int, Sequence[float], Sequence[float]]
 
-MANY = 200  # statuses and shapes that are kept; the oldest goes
-SAMPLES = 5000  # of an Imu that wait for a frame; the oldest goes
-MARKS = 100  # that wait for a frame
+MANY = 200  # most statuses and shapes; the oldest is dropped
+SAMPLES = 5000  # most Imu samples between two frames; the oldest is dropped
+MARKS = 100  # most marks between two frames
 
 
 class Surroundings:
-    """Marks and samples of an Imu belong to the one frame that comes next.
+    """Buffer of marks, statuses, shapes and Imu samples.
 
-    Statuses and shapes hold until there are others.
+    A mark or a sample belongs to the next frame only. Statuses and shapes hold until newer ones come.
     """
 
     def __init__(self) -> None:
@@ -31,16 +31,19 @@ class Surroundings:
         self._samples: dict[str, deque[_Sample]] = {}  # by topic
 
     def add_mark(self, text: str) -> None:
+        """Add a mark."""
         self._marks.append(text)
         del self._marks[:-MARKS]
 
     def add_motion(
         self, topic: str, stamp: int, received: int, rotation: Sequence[float], acceleration: Sequence[float]
     ) -> None:
+        """Add a sample of an Imu: rotation rate and acceleration."""
         samples = self._samples.setdefault(topic, deque(maxlen=SAMPLES))
         samples.append((stamp, received, rotation, acceleration))
 
     def add_statuses(self, statuses: Sequence[Status]) -> None:
+        """Add statuses. Each replaces the status of the same name."""
         for status in statuses:
             self._statuses.pop(status.name, None)
             self._statuses[status.name] = status
@@ -48,13 +51,14 @@ class Surroundings:
             del self._statuses[next(iter(self._statuses))]
 
     def add_shapes(self, topic: str, shapes: list[Shape]) -> None:
+        """Replace the shapes of a topic."""
         self._shapes[topic] = shapes[-MANY:]
 
     def take(self, place: Callable[[str], F64 | None]) -> Around | None:
-        """All of it, for a frame; None: there is nothing.
+        """Return the surroundings for a frame; None if there are none.
 
         Args:
-            place: (4, 4) world from a frame at the time of the cloud; None: not connected.
+            place: returns (4, 4) world from a frame at the stamp of the cloud; None: not connected.
         """
         if not (self._marks or self._statuses or self._shapes or self._samples):
             return None

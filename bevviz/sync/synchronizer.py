@@ -1,4 +1,4 @@
-"""Brings clouds, images, transforms and boxes of one time together into frames; the LiDAR drives."""
+"""Synchroniser of clouds, images, transforms and boxes into frames, driven by the LiDAR."""
 
 from __future__ import annotations
 
@@ -41,43 +41,54 @@ from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000
-LATENCY = 2 * SECOND  # the longest a cloud is expected to arrive after an image of the same stamp
+LATENCY = 2 * SECOND  # longest delay of a cloud after an image of the same stamp
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
-FAR = 500.0  # metres that no LiDAR has half of its points beyond
-OVERTAKEN = 64  # results and frames that late results are placed by
-GLOBE_FRAMES = {"earth", "ecef", "utm"}  # coordinates too large for the float32 of a viewer
+FAR = 500.0  # metres; no LiDAR has half of its points farther away
+OVERTAKEN = 64  # late results, and frames to compare them with, that are kept
+GLOBE_FRAMES = {"earth", "ecef", "utm"}  # their coordinates are too large for the float32 of a viewer
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True)
 class _UndecodedBoxes:
-    """When boxes were, and how to get them."""
+    """Boxes that are not decoded yet.
+
+    Attributes:
+        stamp: nanoseconds.
+        load: decodes the boxes.
+    """
 
     stamp: int
     load: Callable[[], LabelledBoxes3D]
 
 
 class Synchronizer:
-    """Bounded in memory; the same for a bag and a live robot. Messages come in the order of receipt.
+    """Synchroniser of the messages of a bag or a live robot, with bounded memory.
 
-    A cloud waits until each camera has an image of its stamp or later and the transforms reach as far,
-    at most ``sync.max_wait`` seconds of received time, and in a queue of ``sync.queue``. Clouds out of
-    order within the queue are put back in order; later ones are dropped, and all of it is counted.
+    Messages come in order of receipt. A cloud waits until each camera has an image of its stamp or later and
+    the transforms reach its stamp. It waits at most ``sync.max_wait`` seconds of received time, in a queue of
+    ``sync.queue`` clouds. Clouds that are out of order within the queue are put back in order. Later ones are
+    dropped and counted.
 
     Args:
-        roles: which topic is what.
+        roles: roles of the topics.
         config: tolerances and queues.
-        beside: topics of the robot's boxes that no frame waits for: what comes too late for its frame is to
-            be had from ``overtaken``.
+        beside: topics of the robot's boxes for which no frame waits. ``overtaken`` returns those that come
+            too late for their frame.
 
     Attributes:
-        followed: the frame that odometry places.
+        report: counts and oddities.
+        followed: child frame of the odometry; empty: not known yet.
+        absent: topics without a publisher, for which no frame waits.
+        videos: video by topic.
+        placing: finder of poses.
+        cameras: buffer of images and calibrations.
     """
 
     def __init__(self, roles: Roles, config: Config, beside: Collection[str] = ()) -> None:
         self.report = SyncReport()
         self.followed = ""
-        self.absent: frozenset[str] = frozenset()  # topics that nobody publishes now: not waited for
+        self.absent: frozenset[str] = frozenset()
         self.tf = self.report.tf
         self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
@@ -90,21 +101,22 @@ class Synchronizer:
         self._wait = round(config.sync.max_wait * 1e9)
         self._horizon = self._wait + self._tolerance + LATENCY
         self._now = 0
-        self._clouds: list[Cloud] = []  # of the driving LiDAR, in order of stamp
+        self._clouds: list[Cloud] = []  # clouds of the driving LiDAR, in order of stamp
         self._done: deque[Frame] = deque()
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
         self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
-        self.videos: dict[str, Video] = {}  # by topic
-        self._lidar_frames: dict[str, str] = {}  # cloud topic -> frame
+        self.videos: dict[str, Video] = {}
+        self._lidar_frames: dict[str, str] = {}  # frame by cloud topic
         self._boxes: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
         self._detections: dict[str, Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
         self._robot_clouds: dict[str, Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
         self._truth: dict[str, Track[_UndecodedBoxes]] = self._make_tracks(*filter(None, [roles.truth]))
         self._beside = frozenset(beside)
         self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
-        self._places: deque[tuple[Place, F64]] = deque(maxlen=OVERTAKEN)  # of the last frames, their poses
+        # Reference frames and poses of the last frames.
+        self._places: deque[tuple[Place, F64]] = deque(maxlen=OVERTAKEN)
         self.placing = Placing(
             config, self.report, self.upright, turned=bool(roles.lidars), merged=bool(self._partners)
         )
@@ -114,7 +126,7 @@ class Synchronizer:
         return {topic: Track(self._horizon) for topic in topics}
 
     def take_over(self, former: Synchronizer) -> None:
-        """Go on with the transforms, calibrations and counts of ``former``, when the roles change."""
+        """Continue with the transforms, calibrations and counts of ``former`` when the roles change."""
         clocked = self.report.clocked
         self.report, self.absent = former.report, former.absent
         self.report.clocked = clocked
@@ -127,7 +139,7 @@ class Synchronizer:
     # --- what comes in -------------------------------------------------------------------------
 
     def add_cloud(self, cloud: Cloud) -> None:
-        """A scan of a LiDAR, told by ``cloud.topic``."""
+        """Add a scan. ``cloud.topic`` tells its LiDAR."""
         if cloud.topic not in self._roles.lidars:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
@@ -141,7 +153,7 @@ class Synchronizer:
         self._drive(cloud)
 
     def _drive(self, cloud: Cloud) -> None:
-        """A frame for a cloud of the driving LiDAR."""
+        """Queue a cloud of the driving LiDAR for a frame."""
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
         place = bisect_left(stamps, cloud.stamp)
@@ -156,55 +168,71 @@ class Synchronizer:
     def add_image(
         self, topic: str, stamp: int, frame_id: str, received: int, load: Callable[[], Image]
     ) -> None:
-        """An image not yet decoded: ``load`` is called only when a frame takes it.
+        """Add an image that is not decoded yet.
 
-        ``load`` may raise a UserError, which becomes a problem of that frame's camera.
+        Args:
+            topic: topic of the image.
+            stamp: stamp of its header, nanoseconds.
+            frame_id: frame of its header.
+            received: time of receipt, nanoseconds.
+            load: decodes the image when a frame takes it. A UserError that it raises becomes a problem of the
+                camera.
         """
         if topic in self.cameras.images:
             stamp = self._arrived(topic, stamp, received)
             repeated = self.cameras.add_image(topic, stamp, frame_id, load)
-            if topic not in self.videos:  # whose parameters may come before the picture, with its stamp
+            if topic not in self.videos:  # parameters of a video may precede the picture with the same stamp
                 self.report.repeated[topic] += repeated
-            if topic == self._roles.driver:  # there is no LiDAR
+            if topic == self._roles.driver:  # without a LiDAR the camera drives
                 self.report.clouds += 1
                 self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
-        """``topic`` is that of the CameraInfo; for an image the one that is nearest in stamp holds."""
+        """Add a calibration on a CameraInfo topic. An image uses the calibration with the nearest stamp."""
         self.cameras.add_info(topic, self._arrived(topic, stamp, received), intrinsics)
 
     def refuse_camera_info(self, topic: str, reason: str) -> None:
-        """A calibration that cannot be used; the reason is that of the camera where there is no other."""
+        """Note why a calibration cannot be used. The camera reports it if it has no other calibration."""
         self.cameras.refuse_info(topic, reason)
 
     def add_transform(
         self, transform: StampedTransform, static: bool = False, fallback: bool = False, held: bool = False
     ) -> None:
-        """``fallback``: from Odometry, used only where nothing else states the child's parent.
+        """Add a transform.
 
-        ``held``: what is stated once holds until there is more.
+        Args:
+            transform: the transform.
+            static: whether it holds at any time.
+            fallback: whether it is from odometry, which is used only if nothing else states the parent of the
+                child.
+            held: whether it holds until the next one.
         """
         if fallback:
             self.placing.odometry_frames.add(transform.parent.lstrip("/"))
         self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held)
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
-        """The robot's own 3D boxes."""
+        """Add 3D boxes of the robot."""
         self._add_result(self._boxes, boxes)
 
     def add_detections(self, detections: LabelledBoxes2D) -> None:
-        """The robot's own image boxes."""
+        """Add image boxes of the robot."""
         self._add_result(self._detections, detections)
 
     def add_robot_cloud(self, cloud: Cloud) -> None:
-        """The robot's own points without the ground."""
+        """Add the robot's points without the ground."""
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         self._robot_clouds[cloud.topic].add(stamp, replace(cloud, stamp=stamp))
 
     def add_truth(self, topic: str, stamp: int, received: int, load: Callable[[], LabelledBoxes3D]) -> None:
-        """Ground truth not yet decoded: ``load`` is called only when a frame takes it.
+        """Add ground truth that is not decoded yet.
 
-        ``load`` may raise a UserError: it is counted, and the boxes are as if they had not come.
+        Args:
+            topic: topic of the boxes.
+            stamp: stamp, nanoseconds.
+            received: time of receipt, nanoseconds.
+            load: decodes the boxes when a frame takes them. If it raises a UserError, this is counted and the
+                boxes are ignored.
         """
         stamp = self._arrived(topic, stamp, received)
         track = self._truth.setdefault(topic, Track(self._horizon))
@@ -220,14 +248,14 @@ class Synchronizer:
             self.report.repeated[result.topic] += track.add(stamp, result)
 
     def _is_past(self, stamp: int) -> bool:
-        """Whether the frame that is nearest to a stamp has gone on."""
+        """Return whether the frame nearest to a stamp has been delivered."""
         if self._last is None:
             return False
         after = self._clouds[0].stamp if self._clouds else self._last + self._step
         return stamp <= min(self._last + self._tolerance, (self._last + after) / 2)
 
     def _overtake(self, result: LabelledBoxes2D | LabelledBoxes3D) -> None:
-        """Place a result of the robot's where no frame takes it."""
+        """Note a result of the robot that no frame takes, with the frame nearest to it."""
         self.report.overtaken[result.topic] += 1
         late = (result.received - result.stamp) * 1e-9
         self.report.note_boxes(result)
@@ -243,13 +271,13 @@ class Synchronizer:
         self._overtaken.append(LateResult(result, place.stamp, pose))
 
     def overtaken(self) -> tuple[LateResult, ...]:
-        """The robot's results that no frame has taken, since the last call."""
+        """Return the robot's results that no frame has taken since the last call."""
         found = tuple(self._overtaken)
         self._overtaken.clear()
         return found
 
     def _arrived(self, topic: str, stamp: int, received: int) -> int:
-        """The stamp to go by."""
+        """Return the stamp to use."""
         self._now = received
         if stamp == 0:
             self.report.unstamped[topic] += 1
@@ -257,10 +285,10 @@ class Synchronizer:
         return self.clocks.stamp(topic, stamp, received)
 
     def _check_units(self, cloud: Cloud) -> None:
-        """In millimetres, or far from the origin of a map, nothing is within the reach of any stage."""
+        """Warn of coordinates in millimetres or far from the origin of a map, which no stage reaches."""
         if cloud.topic not in self.report.oddities and len(cloud.xyz):
             some = cloud.xyz[::16]
-            x, y, z = np.abs(some).T  # their maximum, faster than by row
+            x, y, z = np.abs(some).T  # maximum of each point, faster than max(axis=1)
             middle = float(np.median(np.maximum(np.maximum(x, y), z)))
             if middle > FAR:
                 around = float(np.median(np.abs(some - np.median(some, axis=0)).max(axis=1)))
@@ -287,7 +315,7 @@ class Synchronizer:
             self._step = step
 
     def _reset(self, stamp: int) -> None:
-        """The clock went back to ``stamp``: a bag played in a loop, or a simulation restarted."""
+        """Start again at ``stamp``: the clock jumped back, as with a bag in a loop or a new simulation."""
         self.report.resets += 1
         self._done.extend(self._build_all())
         self._last = None
@@ -296,7 +324,7 @@ class Synchronizer:
             track.keep(0, stamp + JUMP)
 
     def _tracks(self) -> Iterator[tuple[str, Track[Any]]]:
-        """Topic and messages."""
+        """Iterate over all topics and their buffers."""
         groups: tuple[Mapping[str, Track[Any]], ...] = (
             self._partners,
             self.cameras.images,
@@ -309,7 +337,7 @@ class Synchronizer:
             yield from group.items()
 
     def lacking(self) -> Iterator[str]:
-        """What keeps frames from being whole so far, and may still come: calibrations and transforms."""
+        """Yield a sentence for each calibration or transform that is missing so far and may still come."""
         lidar = next(iter(self._lidar_frames.values()), "")
         for camera in self._roles.cameras:
             if camera.info_topic and camera.info_topic not in self.cameras.intrinsics:
@@ -324,10 +352,12 @@ class Synchronizer:
     # --- what goes out -------------------------------------------------------------------------
 
     def ready(self, now: int | None = None) -> Iterator[Frame]:
-        """The frames, in order of stamp, that have all they wait for, or have waited long enough.
+        """Yield the frames, in order of stamp, that are complete or have waited long enough.
 
-        ``now``: newest received time in nanoseconds; None: that of the last message added. Call it
-        after every message, or every few: what is not fetched is held.
+        Call it after every message, or after a few. Frames are kept until they are taken.
+
+        Args:
+            now: newest time of receipt, nanoseconds; None: that of the last message.
         """
         if now is not None:
             self._now = now
@@ -342,7 +372,7 @@ class Synchronizer:
             yield self._build()
 
     def flush(self) -> Iterator[Frame]:
-        """The frames still held, at the end of the stream."""
+        """Yield the remaining frames at the end of the stream."""
         while self._done:
             yield self._done.popleft()
         yield from self._build_all()
@@ -354,7 +384,7 @@ class Synchronizer:
             yield self._build()
 
     def _complete(self) -> bool:
-        """Whether nothing that may still come could change the oldest cloud's frame."""
+        """Return whether no further message can change the frame of the oldest cloud."""
         stamp = self._clouds[0].stamp
         beside = self.absent | self._beside
         waited = [track for topic, track in self._tracks() if topic not in beside]
@@ -382,7 +412,7 @@ class Synchronizer:
         return nearest is not None and 0 < nearest[0] - stamp <= self._tolerance
 
     def _transforms_reach(self, cloud: Cloud) -> bool:
-        """Whether the transforms have samples up to the cloud and to all that it is joined with."""
+        """Return whether the transforms reach the stamps of the cloud and the messages joined with it."""
         place = self.placing.of(cloud)
         moving = self._roles.tf or self._roles.odometry
         if moving and not place.world_frame:
@@ -443,7 +473,7 @@ class Synchronizer:
         return self._passed(place, frame)
 
     def _passed(self, place: Place, frame: Frame) -> Frame:
-        """The frame, from here on that of before."""
+        """Note that the frame is delivered. Return it."""
         last = self._window(frame.stamp)[1]
         self._index += 1
         self._last = frame.stamp
@@ -465,7 +495,7 @@ class Synchronizer:
     def _gather(
         self, cloud: Cloud, place: Place, problems: list[str]
     ) -> tuple[tuple[Cloud, ...], tuple[F64, ...]]:
-        """The clouds of every LiDAR nearest to ``cloud``, each with points_from_cloud."""
+        """Return the clouds of all LiDARs nearest to ``cloud``, and points_from_cloud of each."""
         clouds, poses = [cloud], [np.eye(4) if place.upright is None else place.upright]
         if place.points_frame != cloud.frame_id.lstrip("/"):
             try:
@@ -488,7 +518,7 @@ class Synchronizer:
         return tuple(clouds), tuple(poses)
 
     def _window(self, stamp: int) -> tuple[int, int]:
-        """The stamps that are nearer to this cloud than to its neighbours, within the tolerance."""
+        """Return the first and last stamp nearer to this cloud than to others, within the tolerance."""
         first, last = stamp - self._tolerance, stamp + self._tolerance
         if self._last is not None:
             first = max(first, (self._last + stamp) // 2 + 1)
@@ -511,7 +541,7 @@ class Synchronizer:
     def _robot_detections(
         self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int
     ) -> tuple[LabelledBoxes2D, ...]:
-        """The robot's image boxes of this time, each told its camera by the image's frame."""
+        """Return the robot's image boxes of this time, with the camera that has their frame."""
         names = {c.image.frame_id: c.name for c in cameras if c.image is not None}
         taken = (track.take(stamp, first, last) for track in self._detections.values())
         found = [detections for detections in taken if detections is not None]
@@ -520,7 +550,7 @@ class Synchronizer:
         return tuple(d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found)
 
     def _taken_clouds(self, place: Place, first: int, last: int, problems: list[str]) -> tuple[Cloud, ...]:
-        """The robot's clouds of this time, in the frame of the points."""
+        """Return the robot's clouds of this time, in the frame of the points."""
         found = []
         for track in self._robot_clouds.values():
             cloud = track.take(place.stamp, first, last)
@@ -538,7 +568,7 @@ class Synchronizer:
 def _merge(
     clouds: tuple[Cloud, ...], poses: tuple[F64, ...], in_place: bool
 ) -> tuple[F32, Mapping[str, NDArray[Any]]]:
-    """All points in one frame, with the fields that every cloud has."""
+    """Return all points in one frame, with the fields that all clouds have."""
     if len(clouds) == 1 and in_place:
         return clouds[0].xyz, clouds[0].fields
     points = np.concatenate([geometry.apply(p, c.xyz) for c, p in zip(clouds, poses, strict=True)])

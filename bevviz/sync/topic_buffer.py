@@ -1,4 +1,4 @@
-"""The last messages of a topic, by their stamps."""
+"""Buffer of the last messages of a topic, by stamp."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-JUMP = 1_000_000_000  # a stamp that is this much older than its topic's newest means that the clock was reset
+# Nanoseconds. A stamp that is older than its topic's newest by more means that the clock was reset.
+JUMP = 1_000_000_000
 
 
 class Track(Generic[T]):
-    """The last messages of one topic, in order of stamp, ``horizon`` nanoseconds of them."""
+    """Buffer of the messages of one topic, in order of stamp. It keeps the last ``horizon`` nanoseconds."""
 
     def __init__(self, horizon: int) -> None:
         self._horizon = horizon
@@ -23,10 +24,11 @@ class Track(Generic[T]):
 
     @property
     def newest(self) -> int | None:
+        """Newest stamp; None: the buffer is empty."""
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp: int, item: T) -> bool:
-        """Whether it takes the place of another one with that stamp."""
+        """Add a message. Return whether it replaces one with the same stamp."""
         if self._stamps and stamp < self._stamps[-1] - JUMP:
             self.keep(0, -1)
         i = bisect_left(self._stamps, stamp)
@@ -39,6 +41,7 @@ class Track(Generic[T]):
         return False
 
     def nearest(self, stamp: int) -> tuple[int, T] | None:
+        """Return stamp and message nearest to a stamp; None if the buffer is empty."""
         near = bisect_left(self._stamps, stamp)
         best = min(range(near - 1, near + 1), key=lambda i: self._distance(i, stamp))
         return (self._stamps[best], self._items[best]) if 0 <= best < len(self) else None
@@ -47,7 +50,7 @@ class Track(Generic[T]):
         return abs(self._stamps[i] - stamp) if 0 <= i < len(self) else float("inf")
 
     def take(self, stamp: int, first: int, last: int) -> T | None:
-        """Remove and return the item within [first, last] that is nearest to ``stamp``."""
+        """Remove and return the message within [first, last] that is nearest to ``stamp``."""
         inside = [i for i, s in enumerate(self._stamps) if first <= s <= last]
         if not inside:
             return None
@@ -56,24 +59,25 @@ class Track(Generic[T]):
         return self._items.pop(best)
 
     def shed(self, last: int) -> list[T]:
-        """Remove and return what has that stamp or an earlier one."""
+        """Remove and return the messages up to a stamp."""
         end = bisect_left(self._stamps, last + 1)
         gone, self._items = self._items[:end], self._items[end:]
         del self._stamps[:end]
         return gone
 
     def forget(self, before: int) -> None:
-        """Drop what is older, but for the last of it, which may be the nearest to the next cloud."""
+        """Drop older messages, except the last of them: it may be the nearest to the next cloud."""
         first = max(0, bisect_left(self._stamps, before) - 1)
         del self._stamps[:first], self._items[:first]
 
     def keep(self, first: int, last: int) -> None:
+        """Drop the messages outside [first, last]."""
         low, high = bisect_left(self._stamps, first), bisect_left(self._stamps, last + 1)
         self._stamps, self._items = self._stamps[low:high], self._items[low:high]
 
 
 def too_far(nearest: tuple[int, object] | None, stamp: int, tolerance: int) -> str:
-    """Of what is nearest to a stamp and not within the tolerance, both in nanoseconds."""
+    """Describe how far the nearest message is from a stamp (nanoseconds), for the end of a sentence."""
     within = f"within {tolerance * 1e-9:.2f} s"
     if nearest is None:
         return f"{within}: none at all around this time"

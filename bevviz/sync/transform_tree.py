@@ -1,8 +1,8 @@
-"""The transform tree over time: what /tf and /tf_static say, asked at any stamp.
+"""Transform tree over time, from /tf and /tf_static.
 
-Follows the semantics of tf2 (Foote 2013, "tf: The transform library"): one parent for each frame, a
-bounded history for each edge, interpolation between samples. Where tf2 refuses a stamp just past the
-newest sample, the nearest sample is held for a tolerance and its age is told.
+It follows the semantics of tf2 (Foote 2013, "tf: The transform library"): one parent for each frame, a
+bounded history for each edge, interpolation between samples. tf2 refuses a stamp just past the newest sample.
+Here the nearest sample holds for a tolerance, and its age is returned.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from bevviz.model.frame import F64
 
 
 class TransformError(UserError):
-    """Why there is no transform between two frames at a stamp."""
+    """Error for two frames without a transform at a stamp."""
 
 
 class Origin(IntEnum):
-    """Who states a transform. Where two state the parent of one frame, the higher one holds."""
+    """Source of a transform. If two sources state the parent of a frame, the higher one counts."""
 
     ODOMETRY = 0
     TF = 1
@@ -36,28 +36,47 @@ class Origin(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Lookup:
-    matrix: F64  # (4, 4) target_from_source
-    age: float  # seconds from the asked stamp to the nearest sample, the worst over the chain; 0 for static
+    """Transform between two frames.
+
+    Attributes:
+        matrix: (4, 4) target_from_source.
+        age: seconds from the stamp to the nearest sample, the largest over the chain; 0 for static
+            transforms.
+    """
+
+    matrix: F64
+    age: float
 
 
 @dataclass(slots=True)
 class _Edge:
-    """The parent of one frame. ``stamps`` is sorted; a static edge has one pose and no stamp."""
+    """Parent of a frame over time. ``stamps`` is sorted. A static edge has one pose and no stamp.
+
+    Attributes:
+        parent: parent frame.
+        origin: source of the edge.
+        static: whether the pose holds at any time.
+        stamps: nanoseconds.
+        poses: (4, 4) parent_from_child.
+        held: whether a pose holds until the next one.
+        moved: whether the pose of a held edge has changed.
+    """
 
     parent: str
     origin: Origin
     static: bool
     stamps: list[int] = field(default_factory=list)
-    poses: list[F64] = field(default_factory=list)  # parent_from_child
-    held: bool = False  # one pose holds until there is another
-    moved: bool = False  # of a held one, whether there was another
+    poses: list[F64] = field(default_factory=list)
+    held: bool = False
+    moved: bool = False
 
     @property
     def rests(self) -> bool:
-        """Whether no further sample is waited for."""
+        """Whether no further sample is expected."""
         return self.static or (self.held and len(self.stamps) == 1)
 
     def put(self, stamp: int, pose: F64) -> None:
+        """Insert a sample."""
         if self.held and self.poses and not np.array_equal(pose, self.poses[-1]):
             self.moved = True
         if self.static:
@@ -76,7 +95,10 @@ class _Edge:
         self.stamps, self.poses = self.stamps[low:high], self.poses[low:high]
 
     def at(self, stamp: int) -> tuple[F64, float, int]:
-        """The pose, the seconds to the nearest sample, and the nanoseconds past the ends (< 0: before)."""
+        """Return the pose, the seconds to the nearest sample, and the nanoseconds beyond the history.
+
+        Nanoseconds before the history are negative.
+        """
         if self.static or (self.held and not self.moved):
             return self.poses[0], 0.0, 0
         i = bisect_left(self.stamps, stamp)
@@ -94,9 +116,10 @@ class _Edge:
 
 
 class TransformBuffer:
-    """Any forest of frames, with ``duration`` seconds of history for each moving edge.
+    """Transforms between frames, with ``duration`` seconds of history for each moving edge.
 
-    Names are taken without the leading slash that ROS 1 gives them. Samples may come in any order.
+    The frames may form several trees. The leading slash of ROS 1's frame names is removed. Samples may come
+    in any order.
     """
 
     def __init__(self, duration: float = 30.0) -> None:
@@ -107,9 +130,13 @@ class TransformBuffer:
     def add(
         self, t: StampedTransform, static: bool = False, origin: Origin = Origin.TF, held: bool = False
     ) -> None:
-        """Insert a sample. What cannot be used is left out and told in ``problems``.
+        """Insert a sample. An unusable one is left out and listed in ``problems``.
 
-        ``held``: where the frame is never stated anywhere else, it holds at any stamp.
+        Args:
+            t: the sample.
+            static: whether it holds at any time.
+            origin: source of the sample.
+            held: whether it holds at any time as long as no other sample differs from it.
         """
         parent, child = _name(t.parent), _name(t.child)
         about = f"'{parent}' -> '{child}'"
@@ -131,7 +158,7 @@ class TransformBuffer:
                 if not (edge.static or static) and t.stamp < edge.stamps[-1]:
                     return
             if not self._break_cycle(parent, child, origin):
-                if origin is not Origin.ODOMETRY:  # which only fills in for what others leave open
+                if origin is not Origin.ODOMETRY:  # odometry only fills gaps
                     self._problems[f"{about} is refused: '{child}' is above '{parent}' already"] += 1
                 return
             edge = self._edges[child] = _Edge(parent, origin, static, held=held)
@@ -141,12 +168,12 @@ class TransformBuffer:
             self._problems[f"the clock of {about} jumped back: its history was cleared"] += 1
             edge.keep(0, -1)
         edge.put(t.stamp, t.parent_from_child)
-        # Pruned by chunks, so that the cost of it is spread over many insertions.
+        # Prune in chunks, which spreads the cost over many insertions.
         if edge.stamps and edge.stamps[0] < edge.stamps[-1] - self._duration * 5 // 4:
             edge.keep(edge.stamps[-1] - self._duration, edge.stamps[-1])
 
     def _break_cycle(self, parent: str, child: str, origin: Origin) -> bool:
-        """True where ``child`` may hang below ``parent``, if need be by cutting an edge of lower origin."""
+        """Return whether ``child`` may be below ``parent``. If needed, cut an edge of lower origin."""
         path = self.ancestors(parent)
         if child not in path:
             return True
@@ -158,7 +185,7 @@ class TransformBuffer:
         return True
 
     def forget_after(self, stamp: int) -> None:
-        """Drop the samples newer than ``stamp``: those of before a clock reset."""
+        """Drop the samples newer than ``stamp``, which are from before a clock reset."""
         for child, edge in list(self._edges.items()):
             if not edge.static:
                 edge.keep(0, stamp)
@@ -166,11 +193,11 @@ class TransformBuffer:
                     del self._edges[child]
 
     def lookup(self, target: str, source: str, stamp: int, tolerance: float) -> Lookup:
-        """target_from_source at ``stamp``, interpolated along the chain through the common ancestor.
+        """Return target_from_source at ``stamp``, interpolated along the chain through the common ancestor.
 
         Raises:
-            TransformError: the frames are not connected, or a moving edge has no sample within
-                ``tolerance`` seconds of a stamp outside its history.
+            TransformError: the frames are not connected, or a moving edge has no sample within ``tolerance``
+                seconds of a stamp outside its history.
         """
         up, down = self._chains(target, source)
         to_common, age = self._climb(up, target, source, stamp, tolerance)
@@ -180,10 +207,12 @@ class TransformBuffer:
     def lookup_moving(
         self, target: str, target_stamp: int, source: str, source_stamp: int, fixed: str, tolerance: float
     ) -> Lookup:
-        """target at ``target_stamp`` from source at ``source_stamp``: what rests in ``fixed`` stays in place.
+        """Return target at ``target_stamp`` from source at ``source_stamp``.
+
+        Objects at rest in ``fixed`` stay in place.
 
         Raises:
-            TransformError: as ``lookup``.
+            TransformError: see ``lookup``.
         """
         fixed_from_source = self.lookup(fixed, source, source_stamp, tolerance)
         fixed_from_target = self.lookup(fixed, target, target_stamp, tolerance)
@@ -191,7 +220,7 @@ class TransformBuffer:
         return Lookup(matrix, max(fixed_from_source.age, fixed_from_target.age))
 
     def latest(self, target: str, source: str) -> int | None:
-        """Newest stamp that the whole chain has samples for; None: it is static.
+        """Return the newest stamp that all edges of the chain reach; None if the chain is static.
 
         Raises:
             TransformError: the frames are not connected.
@@ -201,38 +230,40 @@ class TransformBuffer:
         return min(ends, default=None)
 
     def knows(self, target: str, source: str) -> bool:
-        """Whether the two frames are connected, at whatever stamps."""
+        """Return whether two frames are connected at any stamp."""
         return self.root(target) == self.root(source)
 
     def frames(self) -> set[str]:
+        """Return all frames."""
         return {*self._edges, *(edge.parent for edge in self._edges.values())}
 
     def needs_odometry(self, frame: str) -> bool:
-        """Whether nothing but odometry states the parent of a frame."""
+        """Return whether only odometry states the parent of a frame."""
         edge = self._edges.get(_name(frame))
         return edge is None or edge.origin is Origin.ODOMETRY
 
     def ancestors(self, frame: str) -> tuple[str, ...]:
-        """The frame itself, its parent, and so on to the root."""
+        """Return the frame, its parent, and so on up to the root."""
         path = [_name(frame)]
         while (edge := self._edges.get(path[-1])) is not None:
             path.append(edge.parent)
         return tuple(path)
 
     def root(self, frame: str) -> str:
+        """Return the root of a frame's tree."""
         return self.ancestors(frame)[-1]
 
     def tree(self) -> Mapping[str, str]:
-        """Child to parent."""
+        """Return the parent of each frame."""
         return {child: edge.parent for child, edge in self._edges.items()}
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What was refused or looked wrong, one sentence each with its count."""
+        """A sentence with a count for each problem of the transforms."""
         return tuple(f"{text} ({n} time{'s' * (n > 1)})" for text, n in self._problems.items())
 
     def _chains(self, target: str, source: str) -> tuple[Sequence[str], Sequence[str]]:
-        """The frames below the common ancestor: from source upwards, from target upwards."""
+        """Return the frames below the common ancestor: from source upwards, and from target upwards."""
         up, down = self.ancestors(source), self.ancestors(target)
         if not up[0] or not down[0]:
             raise TransformError(
@@ -272,7 +303,7 @@ def _name(frame: str) -> str:
 
 
 def _is_rigid(matrix: F64) -> bool:
-    # Number by number: for so few of them NumPy's calls take ten times as long.
+    # Without NumPy: for so few numbers its calls take ten times as long.
     a, b, c = rows = matrix[:3].tolist()
     if not all(math.isfinite(value) for row in rows for value in row):
         return False

@@ -1,4 +1,4 @@
-"""Messages and boxes that could not be used: counted by topic, with the reason of the first."""
+"""Counter of messages and boxes that could not be used."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections import Counter
 
 
 class Damage:
-    """Of a bag as of a robot.
+    """Counts of unusable messages by topic, with the reason for the first one.
 
     Args:
-        noun: what is counted.
+        noun: name of the counted things.
     """
 
     def __init__(self, noun: str = "message(s)") -> None:
@@ -18,19 +18,24 @@ class Damage:
         self._first: dict[str, str] = {}
 
     def add(self, topic: str, reason: str) -> int:
-        """One more, and why, which names the topic. Returns how many of the topic there are."""
+        """Count a message. Return the count of its topic.
+
+        Args:
+            topic: topic of the message.
+            reason: a sentence that names the topic.
+        """
         self._counts[topic] += 1
         self._first.setdefault(topic, reason)
         return self._counts[topic]
 
     def extend(self, other: Damage) -> None:
-        """What another one has counted."""
+        """Add the counts of another one."""
         self._counts += other._counts
         self._first = {**other._first, **self._first}
 
     @property
     def sentences(self) -> list[str]:
-        """One for each topic."""
+        """A sentence for each topic."""
         return [
             f"{count} {self._noun} of {topic} could not be used, the first: {self._first[topic]}"
             for topic, count in self._counts.items()

@@ -1,4 +1,4 @@
-"""Pictures of a video, each decoded when a frame takes it, from the key frame before it."""
+"""Pictures of a video, decoded from the last key frame on when a frame takes them."""
 
 from __future__ import annotations
 
@@ -24,53 +24,58 @@ if TYPE_CHECKING:
 
 Rewind = Callable[[str, int], Iterable[Packet]]
 
-SHOWN = ("h264", "h265", "av1", "vp8", "vp9")  # which Rerun takes as they are
-HELD = 5_000_000_000  # nanoseconds of receipt that an image may be asked for after its packet
-MOST_BYTES = 64_000_000  # of packets that are held
-MOST_REORDERED = 20  # pictures that a decoder has made and nobody has asked for
-UNNUMBERED = ("av1", "vp8", "vp9")  # whose pictures do not tell that one is missing between them
-STEPS = 9  # between packets, by which a longer one is known
+SHOWN = ("h264", "h265", "av1", "vp8", "vp9")  # codecs that Rerun shows
+HELD = 5_000_000_000  # nanoseconds after the receipt of a packet in which its image may be requested
+MOST_BYTES = 64_000_000  # bytes of packets that are kept
+MOST_REORDERED = 20  # decoded pictures that are kept until they are requested
+UNNUMBERED = ("av1", "vp8", "vp9")  # codecs without a number by which a missing picture is noticed
+STEPS = 9  # steps between packets that a longer step is compared with
 _DECODERS = {"h265": "hevc", "av1": "libdav1d"}
-LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: a picture for each packet, at once
+LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: return the picture of each packet at once
 
 
 @dataclass(frozen=True, slots=True)
 class VideoLoader:
-    """Decodes a picture when a frame takes it."""
+    """Function that decodes a picture when a frame takes it."""
 
     video: Video
     place: tuple[int, int]
 
     def __call__(self) -> Image:
+        """Decode the picture."""
         return self.video.image(self.place)
 
 
 class Video:
-    """The video of one topic. Packets are added in the order of receipt; bounded in memory.
+    """Video of one topic, with bounded memory. Packets are added in order of receipt.
 
-    Pictures that others are missing for, which the decoder would paint over, are not given.
+    A picture that depends on missing pictures is not returned; decoders would conceal the gap.
 
     Args:
-        topic: of the packets.
-        rewind: the packets from the last key frame at or before a time of receipt up to that time, out of the
-            recording; None: what has gone by is gone.
+        topic: topic of the packets.
+        rewind: returns the packets from the last key frame before a time of receipt up to this time, from the
+            recording; None: earlier packets cannot be read again.
     """
 
     def __init__(self, topic: str, rewind: Rewind | None = None) -> None:
         self.topic, self._rewind = topic, rewind
         self._packets: list[Packet] = []
-        self._size = 0  # bytes of them
-        self._keyless = -1  # no key frame up to this time of receipt
-        self._headers: dict[bytes, None] = {}  # of Theora
+        self._size = 0  # bytes of the packets
+        self._keyless = -1  # no key frame before this time of receipt
+        self._headers: dict[bytes, None] = {}  # header packets of Theora
         self._decoder: _Decoder | None = None
-        self._next = 0  # packet that the decoder is to be given next
+        self._next = 0  # row of the next packet for the decoder
         self._last: Image | None = None
         self._last_place: tuple[int, int] | None = None
-        self._stamp = 0  # of the packet that was added last
+        self._stamp = 0  # stamp of the last packet
         self._steps: deque[int] = deque(maxlen=STEPS)  # nanoseconds between packets
 
     def add(self, packet: Packet) -> bool:
-        """Whether packets may be missing before it, by its stamp, where the codec does not tell."""
+        """Add a packet.
+
+        Returns:
+            Whether packets may be missing before it, judged by its stamp, if the codec does not tell.
+        """
         if packet.is_header:
             self._headers[packet.data] = None
             return False
@@ -84,15 +89,15 @@ class Video:
         self._size += len(packet.data)
         if self._size > MOST_BYTES:
             self._drop(before=packet.received)
-        if self._size > MOST_BYTES:  # one group of pictures: of it the decoder has what it needs
+        if self._size > MOST_BYTES:  # a single group of pictures: drop the packets that the decoder has
             self._forget(self._next or len(self._packets))
         return packet.codec in UNNUMBERED and not packet.is_key and step > 1.5 * usual
 
     def image(self, place: tuple[int, int]) -> Image:
-        """The picture of the packet at that place.
+        """Return the picture of the packet at ``place``.
 
         Raises:
-            MessageError: it cannot be decoded, or only without pictures that are lost.
+            MessageError: it cannot be decoded, or depends on lost packets.
         """
         if place != self._last_place or self._last is None:
             self._last = self._decode(place)
@@ -143,10 +148,10 @@ class Video:
         return Clip(codec, places, tuple(packet.data for packet in packets), key - first)
 
     def _find(self, place: tuple[int, int]) -> tuple[int, int]:
-        """Where the packet is, and the key frame before it.
+        """Return the rows of the packet and of the key frame before it.
 
         Raises:
-            MessageError: they are not there.
+            MessageError: the packets are not available.
         """
         found = self._among(place)
         if found is None and place[0] > self._keyless and self._rewind is not None:
@@ -170,13 +175,13 @@ class Video:
         rows = [row for row, packet in enumerate(self._packets) if packet.place == place]
         if not rows:
             return None
-        # What was before the first one may be dropped, where the decoder has had it.
+        # Packets before the first one may have been dropped after the decoder got them.
         within = 0 < self._next <= rows[-1] and self._decoder is not None
         keys = [row for row in range(rows[-1], -1, -1) if self._packets[row].is_key]
         return (rows[-1], keys[0]) if keys else ((rows[-1], -1) if within else None)
 
     def _drop(self, before: int) -> None:
-        """Forget the groups of pictures that end before a time of receipt."""
+        """Drop the groups of pictures that end before a time of receipt."""
         keys = [row for row, packet in enumerate(self._packets) if packet.is_key]
         ends = [row for row in keys if row and self._packets[row - 1].received <= before]
         self._forget(ends[-1] if ends else 0)
@@ -190,10 +195,10 @@ class Video:
 
 
 class _Decoder:
-    """Pictures of consecutive packets, from a key frame on."""
+    """Decoder of consecutive packets, from a key frame on."""
 
     def __init__(self, codec: str, headers: tuple[bytes, ...]) -> None:
-        import av  # with its libraries it takes a tenth of a second
+        import av  # the import takes 0.1 s
 
         av.logging.set_level(None)
         self._context = cast("VideoCodecContext", av.CodecContext.create(_DECODERS.get(codec, codec), "r"))
@@ -203,19 +208,20 @@ class _Decoder:
         if codec == "theora":
             self._context.extradata = b"".join(len(h).to_bytes(2) + h for h in headers)
         self._continuity = Continuity() if codec == "h264" else None
-        self._number: int | None = None  # of the packet before
+        self._number: int | None = None  # number of the previous packet
         self._places: list[tuple[int, int]] = []
-        self._broken = ""  # why no picture is whole until the next key frame
+        self._broken = ""  # why pictures are incomplete until the next key frame
         self._finished = False
         self._pictures: OrderedDict[tuple[int, int], av.VideoFrame] = OrderedDict()
         self.failures: dict[tuple[int, int], str] = {}
 
     @property
     def reorders(self) -> bool:
-        """Whether pictures may need later ones."""
+        """Whether a picture may depend on later packets."""
         return bool(self._context.has_b_frames)
 
     def put(self, packet: Packet) -> None:
+        """Decode a packet."""
         import av
 
         lost = self._missing(packet)
@@ -230,14 +236,14 @@ class _Decoder:
         self._take(given)
 
     def _missing(self, packet: Packet) -> int:
-        """How many packets before it are."""
+        """Return the number of packets that are missing before a packet."""
         if self._continuity is not None:
             return self._continuity.missing(packet.data)
         last, self._number = self._number, packet.number
         return 0 if last is None or packet.number is None else max(0, packet.number - last - 1)
 
     def finish(self) -> None:
-        """Have the pictures that wait for later ones."""
+        """Decode the pictures that wait for later packets."""
         self._finished = True
         self._take(None)
 
@@ -259,15 +265,15 @@ class _Decoder:
             self._pictures.popitem(last=False)
 
     def has(self, place: tuple[int, int]) -> bool:
-        """Whether it has made this picture, and still has it."""
+        """Return whether a picture is decoded and still kept."""
         return place in self._pictures
 
     def waits_for(self, place: tuple[int, int]) -> bool:
-        """Whether the picture may come with the next packet."""
+        """Return whether the next packet may complete the picture."""
         there = place in self._pictures or place in self.failures
         return self.reorders and not there and not self._finished
 
     def picture(self, place: tuple[int, int]) -> U8 | None:
-        """(H, W, 3) BGR; None: it was not made."""
+        """Return the (H, W, 3) BGR picture; None if it was not decoded."""
         found = self._pictures.get(place)
         return None if found is None else np.ascontiguousarray(found.to_ndarray(format="bgr24"))
