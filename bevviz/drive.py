@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from bevviz.why import Answer, Questioner
 
 Settings = Mapping[str, Any] | Sequence[str]
-KEPT = 8  # number of single frames whose results are kept for further questions
+MAX_RESULTS = 8  # number of single frames whose results are kept for further questions
 
 
 class Drive(Closing):
@@ -54,7 +54,7 @@ class Drive(Closing):
         self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
         self._questioner: Questioner | None = None
-        self._shown: NotebookViewer | None = None
+        self._viewer: NotebookViewer | None = None
 
     def close(self) -> None:
         """Close the source."""
@@ -113,7 +113,7 @@ class Drive(Closing):
         key = number, id(self.config)
         if key not in self._results:
             self._results[key] = self.session.alone(self.raw(number))
-            while len(self._results) > KEPT:
+            while len(self._results) > MAX_RESULTS:
                 self._results.popitem(last=False)
         self._results.move_to_end(key)
         return self._results[key]
@@ -124,10 +124,10 @@ class Drive(Closing):
         Raises:
             UserError: there is no such scan, or it cannot be read.
         """
-        found = self.frames.frame(frame)
-        if found is None:
+        raw_frame = self.frames.frame(frame)
+        if raw_frame is None:
             raise UserError(f"frame {frame}: the scan there cannot be read: {'; '.join(self.warnings)}")
-        return found
+        return raw_frame
 
     def why(
         self,
@@ -182,7 +182,7 @@ class Drive(Closing):
             detection=detection,
             camera=camera,
         )
-        viewer = self._shown
+        viewer = self._viewer
         if time is None and frame is None and viewer is not None:
             frame = viewer.frame
             if not (selection.one or selection.label) and (clicked := self.selected) is not None:
@@ -196,13 +196,13 @@ class Drive(Closing):
     @property
     def selected(self) -> Selected | None:
         """Last click in the notebook's viewer, see ``show``. None: nothing was clicked."""
-        viewer = self._shown
+        viewer = self._viewer
         if viewer is None or viewer.clicked is None:
             return None
         if viewer.config == self.config:
             return viewer.selected(self.at(frame=viewer.clicked))
-        as_shown = Session(viewer.config, loader=self.session.loader)
-        return viewer.selected(as_shown.alone(self.raw(viewer.clicked)))
+        session = Session(viewer.config, loader=self.session.loader)
+        return viewer.selected(session.alone(self.raw(viewer.clicked)))
 
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
         """Return an object that answers questions about one scan. It computes shared results once.
@@ -328,8 +328,8 @@ class Drive(Closing):
         from bevviz.recording.sinks import open_recording
 
         if in_notebook():
-            self._shown = NotebookViewer(self.scene, self.config, blueprint or "workbench")
-            self.run([self._shown])
+            self._viewer = NotebookViewer(self.scene, self.config, blueprint or "workbench")
+            self.run([self._viewer])
             return
         with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
             self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
@@ -384,7 +384,7 @@ def open_drive(
     from bevviz.bags.source import BagSource
 
     paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
-    settings, notes = _given(model, set), tuple[str, ...]()
+    settings, notes = _all_settings(model, set), tuple[str, ...]()
     if len(paths) == 1 and paths[0].suffix == ".rrd":
         from bevviz.recording.source_lookup import follow
 
@@ -430,13 +430,15 @@ def simulate(
     """
     from bevviz.synthetic import SyntheticSource
 
-    return Drive(SyntheticSource(frames, seed, plant=plant), load(_file(config), _given(model, set), preset))
+    return Drive(
+        SyntheticSource(frames, seed, plant=plant), load(_file(config), _all_settings(model, set), preset)
+    )
 
 
-def _given(model: str | PathLike[str], settings: Settings) -> list[str]:
+def _all_settings(model: str | PathLike[str], settings: Settings) -> list[str]:
     """Return the settings as ``key=value``."""
-    given = _settings(settings) if isinstance(settings, Mapping) else list(settings)
-    return [*([f"detector.model={model}"] if model else []), *given]
+    tree_settings = _settings(settings) if isinstance(settings, Mapping) else list(settings)
+    return [*([f"detector.model={model}"] if model else []), *tree_settings]
 
 
 def _file(config: str | PathLike[str] | None) -> Path | None:

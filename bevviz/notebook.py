@@ -86,7 +86,7 @@ class _Click:
 
 
 @dataclass(slots=True)
-class _Times:
+class _FrameTimes:
     """Times of each frame on the timelines."""
 
     numbers: list[int] = field(default_factory=list)
@@ -106,10 +106,10 @@ class _Times:
     def number(self, timeline: str, time: float) -> int | None:
         """Return the number of the frame that a viewer shows at this time. None: there are no frames."""
         values = np.array(self.at.get(timeline, ()), np.float64)
-        before = np.flatnonzero(values <= time + entities.SLACK * (timeline != entities.FRAME))
+        earlier = np.flatnonzero(values <= time + entities.SLACK * (timeline != entities.FRAME))
         if not len(values):
             return None
-        row = int(before[values[before].argmax()]) if len(before) else int(values.argmin())
+        row = int(earlier[values[earlier].argmax()]) if len(earlier) else int(values.argmin())
         return self.numbers[row]
 
 
@@ -137,11 +137,11 @@ class NotebookViewer(Recorder):
         self.config = config
         self.viewer = _viewer(recording, layout)
         self._marker = Logger(recording, config, scene)
-        self._frames = _Times()
+        self._frames = _FrameTimes()
         self._tracks: dict[int, Tracks] = {}
         self._timeline, self._time = entities.STAMP, 0.0
         self._click: _Click | None = None
-        self.viewer.on_event(self._told)
+        self.viewer.on_event(self._on_event)
         self.viewer.display()
 
     def see(self, result: FrameResult) -> None:
@@ -149,8 +149,8 @@ class NotebookViewer(Recorder):
         super().see(result)
         self._frames.add(result)
         if result.tracks is not None:
-            bare = np.zeros((len(result.tracks), 0, 3), np.float32)
-            self._tracks[result.frame.index] = replace(result.tracks, trail=bare)
+            no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)
+            self._tracks[result.frame.index] = replace(result.tracks, trail=no_trail)
 
     @property
     def frame(self) -> int | None:
@@ -171,8 +171,8 @@ class NotebookViewer(Recorder):
         click = self._click
         if click is None:
             return None
-        found = pick(result, self._tracks.get(click.frame), click.path, click.instance, click.position)
-        return Selected(click.frame, found, click.path, _place(result, found))
+        picked = pick(result, self._tracks.get(click.frame), click.path, click.instance, click.position)
+        return Selected(click.frame, picked, click.path, _place(result, picked))
 
     def mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
         """Mark the objects of answers in the viewer, and show their frame."""
@@ -182,17 +182,17 @@ class NotebookViewer(Recorder):
         mark_answers(self._marker, frame, answers[:MARKED], result.config.bev)
         self.recording.flush()
         if frame.index != self.frame:
-            when = np.datetime64(frame.stamp, "ns")
-            self.viewer.set_time_ctrl(timeline=entities.STAMP, timestamp=when)
+            timestamp = np.datetime64(frame.stamp, "ns")
+            self.viewer.set_time_ctrl(timeline=entities.STAMP, timestamp=timestamp)
 
-    def _told(self, event: ViewerEvent) -> None:
+    def _on_event(self, event: ViewerEvent) -> None:
         """Handle an event of the viewer. The notebook passes it on between two cells."""
         if event.type == "timeline_change":
             self._timeline, self._time = event.timeline, event.time
         elif event.type == "time_update":
             self._time = event.time
         elif event.type == "selection_change":
-            item = next((one for one in event.items if one.type == "entity"), None)
+            item = next((candidate for candidate in event.items if candidate.type == "entity"), None)
             frame = self.frame
             self._click = None
             if item is not None and frame is not None:
@@ -211,17 +211,17 @@ def _viewer(recording: rr.RecordingStream, layout: Blueprint) -> Viewer:
         ) from None
 
 
-def _place(result: FrameResult, found: Pick | None) -> tuple[float, ...]:
+def _place(result: FrameResult, picked: Pick | None) -> tuple[float, ...]:
     """Return the centre of an object identified by its row in a result. Empty for any other pick."""
-    if found is None:
+    if picked is None:
         return ()
-    if found.kind == "object" and result.objects is not None:
-        return tuple(map(float, result.objects.boxes.center[found.row]))
-    if found.kind == "cluster" and result.clusters is not None:
-        return tuple(map(float, result.clusters.centroid[found.row]))
-    if found.kind == "detection":
+    if picked.kind == "object" and result.objects is not None:
+        return tuple(map(float, result.objects.boxes.center[picked.row]))
+    if picked.kind == "cluster" and result.clusters is not None:
+        return tuple(map(float, result.clusters.centroid[picked.row]))
+    if picked.kind == "detection":
         for camera in result.cameras:
-            if camera.camera.name == found.camera and camera.detections is not None:
-                u0, v0, u1, v1 = map(float, camera.detections.xyxy[found.row])
+            if camera.camera.name == picked.camera and camera.detections is not None:
+                u0, v0, u1, v1 = map(float, camera.detections.xyxy[picked.row])
                 return (u0 + u1) / 2, (v0 + v1) / 2
     return ()

@@ -44,8 +44,8 @@ def drive(shown: Drive) -> Iterator[Drive]:
 
 
 def viewer(drive: Drive) -> NotebookViewer:
-    assert drive._shown is not None
-    return drive._shown
+    assert drive._viewer is not None
+    return drive._viewer
 
 
 def tell(drive: Drive, **event: object) -> None:

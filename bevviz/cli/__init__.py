@@ -89,13 +89,13 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser, commands = _parser()
         if "_ARGCOMPLETE" in os.environ:
             completion.complete(parser)
-        given = with_json(with_negatives(sys.argv[1:] if arguments is None else arguments))
-        if not given:
+        command_line = with_json(with_negatives(sys.argv[1:] if arguments is None else arguments))
+        if not command_line:
             parser.print_help()
             return 2
-        if given[0] not in commands and Path(given[0]).exists():
-            given = ["open", *given]
-        options = parser.parse_args(given)
+        if command_line[0] not in commands and Path(command_line[0]).exists():
+            command_line = ["open", *command_line]
+        options = parser.parse_args(command_line)
         if options.verbose:
             _log_to_stderr()
         outputs.speak(quiet=options.quiet)
@@ -119,14 +119,14 @@ def _main(arguments: Sequence[str] | None) -> int:
             return 130
         from bevviz.support.files import full_disk
 
-        if (full := full_disk(error)) is not None:
+        if (disk_message := full_disk(error)) is not None:
             _log().debug("what led to the error", exc_info=error)
-            print(f"{style.error('bevviz: error:')} {full}", file=sys.stderr)
+            print(f"{style.error('bevviz: error:')} {disk_message}", file=sys.stderr)
             return 2
         _log().error("an error that nobody foresaw", exc_info=error)
-        what = f"{type(error).__name__}: {first_line(error)}"
-        began = style.error("bevviz: error of bevviz itself:")
-        print(f"{began} {what}; --verbose shows where, please report it", file=sys.stderr)
+        description = f"{type(error).__name__}: {first_line(error)}"
+        prefix = style.error("bevviz: error of bevviz itself:")
+        print(f"{prefix} {description}; --verbose shows where, please report it", file=sys.stderr)
         return 3
     finally:
         if arguments is None:

@@ -234,13 +234,13 @@ def _sum_up(
         if interrupted:
             say(f"interrupted; {len(complete)} bags are complete, the same command goes on. Summary: {page}")
             return 130
-        kept = _gate(complete, failed, limits, options.junit)
+        limits_kept = _gate(complete, failed, limits, options.junit)
         frames = sum(info.frames for _, info in complete)
         say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
         if viewer:
             say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C", always=True)
             wait_for_interrupt()
-    return 1 if failed or not complete or not kept else 0
+    return 1 if failed or not complete or not limits_kept else 0
 
 
 def _gate(
@@ -256,15 +256,15 @@ def _gate(
     for table, info in complete:
         metrics = {name: value for name, value in (info.metrics or {}).items() if value is not None}
         suites[table.stem] = check(limits, metrics)
-    broken = [
-        (name, kept.reason)
-        for name, found in suites.items()
-        if not isinstance(found, str)
-        for kept in found
-        if kept.reason
+    violations = [
+        (name, result.reason)
+        for name, outcome in suites.items()
+        if not isinstance(outcome, str)
+        for result in outcome
+        if result.reason
     ]
-    for name, reason in broken:
+    for name, reason in violations:
         say(f"{name}: not kept: {reason}", always=True)
     if junit is not None:
         write_junit(junit, suites)
-    return not broken
+    return not violations

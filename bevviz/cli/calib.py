@@ -53,24 +53,24 @@ def _calib(options: argparse.Namespace) -> int:
     config = load_config(options)
     if options.write is not None and options.write.suffix not in (".yaml", ".yml"):
         raise UserError(f"--write {options.write}: expected a file name that ends in .yaml")
-    chosen = options.every
-    options.every = chosen or 1
+    every = options.every
+    options.every = every or 1
     with open_bag(options, config) as source:
         scene, total = source.scene, source.total
         names = _cameras(scene, options.camera, source.roles.no_camera)
-    options.every = chosen or max(1, total // FRAMES)
+    options.every = every or max(1, total // FRAMES)
     with open_bag(options, config) as source:
         bar = progress.bar(source, total=source.total, unit="frame", desc="find edges")
         shots = gather(bar, names, source.pose)
         warn(source.warnings)
     results = []
     for name in names:
-        form = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-        with progress.bar(total=100, desc=f"align {name}", bar_format=form) as steps:
+        bar_format = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+        with progress.bar(total=100, desc=f"align {name}", bar_format=bar_format) as steps:
 
-            def show(done: float, what: str, steps: Any = steps) -> None:
-                steps.set_postfix_str(what, refresh=False)
-                steps.update(round(100 * done) - steps.n)
+            def show(share: float, step: str, steps: Any = steps) -> None:
+                steps.set_postfix_str(step, refresh=False)
+                steps.update(round(100 * share) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
     give(options, "calib", {"cameras": [result.to_dict() for result in results]})
@@ -82,16 +82,18 @@ def _calib(options: argparse.Namespace) -> int:
     return 0
 
 
-def _cameras(scene: Scene, wanted: str | None, why_none: str) -> tuple[str, ...]:
+def _cameras(scene: Scene, requested: str | None, reason: str) -> tuple[str, ...]:
     from bevviz.errors import UserError
 
     if not scene.cameras:
-        raise UserError(f"{scene.name}: no camera to calibrate ({why_none})")
-    if wanted is None:
+        raise UserError(f"{scene.name}: no camera to calibrate ({reason})")
+    if requested is None:
         return scene.cameras
-    if wanted not in scene.cameras:
-        raise UserError(f"--camera {wanted}: there is no such camera; there are {', '.join(scene.cameras)}")
-    return (wanted,)
+    if requested not in scene.cameras:
+        raise UserError(
+            f"--camera {requested}: there is no such camera; there are {', '.join(scene.cameras)}"
+        )
+    return (requested,)
 
 
 def _print(results: list[Calibration]) -> None:

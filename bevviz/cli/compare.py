@@ -155,8 +155,8 @@ def _saved(options: argparse.Namespace) -> int:
     from bevviz.compare.saved_runs import SavedPair, SavedPairRecorder
     from bevviz.config import Config
 
-    own = options.robot is not None or options.a or options.b or options.set_a or options.set_b
-    if own or options.truth or options.kitti_labels:
+    has_sides = options.robot is not None or options.a or options.b or options.set_a or options.set_b
+    if has_sides or options.truth or options.kitti_labels:
         raise UserError("compare: two .rrd files are compared as they are; leave the sides and the truth out")
     pair = SavedPair(*options.paths)
     return logged(
@@ -183,8 +183,8 @@ def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
 
 def _sides(options: argparse.Namespace) -> tuple[tuple[str, str], tuple[Config, Config]]:
     """Return the names and the configurations of the two sides."""
-    own = options.a, options.b, options.set_a, options.set_b
-    if not any(own) and options.preset is None and options.config is None:
+    side_options = options.a, options.b, options.set_a, options.set_b
+    if not any(side_options) and options.preset is None and options.config is None:
         options.a, options.b = "reference", None if _recorded(options) else "default"
     a = _side(options, options.a, options.set_a)
     b = _side(options, options.b, options.set_b)
@@ -198,8 +198,10 @@ def _side(options: argparse.Namespace, base: str | None, settings: list[str]) ->
     files += [] if base is None or base in presets else [Path(base)]
     model = [f"detector.model={options.model}"] if options.model else []
     config = loaded(options, files, [*options.set, *model, *settings], preset)
-    own = options.config or ("as recorded" if _recorded(options) and preset is None else config.preset)
-    return " ".join([base or str(own), *settings]), config
+    default_name = options.config or (
+        "as recorded" if _recorded(options) and preset is None else config.preset
+    )
+    return " ".join([base or str(default_name), *settings]), config
 
 
 def _recorded(options: argparse.Namespace) -> bool:

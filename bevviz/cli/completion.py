@@ -47,11 +47,11 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    found = list(parser._actions)
+    actions = list(parser._actions)
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            found += [inner for command in action.choices.values() for inner in _actions(command)]
-    return found
+            actions += [nested for command in action.choices.values() for nested in _actions(command)]
+    return actions
 
 
 def _keys(prefix: str, action: argparse.Action, **_: Any) -> list[str]:

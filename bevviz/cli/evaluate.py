@@ -117,14 +117,16 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Names
 
     if not Outputs.of(options) and not on_stdout(options):
         print(evaluation.table())
-    kept = check(limits, evaluation.metrics)
-    gate = [{"limit": str(k.limit), "kept": not k.reason, "reason": k.reason} for k in kept]
+    results = check(limits, evaluation.metrics)
+    gate = [
+        {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
+    ]
     give(options, "evaluate", {**evaluation.as_tree(), "limits": gate})
     if options.junit is not None:
-        write_junit(options.junit, {options.paths[0].resolve().stem: kept})
-    for found in kept:
-        if found.reason:
-            say(f"not kept: {found.reason}", always=True)
-    if kept and not any(found.reason for found in kept):
-        say(f"all {len(kept)} limits are kept" if len(kept) > 1 else f"kept: {kept[0].limit}")
-    return int(any(found.reason for found in kept))
+        write_junit(options.junit, {options.paths[0].resolve().stem: results})
+    for result in results:
+        if result.reason:
+            say(f"not kept: {result.reason}", always=True)
+    if results and not any(result.reason for result in results):
+        say(f"all {len(results)} limits are kept" if len(results) > 1 else f"kept: {results[0].limit}")
+    return int(any(result.reason for result in results))

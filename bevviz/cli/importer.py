@@ -50,10 +50,10 @@ def run(arguments: list[str]) -> int:
         return 0
     from bevviz.errors import UserError
 
-    proposed = (options.application_id, options.recording_id)
+    proposed_ids = (options.application_id, options.recording_id)
     try:
         # Each bag of a folder needs its own recording. In the proposed one they would be mixed.
-        _import(path, *((path.stem, None) if with_folder and path.is_file() else proposed))
+        _import(path, *((path.stem, None) if with_folder and path.is_file() else proposed_ids))
     except UserError as error:
         print(f"bevviz: error: {error}", file=sys.stderr)
         return 1
@@ -85,9 +85,9 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.recording.source_lookup import Origin
 
     # The viewer may open files of unknown origin. Never run the functions they name, even if trusted.
-    never = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
-    stated = layers(path if path.is_dir() else path.parent)
-    config = load(layers=[replace(layer, trust=never) for layer in stated])
+    no_trust = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
+    project_layers = layers(path if path.is_dir() else path.parent)
+    config = load(layers=[replace(layer, trust=no_trust) for layer in project_layers])
     with BagSource([path], config) as source:
         drive = Drive(source, config)
         hint(drive.scene, config)

@@ -59,8 +59,8 @@ def _info(options: argparse.Namespace) -> int:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
-    found = describe(options.paths, load_config(options))
-    give(options, "info", as_tree(found))
+    bag_info = describe(options.paths, load_config(options))
+    give(options, "info", as_tree(bag_info))
     if not on_stdout(options):
-        print(render(found))
+        print(render(bag_info))
     return 0

@@ -46,14 +46,14 @@ def check_outputs(options: argparse.Namespace) -> None:
             raise UserError(f"{option} {target}: there is no folder {target.parent}")
         for identity in _identities(target):
             if identity in inputs:
-                same = "" if inputs[identity] == target else f" ({inputs[identity]})"
-                raise UserError(f"{option} {target}: is what is read{same}; give another name")
+                other_name = "" if inputs[identity] == target else f" ({inputs[identity]})"
+                raise UserError(f"{option} {target}: is what is read{other_name}; give another name")
 
 
 def _inputs(options: argparse.Namespace) -> Iterator[Path]:
     for name in READ:
-        given = getattr(options, name, None)
-        for value in given if isinstance(given, list) else [given]:
+        values = getattr(options, name, None)
+        for value in values if isinstance(values, list) else [values]:
             if isinstance(value, str | Path) and str(value):
                 yield Path(value)
 
@@ -63,5 +63,5 @@ def _identities(path: Path) -> Iterator[tuple[int, int]]:
     with suppress(OSError, ValueError):
         for file in path.iterdir() if path.is_dir() else [path]:
             with suppress(OSError):
-                about = file.stat()
-                yield about.st_dev, about.st_ino
+                status = file.stat()
+                yield status.st_dev, status.st_ino

@@ -78,21 +78,21 @@ def terminable() -> Iterator[Event]:
 
     def interrupt(number: int, stack: object) -> None:
         ended.set()
-        if _interrupt in before.values():  # This process is a command.
+        if _interrupt in previous.values():  # This process is a command.
             _came.set()
         raise KeyboardInterrupt
 
-    before = {
+    previous = {
         number: handler for number in SIGNALS if (handler := signal.getsignal(number)) != signal.SIG_IGN
     }
-    for number in before:
+    for number in previous:
         signal.signal(number, interrupt)
     try:
         yield ended
     finally:
-        for number, handler in before.items():
-            over = ended.is_set() and handler is _interrupt
-            signal.signal(number, signal.SIG_IGN if over else handler)
+        for number, handler in previous.items():
+            ignores = ended.is_set() and handler is _interrupt
+            signal.signal(number, signal.SIG_IGN if ignores else handler)
 
 
 def wait_for_interrupt() -> None:

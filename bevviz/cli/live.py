@@ -122,7 +122,7 @@ def _live(options: argparse.Namespace) -> int:
     from bevviz.live.notes import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
-    given = {
+    option_values = {
         "detector.model": options.model,
         "live.every": options.every,
         "live.max_rate": options.max_rate,
@@ -131,9 +131,9 @@ def _live(options: argparse.Namespace) -> int:
         "logging.keep": options.keep,
         "live.flight_time": options.flight,
     }
-    more = [f"{key}={value}" for key, value in given.items() if value is not None]
+    option_settings = [f"{key}={value}" for key, value in option_values.items() if value is not None]
     if options.split is not None:
-        more.append(options.split)
+        option_settings.append(options.split)
     _, messages = _files(options.save)
     if options.split is not None and not options.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
@@ -143,7 +143,9 @@ def _live(options: argparse.Namespace) -> int:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
-    settings = Settings(options.config, [*options.set, *more], options.preset, project_layers(options))
+    settings = Settings(
+        options.config, [*options.set, *option_settings], options.preset, project_layers(options)
+    )
     _check_outputs(options)
     loader = StageLoader()
     if not options.observe:
@@ -205,15 +207,15 @@ def _watch_robot(
         orders = Orders(source.node, settings.config, take, refuse)
         orders.config = settings.config
         if not options.observe:  # Warm up while waiting for the robot.
-            warm = partial(warm_up, settings.config, loader)
-            threading.Thread(target=warm, name="warm up", daemon=True).start()
-        shown = ""
+            warm_up_stages = partial(warm_up, settings.config, loader)
+            threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
+        reported_missing = ""
         with suppress(KeyboardInterrupt), terminable() as ended:
             while not source.wait(1.0):
                 missing = source.missing
-                if missing and missing != shown:
-                    shown = missing
-                    say(f"waiting: {shown}")
+                if missing and missing != reported_missing:
+                    reported_missing = missing
+                    say(f"waiting: {reported_missing}")
         if ended.is_set():
             return 1
         publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
@@ -238,8 +240,8 @@ def _watch_robot(
 
             return show
 
-        wanted = on_result if publisher is not None or diagnostics is not None else None
-        return _watch(source, settings, options, notes, loader, wanted, follow, control, raw)
+        callback = on_result if publisher is not None or diagnostics is not None else None
+        return _watch(source, settings, options, notes, loader, callback, follow, control, raw)
 
 
 def _replay(frames: int) -> Replay:
@@ -266,13 +268,13 @@ def _watch(
     """Run until the source ends or the user ends it."""
     from bevviz.live.runtime import Live, Outputs
 
-    window = options.viewer
+    show_window = options.viewer
     save, messages = _files(options.save)
-    places = options.serve, options.connect, options.workbench
-    unsaid = not options.save and all(place is None for place in places) and not window
-    window = window or (unsaid and has_display())
+    viewer_options = options.serve, options.connect, options.workbench
+    no_output = not options.save and all(option is None for option in viewer_options) and not show_window
+    show_window = show_window or (no_output and has_display())
     connect = [options.connect] if options.connect else []
-    outputs = Outputs(save, window, options.serve, options.bind, connect, options.blueprint, messages)
+    outputs = Outputs(save, show_window, options.serve, options.bind, connect, options.blueprint, messages)
     live = Live(
         source,
         settings,
@@ -289,7 +291,7 @@ def _watch(
         live.on_change = follow(live)
     for url in live.urls:
         say(f"viewer at {url}", always=True)
-    if unsaid and not window:
+    if no_output and not show_window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
@@ -303,17 +305,23 @@ def _watch(
             bar.update(status.frames - bar.n)
 
         live.run(show)
-    if (against := live.against) is not None:
-        text = f"{against.differing} of {against.frames} compared frames differ from {against.names[1]}"
-        say(text if against.frames else f"the robot published nothing on {against.names[1]}")
-        if against.without_ours:
-            say(f"{against.without_ours} frames are not compared: no objects of ours were made of them")
-        if against.late_images:
-            late = f"{against.late_images} of the robot's detections in images"
+    if (comparison := live.against) is not None:
+        text = (
+            f"{comparison.differing} of {comparison.frames} compared frames differ from {comparison.names[1]}"
+        )
+        say(text if comparison.frames else f"the robot published nothing on {comparison.names[1]}")
+        if comparison.without_ours:
+            say(f"{comparison.without_ours} frames are not compared: no objects of ours were made of them")
+        if comparison.late_images:
+            late = f"{comparison.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")
     warn(source.warnings)
-    written = [saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths]
-    targets = [f"{where[0]}" + (f" and {len(where) - 1} more" if where[1:] else "") for where in written]
+    written_paths = [
+        saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths
+    ]
+    targets = [
+        f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "") for paths in written_paths
+    ]
     target = f" in {', '.join(targets)}" if targets else ""
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
     say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
@@ -340,20 +348,22 @@ def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
     """Return the paths of ``--save``: the recording's and the messages'."""
     from bevviz.live.files import check_name
 
-    found: dict[str, Path] = {}
+    paths_by_suffix: dict[str, Path] = {}
     for path in paths:
         check_name(path, ".rrd", ".mcap")
-        if path.suffix in found:
-            raise UserError(f"--save {path}: {found[path.suffix]} is given already; one of each kind")
-        found[path.suffix] = path
-    return found.get(".rrd"), found.get(".mcap")
+        if path.suffix in paths_by_suffix:
+            raise UserError(
+                f"--save {path}: {paths_by_suffix[path.suffix]} is given already; one of each kind"
+            )
+        paths_by_suffix[path.suffix] = path
+    return paths_by_suffix.get(".rrd"), paths_by_suffix.get(".mcap")
 
 
 def _snap(options: argparse.Namespace) -> int:
     from bevviz.live.control import snap
 
-    saved = snap(options.path, options.pid)
-    print(saved)
-    if saved.with_suffix(".mcap").exists():
-        print(saved.with_suffix(".mcap"))
+    recording = snap(options.path, options.pid)
+    print(recording)
+    if recording.with_suffix(".mcap").exists():
+        print(recording.with_suffix(".mcap"))
     return 0

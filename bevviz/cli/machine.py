@@ -26,12 +26,12 @@ def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
 
 def with_json(arguments: Iterable[str]) -> list[str]:
     """Replace ``--json PATH`` by ``--json=- PATH``, unless PATH is a .json file."""
-    told: list[str] = []
+    joined: list[str] = []
     for argument in arguments:
-        if told and told[-1] == OPTION and not argument.endswith(".json"):
-            told[-1] = f"{OPTION}={STDOUT}"
-        told.append(argument)
-    return told
+        if joined and joined[-1] == OPTION and not argument.endswith(".json"):
+            joined[-1] = f"{OPTION}={STDOUT}"
+        joined.append(argument)
+    return joined
 
 
 def on_stdout(options: argparse.Namespace) -> bool:

@@ -248,13 +248,13 @@ def given_settings(options: argparse.Namespace) -> list[str]:
 
 
 def _keep(options: argparse.Namespace) -> list[str]:
-    given = getattr(options, "keep", None)
-    return [f"logging.keep={given}"] if given else []
+    keep = getattr(options, "keep", None)
+    return [f"logging.keep={keep}"] if keep else []
 
 
 def _dataset(options: argparse.Namespace) -> list[str]:
-    stated = {key: getattr(options, f"source_{key}", None) for key in ("dataset", "sequence")}
-    return [f"source.{key}={value}" for key, value in stated.items() if value is not None]
+    values = {key: getattr(options, f"source_{key}", None) for key in ("dataset", "sequence")}
+    return [f"source.{key}={value}" for key, value in values.items() if value is not None]
 
 
 def loaded(
@@ -269,14 +269,14 @@ def loaded(
     recorded: Recorded | None = getattr(options, "recorded", None)
     settings = [*settings, *_dataset(options)]
     if recorded is not None:
-        found = recorded.load(file, settings, preset)
+        config = recorded.load(file, settings, preset)
     else:
-        found = load(file, settings, preset, layers=project_layers(options))
+        config = load(file, settings, preset, layers=project_layers(options))
     if hasattr(options, "keep"):
-        return found
+        return config
     # A single frame is read from the bag and logged whole, even if the recording or the project keeps less.
-    logging = found.logging.model_copy(update={"keep": "everything"})
-    return found.model_copy(update={"logging": logging})
+    logging = config.logging.model_copy(update={"keep": "everything"})
+    return config.model_copy(update={"logging": logging})
 
 
 def project_layers(options: argparse.Namespace) -> list[Layer]:
@@ -293,8 +293,8 @@ def project_layers(options: argparse.Namespace) -> list[Layer]:
         return []
     if not hasattr(options, "layers"):
         options.layers = layers(Path.cwd())
-    found: list[Layer] = options.layers
-    return found
+    project: list[Layer] = options.layers
+    return project
 
 
 def follow_recording(options: argparse.Namespace) -> None:
@@ -307,8 +307,8 @@ def follow_recording(options: argparse.Namespace) -> None:
     """
     if not hasattr(options, "bags") or getattr(options, "check", False):
         return
-    given: list[Path] = options.paths
-    if len(given) != 1 or given[0].suffix != ".rrd":
+    paths: list[Path] = options.paths
+    if len(paths) != 1 or paths[0].suffix != ".rrd":
         if options.bags:
             raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
         return
@@ -316,14 +316,14 @@ def follow_recording(options: argparse.Namespace) -> None:
     from bevviz.recording.source_lookup import NoBagError, follow
 
     try:
-        recorded = follow(given[0], options.bags, given_settings(options))
+        recorded = follow(paths[0], options.bags, given_settings(options))
     except NoBagError:
         if not getattr(options, "shows_recordings", False) or options.bags:
             raise
-        options.shown = given[0]
+        options.shown = paths[0]
         return
-    options.recorded, options.recording, options.paths = recorded, given[0], list(recorded.paths)
-    say(f"{given[0]}: made from {', '.join(map(str, recorded.paths))}")
+    options.recorded, options.recording, options.paths = recorded, paths[0], list(recorded.paths)
+    say(f"{paths[0]}: made from {', '.join(map(str, recorded.paths))}")
     warn(recorded.warnings)
 
 

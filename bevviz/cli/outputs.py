@@ -151,13 +151,13 @@ def tell_of_browser(address: str) -> None:
 
 def program() -> str:
     """Return the command that runs this program, to be typed again."""
-    called = Path(sys.argv[0])
-    if called.name == "__main__.py":
+    script = Path(sys.argv[0])
+    if script.name == "__main__.py":
         return f"{shlex.quote(sys.executable)} -m bevviz"
-    found = shutil.which("bevviz")
-    if found is not None and Path(found).resolve() == called.resolve():
+    installed = shutil.which("bevviz")
+    if installed is not None and Path(installed).resolve() == script.resolve():
         return "bevviz"
-    return shlex.quote(str(called))
+    return shlex.quote(str(script))
 
 
 def has_browser() -> bool:

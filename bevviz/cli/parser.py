@@ -26,32 +26,32 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str], namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse arguments like argparse. The command that got an unknown option reports it first."""
-        for option in self._own(args):
+        for option in self._own_options(args):
             name = option.partition("=")[0]
             known = self._option_string_actions
-            if name not in known and not any(one.startswith(name) for one in known):
+            if name not in known and not any(known_option.startswith(name) for known_option in known):
                 self.error(f"unknown option {name}{did_you_mean(name, known, CUTOFF)}")
-        found, unknown = super().parse_known_args(args, namespace)
+        parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"{unknown[0]}: nothing is expected here")
-        return found, unknown
+        return parsed, unknown
 
-    def _own(self, args: Sequence[str]) -> Iterable[str]:
+    def _own_options(self, args: Sequence[str]) -> Iterable[str]:
         """Yield this parser's own options. Those of a subcommand and of ROS are not among them."""
         if any(isinstance(action, argparse._SubParsersAction) for action in self._actions):
             args = list(takewhile(lambda arg: arg.startswith("-"), args))
-        mine = takewhile(lambda arg: arg not in ("--", "--ros-args"), args)
-        return (arg for arg in mine if arg.startswith("--"))
+        own_args = takewhile(lambda arg: arg not in ("--", "--ros-args"), args)
+        return (arg for arg in own_args if arg.startswith("--"))
 
     def error(self, message: str) -> NoReturn:
         """Print an error and the usage on stderr, and exit with status 2."""
         if choice := _CHOICE.search(message):
-            given, known = choice["given"], re.findall(r"[^\s',]+", choice["known"])
+            wrong, known = choice["given"], re.findall(r"[^\s',]+", choice["known"])
             if message.startswith(f"argument {COMMAND}:"):
-                message = _no_command(given, known)
+                message = _no_command(wrong, known)
             else:
-                message = f"{message[: choice.start()]}'{given}' is none of {', '.join(known)}"
-                message += did_you_mean(given, known, CUTOFF)
+                message = f"{message[: choice.start()]}'{wrong}' is none of {', '.join(known)}"
+                message += did_you_mean(wrong, known, CUTOFF)
         print(f"{style.error('bevviz: error:')} {printable(message)}\n{self.short_usage()}", file=sys.stderr)
         self.exit(2)
 
@@ -68,16 +68,18 @@ class Parser(argparse.ArgumentParser):
         ]
         for group in self._mutually_exclusive_groups:
             if group.required:
-                one = (f"{action.option_strings[-1]} {action.metavar}" for action in group._group_actions)
-                words.append(f"({' | '.join(one)})")
+                alternatives = (
+                    f"{action.option_strings[-1]} {action.metavar}" for action in group._group_actions
+                )
+                words.append(f"({' | '.join(alternatives)})")
         return f"usage: {' '.join(words)} [OPTION ...]    '{self.prog} --help' explains"
 
 
 def _no_command(given: str, known: Iterable[str]) -> str:
     """Return the message for an argument that is neither a command nor an existing file."""
-    path = Path(given)
+    path = Path(argument)
     if path.suffix or len(path.parts) > 1:
-        there: list[str] = []
+        siblings: list[str] = []
         with suppress(OSError, ValueError):
             there = [str(other) for other in path.parent.iterdir()]
         return f"{given}: no such file or folder{did_you_mean(given, there, CUTOFF)}"

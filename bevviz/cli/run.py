@@ -84,11 +84,11 @@ def logged(
     from bevviz.recording.recorder import DiskWatch
 
     with outputs.opened(items.scene, config) as sinks:
-        seen = [*observers(sinks.recording), DiskWatch(sinks)]
-        early = list(items.warnings)  # Print these warnings before the long run, not after it.
-        warn(early)
-        end = through(items, processor, seen)
-        warn(warning for warning in items.warnings if warning not in early)
+        all_observers = [*observers(sinks.recording), DiskWatch(sinks)]
+        early_warnings = list(items.warnings)  # Print these warnings before the long run, not after it.
+        warn(early_warnings)
+        end = through(items, processor, all_observers)
+        warn(warning for warning in items.warnings if warning not in early_warnings)
         finish()
         if end.frames and not end.interrupted:
             outputs.keep_serving(sinks, f"{end.frames} frames; ")

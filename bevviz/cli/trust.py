@@ -68,10 +68,10 @@ def _trust(options: argparse.Namespace) -> int:
 def _list() -> int:
     from bevviz.config.trust import records
 
-    found = list(records())
-    for record in found:
+    trusted = list(records())
+    for record in trusted:
         print(f"{record.path}: {', '.join(record.functions)}{_state(record.path, record.sha256)}")
-    if not found:
+    if not trusted:
         print("nothing is trusted")
     return 0
 
@@ -93,7 +93,7 @@ def _file(path: Path | None) -> Path:
     if path is not None and not path.is_dir():
         return path
     folder = Path.cwd() if path is None else path.absolute()
-    found = find(folder)
-    if found is None:
+    project_file = find(folder)
+    if project_file is None:
         raise UserError(f"{os.path.relpath(folder)}: there is no {NAME} in this folder, or in one above")
-    return found
+    return project_file

@@ -50,25 +50,27 @@ def _tune(options: argparse.Namespace) -> int:
     from bevviz.recording.ports import free_port
     from bevviz.sweep.tune import OneFrame, Saves, Version, VersionRecorder, create
 
-    given = given_settings(options)
-    known: list[Layer] = []
+    option_settings = given_settings(options)
+    recorded_layers: list[Layer] = []
     if not options.config.exists() and create(
-        options.config, dump(loaded(options, None, given, options.preset))
+        options.config, dump(loaded(options, None, option_settings, options.preset))
     ):
         say(f"{options.config}: made, with every parameter")
     elif (recorded := getattr(options, "recorded", None)) is not None:
         say(f"{options.config}: is there already, and taken instead of the recording's configuration")
-        known = [recorded.missing(load(options.config, given, options.preset))]
-    settings = Settings(options.config, [*known, *given], options.preset, project_layers(options))
+        recorded_layers = [recorded.missing(load(options.config, option_settings, options.preset))]
+    settings = Settings(
+        options.config, [*recorded_layers, *option_settings], options.preset, project_layers(options)
+    )
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:
         outputs = outputs._replace(serve=free_port(9090))
-    one = OneFrame(frame)
-    one.check(settings.config)
+    processor = OneFrame(frame)
+    processor.check(settings.config)
     last = 0
 
-    def tell(version: Version, seconds: float) -> None:
+    def print_version(version: Version, seconds: float) -> None:
         nonlocal last
         last = version.number
         after = f" ({seconds * 1e3:.0f} ms after the save)" if version.number else ""
@@ -79,10 +81,10 @@ def _tune(options: argparse.Namespace) -> int:
     with outputs.opened(scene, settings.config) as sinks:
         hint(scene, settings.config)
         warn(warnings)
-        saves = Saves(settings, scene, one.check, lambda error: say(f"not taken: {error}"))
-        recorder = VersionRecorder(sinks.recording, settings.config, tell)
+        saves = Saves(settings, scene, processor.check, lambda error: say(f"not taken: {error}"))
+        recorder = VersionRecorder(sinks.recording, settings.config, print_version)
         with terminable() as ended:
-            run(saves, one, [recorder], dropping=Dropping(), stop=ended)
+            run(saves, processor, [recorder], dropping=Dropping(), stop=ended)
     say(f"ended at version {last}")
     return 0
 

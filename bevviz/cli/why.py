@@ -46,39 +46,39 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(why)
     add_at(group, "the scan nearest to this time", required=True)
-    what = why.add_argument_group("what to explain", "Nothing: what did not end as an object of its own.")
-    one = what.add_mutually_exclusive_group()
-    one.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
-    one.add_argument(
+    targets = why.add_argument_group("what to explain", "Nothing: what did not end as an object of its own.")
+    target = targets.add_mutually_exclusive_group()
+    target.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
+    target.add_argument(
         "--box", type=_numbers(2, 4), default=(), metavar="U,V[,U1,V1]", help="at that pixel, or in that box"
     )
-    one.add_argument(
+    target.add_argument(
         "--point",
         type=_numbers(3),
         default=(),
         metavar="X,Y,Z",
         help="there, in metres of the points' frame",
     )
-    one.add_argument(
+    target.add_argument(
         "--cell",
         type=_numbers(2),
         default=(),
         metavar="ROW,COLUMN",
         help="what is in that cell of the bird's-eye view",
     )
-    one.add_argument("--cluster", type=number, metavar="N", help="the cluster of that number")
-    one.add_argument("--object", type=number, metavar="N", help="the object in that row")
-    one.add_argument("--detection", type=number, metavar="N", help="the detection in that row")
-    what.add_argument(
+    target.add_argument("--cluster", type=number, metavar="N", help="the cluster of that number")
+    target.add_argument("--object", type=number, metavar="N", help="the object in that row")
+    target.add_argument("--detection", type=number, metavar="N", help="the detection in that row")
+    targets.add_argument(
         "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
     )
-    what.add_argument(
+    targets.add_argument(
         "--camera", default="", metavar="NAME", help="of pixel or detection, if there are several"
     )
-    what.add_argument(
+    targets.add_argument(
         "--limit", type=positive, default=5, metavar="N", help="the N worst with their chain (default: 5)"
     )
-    what.add_argument(
+    targets.add_argument(
         "--all", action="store_true", help="also what went well, and what nothing could be done about"
     )
     add_json(why)
@@ -128,19 +128,19 @@ def _why(options: argparse.Namespace) -> int:
         frame = next(iter(source), None) if row is None else source.frame(row)
         warn(source.warnings)
         if frame is None:
-            asked = f"--at {options.at}" if row is None else f"--at-frame {row}"
-            raise UserError(f"{asked}: the scan there cannot be read")
+            option = f"--at {options.at}" if row is None else f"--at-frame {row}"
+            raise UserError(f"{option}: the scan there cannot be read")
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.explained(frame)
         questioner = Questioner(result, loader, session.stages.class_names)
         answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
-        beside = _beside(questioner, selection, answers)
-        in_short = _in_short(questioner, selection)
-        give(options, "why", _tree(result, answers, beside, in_short))
+        neighbours = _neighbours(questioner, selection, answers)
+        headline = _headline(questioner, selection)
+        give(options, "why", _tree(result, answers, neighbours, headline))
         if not on_stdout(options):
-            print(printable(f"frame {frame.index}, preset {config.preset}: {in_short}"))
+            print(printable(f"frame {frame.index}, preset {config.preset}: {headline}"))
             if answers:
-                print(f"\n{plain(answers, options.limit, beside)}")
+                print(f"\n{plain(answers, options.limit, neighbours)}")
         if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
@@ -162,31 +162,31 @@ def _selection(options: argparse.Namespace) -> Selection:
     )
 
 
-def _beside(questioner: Questioner, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
+def _neighbours(questioner: Questioner, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
     """Return the answers about other objects at the selected place."""
     if not (selection.box or selection.point or selection.cell):
         return []
-    told = {answer.subject.key for answer in answers}
-    return [answer for answer in questioner.candidates(selection) if answer.subject.key not in told]
+    answered = {answer.subject.key for answer in answers}
+    return [answer for answer in questioner.candidates(selection) if answer.subject.key not in answered]
 
 
-def _in_short(questioner: Questioner, selection: Selection) -> str:
+def _headline(questioner: Questioner, selection: Selection) -> str:
     """Return one line about the selected objects, or the reason why there are none."""
     from bevviz.why.answer_text import summary
     from bevviz.why.sentences import not_run
 
-    found = questioner.ask(selection)
+    answers = questioner.ask(selection)
     if selection.one:
-        return found[0].subject.name
-    if found:
-        return summary(found)
-    never = "; ".join(not_run(questioner.traces.result, selection.camera))
-    what = f"no {selection.label} is known" if selection.label else "no object is known"
-    if never:
-        return f"{what}, as the detector never ran ({never}); ask for a place with --point x,y,z"
+        return answers[0].subject.name
+    if answers:
+        return summary(answers)
+    reasons = "; ".join(not_run(questioner.traces.result, selection.camera))
+    problem = f"no {selection.label} is known" if selection.label else "no object is known"
+    if reasons:
+        return f"{problem}, as the detector never ran ({reasons}); ask for a place with --point x,y,z"
     if selection.label:
-        return f"{what}: the detector has no candidate, however weak"
-    return f"{what}: there is no detection, however weak"
+        return f"{problem}: the detector has no candidate, however weak"
+    return f"{problem}: there is no detection, however weak"
 
 
 def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
@@ -195,20 +195,20 @@ def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
 
 
 def _tree(
-    result: FrameResult, answers: Sequence[Answer], beside: Sequence[Answer], in_short: str
+    result: FrameResult, answers: Sequence[Answer], neighbours: Sequence[Answer], headline: str
 ) -> dict[str, Any]:
     frame = result.frame
-    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset, "summary": in_short}
-    there = [{"name": a.subject.name, "verdict": a.verdict.text} for a in beside]
-    return {**head, "answers": [a.as_dict() for a in answers], "beside": there}
+    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset, "summary": headline}
+    verdicts = [{"name": a.subject.name, "verdict": a.verdict.text} for a in neighbours]
+    return {**head, "answers": [a.as_dict() for a in answers], "beside": verdicts}
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
     from bevviz.recording.frame_logger import Logger
     from bevviz.why.log import focus, log_answers
 
-    if answers and (place := focus(result.frame, answers[0])) is not None:
-        x, y, z = place.tolist()
+    if answers and (position := focus(result.frame, answers[0])) is not None:
+        x, y, z = position.tolist()
         scene = replace(scene, focus=(x, y, z))
     with outputs.opened(scene, result.config) as sinks:
         logger = Logger(sinks.recording, result.config, scene)

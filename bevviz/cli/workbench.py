@@ -63,19 +63,19 @@ def add(commands: Commands) -> None:
 
 
 def _open(options: argparse.Namespace) -> int:
-    if (shown := getattr(options, "shown", None)) is not None:
-        return _show(shown, options)
+    if (recording := getattr(options, "shown", None)) is not None:
+        return _show(recording, options)
     try:
         from bevviz.workbench.server import serve
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    config, beside = load_config(options), _beside(options)
+    config, native_viewer = load_config(options), _wants_native_viewer(options)
     with ExitStack() as stack:
         from bevviz.bags.source import BagSource
 
-        source, again = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
+        source, second_source = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
         number = options.at_frame or 0
         first = source.checked(number) if options.at is None else source.number_at(options.at)
         warn(source.warnings)
@@ -83,14 +83,14 @@ def _open(options: argparse.Namespace) -> int:
         def make() -> Bench:
             _arrow_without_pandas()
             hint(source.scene, config)
-            bench = made()
-            if beside:
+            bench = make_session()
+            if native_viewer:
                 from bevviz.workbench.native_viewer import NativeViewer
 
                 bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
             return bench
 
-        def made() -> Bench:
+        def make_session() -> Bench:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
             from bevviz.workbench.session import Bench
@@ -98,9 +98,9 @@ def _open(options: argparse.Namespace) -> int:
 
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
             if truth_of is None or (options.truth is None and options.kitti_labels is None):
-                return Bench(Drive(source, config), again, options.paths, truth_of, first)
-            mine, others = (Labelled(frames, truth_of) for frames in (source, again))
-            return Bench(Drive(mine, config), others, options.paths, truth_of, first)
+                return Bench(Drive(source, config), second_source, options.paths, truth_of, first)
+            labelled, second_labelled = (Labelled(frames, truth_of) for frames in (source, second_source))
+            return Bench(Drive(labelled, config), second_labelled, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}", always=True)
@@ -112,27 +112,27 @@ def _open(options: argparse.Namespace) -> int:
 
         with suppress(KeyboardInterrupt), terminable():  # The user ends it with a signal.
             drive = "\n".join(str(path.resolve()) for path in options.paths)
-            serve(make, drive, options.port, ready, "native" if beside else "page")
+            serve(make, drive, options.port, ready, "native" if native_viewer else "page")
     return 0
 
 
 def _show(recording: Path, options: argparse.Namespace) -> int:
     """Show a recording without a bag. It can be looked at, but not asked."""
-    from bevviz.recording import saved_viewer as shown
+    from bevviz.recording import saved_viewer
 
     say(f"{recording}: no bag behind it, shown as it is")
     if has_display():
-        shown.in_viewer(recording)
+        saved_viewer.in_viewer(recording)
         return 0
-    if larger := shown.too_large_for_web(recording, recording.stat().st_size):
+    if larger := saved_viewer.too_large_for_web(recording, recording.stat().st_size):
         warn([larger])
-    with shown.in_browser(recording, options.port) as address:
+    with saved_viewer.in_browser(recording, options.port) as address:
         tell_of_browser(address)
         wait_for_interrupt()
     return 0
 
 
-def _beside(options: argparse.Namespace) -> bool:
+def _wants_native_viewer(options: argparse.Namespace) -> bool:
     """Return whether Rerun's viewer is shown next to the page.
 
     Raises:

@@ -98,10 +98,14 @@ class FrameDifferences:
         """Number of objects of each kind of difference."""
         return Counter(difference.change for difference in self.objects)
 
+    def side_with(self, difference: Difference) -> tuple[Seen, int]:
+        """Return a side that has the object, and the object's row there. B comes first."""
+        return (self.a, difference.row_a) if difference.row_b < 0 else (self.b, difference.row_b)
+
     @property
     def number(self) -> int:
         """Number of objects and detections that differ."""
-        pairs = [*self.objects, *(d for found in self.images.values() for d in found)]
+        pairs = [*self.objects, *(d for image_pairs in self.images.values() for d in image_pairs)]
         return sum(difference.change is not Change.SAME for difference in pairs)
 
 
@@ -109,9 +113,11 @@ def seen(result: FrameResult) -> Seen:
     """Return the result of a run as one side of a comparison."""
     images = {}
     for camera in result.cameras:
-        if (found := camera.detections) is not None:
-            kept = np.flatnonzero(found.kept)
-            images[camera.camera.name] = ImageBoxes(found.xyxy[kept], tuple(found.names[d] for d in kept))
+        if (detections := camera.detections) is not None:
+            kept = np.flatnonzero(detections.kept)
+            images[camera.camera.name] = ImageBoxes(
+                detections.xyxy[kept], tuple(detections.names[d] for d in kept)
+            )
     clusters = None
     if result.clusters is not None:
         clusters = int(result.clusters.kept.sum())
@@ -147,10 +153,10 @@ def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
     """
     distance = np.linalg.norm(a.boxes.center[:, None, :2] - b.boxes.center[None, :, :2], axis=2)
     iou = geometry.bev_iou(a.boxes, b.boxes)
-    other = _other(a.names, b.names)
-    allowed = np.where(other, iou >= OVERLAP, distance <= REACH)
-    cost = np.where(allowed, np.minimum(distance / REACH, 1) + (1 - iou) + other, np.inf)
-    return _paired(a.names, b.names, cost, distance, iou, MOVED)
+    other_class = _names_differ(a.names, b.names)
+    allowed = np.where(other_class, iou >= OVERLAP, distance <= REACH)
+    cost = np.where(allowed, np.minimum(distance / REACH, 1) + (1 - iou) + other_class, np.inf)
+    return _make_pairs(a.names, b.names, cost, distance, iou, MOVED)
 
 
 def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
@@ -161,26 +167,26 @@ def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
     iou = geometry.iou(a.xyxy, b.xyxy)
     middle_a, middle_b = ((boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 for boxes in (a, b))
     distance = np.linalg.norm(middle_a[:, None] - middle_b[None], axis=2)
-    cost = np.where(iou >= IMAGE_OVERLAP, 1 - iou + _other(a.names, b.names), np.inf)
-    return _paired(a.names, b.names, cost, distance, iou, np.inf)
+    cost = np.where(iou >= IMAGE_OVERLAP, 1 - iou + _names_differ(a.names, b.names), np.inf)
+    return _make_pairs(a.names, b.names, cost, distance, iou, np.inf)
 
 
-def _other(a: Sequence[str], b: Sequence[str]) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+def _names_differ(a: Sequence[str], b: Sequence[str]) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
     return np.array([[x != y for y in b] for x in a], bool).reshape(len(a), len(b))
 
 
-def _paired(
+def _make_pairs(
     a: Sequence[str], b: Sequence[str], cost: F64, distance: F32, iou: F32, moved: float
 ) -> tuple[Difference, ...]:
     # Two unmatched objects cost more than any pair, so that the assignment makes as many pairs as it can.
     column = assign(np.asarray(cost, np.float64), unmatched=10.0)
-    found = []
+    pairs = []
     for i, j in enumerate(column.tolist()):
         if j < 0:
-            found.append(Difference(Change.ONLY_A, i, -1, a[i], ""))
+            pairs.append(Difference(Change.ONLY_A, i, -1, a[i], ""))
             continue
-        away = float(distance[i, j])
-        change = Change.CLASS if a[i] != b[j] else Change.MOVED if away > moved else Change.SAME
-        found.append(Difference(change, i, j, a[i], b[j], away, float(iou[i, j])))
-    alone = sorted(set(range(len(b))) - set(column.tolist()))
-    return (*found, *(Difference(Change.ONLY_B, -1, j, "", b[j]) for j in alone))
+        pair_distance = float(distance[i, j])
+        change = Change.CLASS if a[i] != b[j] else Change.MOVED if pair_distance > moved else Change.SAME
+        pairs.append(Difference(change, i, j, a[i], b[j], pair_distance, float(iou[i, j])))
+    only_b = sorted(set(range(len(b))) - set(column.tolist()))
+    return (*pairs, *(Difference(Change.ONLY_B, -1, j, "", b[j]) for j in only_b))

@@ -63,18 +63,18 @@ class DifferenceLogger(Writer):
                 entities.difference_count(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
             )
-        for judged, state in (("broken", State.BAD), ("fixed", State.GOOD)):
+        for outcome, state in (("broken", State.BAD), ("fixed", State.GOOD)):
             self.static(
-                entities.difference(judged),
+                entities.difference(outcome),
                 rr.Boxes3D.from_fields(
                     colors=[state.value], radii=rr.Radius.ui_points(3.5), show_labels=True, fill_mode=OUTLINE
                 ),
             )
-        for what, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
+        for side, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
             for series in ("objects", "clusters"):
                 self.static(
-                    entities.difference_count(f"{series}_{what}"),
-                    rr.SeriesLines(colors=[color], names=[f"{series} {what.upper()}"]),
+                    entities.difference_count(f"{series}_{side}"),
+                    rr.SeriesLines(colors=[color], names=[f"{series} {side.upper()}"]),
                 )
 
     def refresh(self, known: Set[str] = frozenset()) -> None:
@@ -82,47 +82,49 @@ class DifferenceLogger(Writer):
         super().refresh(known)
         self._lanes.states = {}
 
-    def log(self, found: FrameDifferences, received: int, world_from_points: F64) -> None:
+    def log(self, differences: FrameDifferences, received: int, world_from_points: F64) -> None:
         """Log the differences of one frame.
 
         Args:
-            found: differences of the frame.
+            differences: of the frame.
             received: receive time in nanoseconds; 0: unknown.
             world_from_points: (4, 4) pose of the points in the fixed frame.
         """
-        self.begin(found.index, found.stamp, received)
+        self.begin(differences.index, differences.stamp, received)
         for change in DIFFERENT:
-            mine = [d for d in found.objects if d.change is change]
-            if mine:
-                self._log_boxes(change, mine, found, world_from_points)
-        if found.judged is not None:
-            self._log_judged(found.judged, world_from_points)
-        for camera, pairs in found.images.items():
-            self._log_image(camera, pairs, found)
-        for name, value in _counts(found).items():
+            changed_objects = [d for d in differences.objects if d.change is change]
+            if changed_objects:
+                self._log_boxes(change, changed_objects, differences, world_from_points)
+        if differences.judged is not None:
+            self._log_judged(differences.judged, world_from_points)
+        for camera, pairs in differences.images.items():
+            self._log_image(camera, pairs, differences)
+        for name, value in _counts(differences).items():
             self.scalar(entities.difference_count(name), float(value))
-        self.put(entities.COMPARE, document(page(found)))
-        changed = [d for d in found.objects if d.change is not Change.SAME]
-        self.lines(entities.COMPARE_LOG, [("INFO", f"{d.text} {place(d, found)}") for d in changed])
-        worst = worst_of_each_class(found.objects)
+        self.put(entities.COMPARE, document(page(differences)))
+        changed = [d for d in differences.objects if d.change is not Change.SAME]
+        self.lines(entities.COMPARE_LOG, [("INFO", f"{d.text} {place(d, differences)}") for d in changed])
+        worst = worst_of_each_class(differences.objects)
         self._lanes.log(self, {entities.difference_state(name): change for name, change in worst.items()})
         self.end()
 
     def _log_boxes(
-        self, change: Change, mine: list[Difference], found: FrameDifferences, world_from_points: F64
+        self, change: Change, objects: list[Difference], differences: FrameDifferences, world_from_points: F64
     ) -> None:
-        side, rows = (found.a, [d.row_a for d in mine])
+        side, rows = (differences.a, [d.row_a for d in objects])
         if change is not Change.ONLY_A:
-            side, rows = (found.b, [d.row_b for d in mine])
+            side, rows = (differences.b, [d.row_b for d in objects])
         path = entities.difference(change)
         # If the ground truth is known, only objects that one side alone finds get a name. They matter more.
         is_named = named_in_space(side.boxes.center[rows], height=HEIGHT)
-        labels = [_label(d) if found.judged is None and is_named[i] else "" for i, d in enumerate(mine)]
-        what = boxes3d(side.boxes, np.array(rows), labels)
-        self.put(path, transform(world_from_points), what)
+        labels = [
+            _label(d) if differences.judged is None and is_named[i] else "" for i, d in enumerate(objects)
+        ]
+        boxes = boxes3d(side.boxes, np.array(rows), labels)
+        self.put(path, transform(world_from_points), boxes)
         if change is Change.MOVED:
-            start = found.a.boxes.center[[d.row_a for d in mine]]
-            end = found.b.boxes.center[rows]
+            start = differences.a.boxes.center[[d.row_a for d in objects]]
+            end = differences.b.boxes.center[rows]
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
             self.put(f"{path}/from_a", arrows)
 
@@ -130,30 +132,30 @@ class DifferenceLogger(Writer):
         rows = np.array([*judged.broken, *judged.fixed], np.int64)
         is_broken = np.arange(len(rows)) < len(judged.broken)
         is_named = named_in_space(judged.boxes.center[rows], is_broken, HEIGHT)
-        for what, mine in (("broken", is_broken), ("fixed", ~is_broken)):
-            if mine.any():
+        for outcome, selected in (("broken", is_broken), ("fixed", ~is_broken)):
+            if selected.any():
                 labels = [
-                    f"{what}: {judged.labels[row]}" if named else ""
-                    for row, named in zip(rows[mine].tolist(), is_named[mine], strict=True)
+                    f"{outcome}: {judged.labels[row]}" if named else ""
+                    for row, named in zip(rows[selected].tolist(), is_named[selected], strict=True)
                 ]
-                boxes = boxes3d(judged.boxes, rows[mine], labels)
-                self.put(entities.difference(what), transform(world_from_points), boxes)
+                boxes = boxes3d(judged.boxes, rows[selected], labels)
+                self.put(entities.difference(outcome), transform(world_from_points), boxes)
 
-    def _log_image(self, camera: str, pairs: tuple[Difference, ...], found: FrameDifferences) -> None:
+    def _log_image(self, camera: str, pairs: tuple[Difference, ...], differences: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):
-            mine = [d for d in pairs if d.change is change]
-            if not mine:
+            selected = [d for d in pairs if d.change is change]
+            if not selected:
                 continue
             if change is Change.ONLY_A:
-                boxes = found.a.images[camera].xyxy[[d.row_a for d in mine]]
+                boxes = differences.a.images[camera].xyxy[[d.row_a for d in selected]]
             else:
-                boxes = found.b.images[camera].xyxy[[d.row_b for d in mine]]
+                boxes = differences.b.images[camera].xyxy[[d.row_b for d in selected]]
             self.put(
                 entities.image_difference(camera, change),
                 over_image(camera),
                 boxes2d(
                     boxes,
-                    [_label(d) for d in mine],
+                    [_label(d) for d in selected],
                     colors=[COLORS[change]],
                     radii=rr.Radius.ui_points(2.5),
                     draw_order=40.0,
@@ -170,41 +172,39 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
     return worst
 
 
-def place(difference: Difference, found: FrameDifferences) -> str:
+def place(difference: Difference, differences: FrameDifferences) -> str:
     """Return the position of the object relative to its frame's origin, as ``at 12.3 m, 4° left``."""
-    boxes, row = (
-        (found.a.boxes, difference.row_a) if difference.row_b < 0 else (found.b.boxes, difference.row_b)
-    )
-    x, y = boxes.center[row, :2].tolist()
+    side, row = differences.side_with(difference)
+    x, y = side.boxes.center[row, :2].tolist()
     angle = float(np.degrees(np.arctan2(y, x)))
-    side = "left" if angle >= 0 else "right"
-    return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {side}"
+    direction = "left" if angle >= 0 else "right"
+    return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {direction}"
 
 
-def page(found: FrameDifferences) -> str:
+def page(differences: FrameDifferences) -> str:
     """Return the differences of one frame as Markdown."""
-    return "\n".join(_lines(found))
+    return "\n".join(_lines(differences))
 
 
-def _lines(found: FrameDifferences) -> Iterator[str]:
-    yield f"### Frame {found.index}"
+def _lines(differences: FrameDifferences) -> Iterator[str]:
+    yield f"### Frame {differences.index}"
     yield ""
-    yield table.markdown([("", "A", "B"), *_totals(found)])
-    if (judged := found.judged) is not None:
-        for what, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
+    yield table.markdown([("", "A", "B"), *_totals(differences)])
+    if (judged := differences.judged) is not None:
+        for title, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
             if objects:
                 yield ""
-                yield f"#### {what}: {len(objects)}"
+                yield f"#### {title}: {len(objects)}"
                 yield ""
                 yield from (f"- {markdown(judged.text(row))}" for row in objects)
     for change in (*DIFFERENT, Change.SAME):
-        mine = [d for d in found.objects if d.change is change]
-        if mine:
+        selected = [d for d in differences.objects if d.change is change]
+        if selected:
             yield ""
-            yield f"#### {change[0].upper() + change[1:]}: {len(mine)}"
+            yield f"#### {change[0].upper() + change[1:]}: {len(selected)}"
             yield ""
-            yield from (f"- {markdown(_item(d))} {place(d, found)}" for d in mine)
-    for camera, pairs in found.images.items():
+            yield from (f"- {markdown(_item(d))} {place(d, differences)}" for d in selected)
+    for camera, pairs in differences.images.items():
         rows = [d for d in pairs if d.change is not Change.SAME]
         if rows:
             yield ""
@@ -213,9 +213,9 @@ def _lines(found: FrameDifferences) -> Iterator[str]:
             yield from (f"- {markdown(d.text)}" for d in rows)
 
 
-def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
+def _totals(differences: FrameDifferences) -> Iterator[tuple[str, str, str]]:
     """Yield table rows: title, number in A, number in B."""
-    a, b = found.a, found.b
+    a, b = differences.a, differences.b
     yield "objects", str(len(a.names)), str(len(b.names))
     if a.clusters is not None or b.clusters is not None:
         yield (
@@ -223,9 +223,9 @@ def _totals(found: FrameDifferences) -> Iterator[tuple[str, str, str]]:
             "-" if a.clusters is None else str(a.clusters),
             "-" if b.clusters is None else str(b.clusters),
         )
-    if (judged := found.judged) is not None:
+    if (judged := differences.judged) is not None:
         yield f"found of {len(judged.labels)} that are there", str(judged.a.sum()), str(judged.b.sum())
-    for camera in found.images:
+    for camera in differences.images:
         yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
 
 
@@ -243,10 +243,10 @@ def _label(difference: Difference) -> str:
     return f"{difference.name_a or difference.name_b}: {difference.change}"
 
 
-def _counts(found: FrameDifferences) -> dict[str, int]:
-    counts: dict[str, int] = {change: found.counts[change] for change in DIFFERENT}
-    for what, side in (("a", found.a), ("b", found.b)):
-        counts[f"objects_{what}"] = len(side.names)
+def _counts(differences: FrameDifferences) -> dict[str, int]:
+    counts: dict[str, int] = {change: differences.counts[change] for change in DIFFERENT}
+    for side_name, side in (("a", differences.a), ("b", differences.b)):
+        counts[f"objects_{side_name}"] = len(side.names)
         if side.clusters is not None:
-            counts[f"clusters_{what}"] = side.clusters
+            counts[f"clusters_{side_name}"] = side.clusters
     return counts

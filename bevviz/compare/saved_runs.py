@@ -109,8 +109,12 @@ class SavedRun:
             return
         detections = entities.detections("*").split("*")
         of_image = path.startswith(detections[0]) and path.endswith(detections[1])
-        plain = (entities.FUSED, entities.EXPLAIN, *(entities.count(c) for c in ("clusters", "detections")))
-        if chunk.is_static or not (of_image or path in plain):
+        scalar_paths = (
+            entities.FUSED,
+            entities.EXPLAIN,
+            *(entities.count(c) for c in ("clusters", "detections")),
+        )
+        if chunk.is_static or not (of_image or path in scalar_paths):
             return
         for row in _rows(chunk):
             frame = self.frames.setdefault(row[entities.STAMP], SavedFrame())
@@ -178,8 +182,8 @@ class SavedPair:
     def perceive(self, stamp: int, network: Executor | None = None) -> SavedFrames:
         """Compare the runs at one of the stamps."""
         a, b = self.a.frames[stamp], self.b.frames[stamp]
-        found = differences(a.index, stamp, a.seen(self.a.cameras), b.seen(self.b.cameras))
-        return SavedFrames(a, b, found)
+        frame_differences = differences(a.index, stamp, a.seen(self.a.cameras), b.seen(self.b.cameras))
+        return SavedFrames(a, b, frame_differences)
 
     def finish(self, frames: SavedFrames) -> SavedFrames:
         """Return the frames as they are."""
@@ -196,10 +200,10 @@ class SavedPairRecorder(Observer[SavedFrames]):
         """Copy both runs."""
         recording, pair = self._recording, self._pair
         recording.send_chunks(pair.a.stream())
-        recording.send_chunks(_beside(pair.b))
-        beside = Writer(recording, entities.B)
+        recording.send_chunks(_under_b(pair.b))
+        writer_b = Writer(recording, entities.B)
         for camera in pair.b.cameras:
-            log_shared_image(beside, camera)
+            log_shared_image(writer_b, camera)
         self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
     def see(self, frames: SavedFrames) -> None:
@@ -208,18 +212,18 @@ class SavedPairRecorder(Observer[SavedFrames]):
         self._differences.log(frames.found, frames.a.received, posed.world_from_points)
 
 
-def _beside(run: SavedRun) -> Iterator[Chunk]:
+def _under_b(run: SavedRun) -> Iterator[Chunk]:
     """Yield the run's results, moved to ``/b``. The data of sensors and robot are those of the old run."""
-    brought = {entities.TRUTH, *(entities.points(lidar) for lidar in run.lidars)}
+    input_paths = {entities.TRUTH, *(entities.points(lidar) for lidar in run.lidars)}
     for camera in run.cameras:
-        brought |= {entities.sensor(camera), entities.image(camera)}
-    how = f"/__properties/{entities.PROPERTY}"
+        input_paths |= {entities.sensor(camera), entities.image(camera)}
+    property_path = f"/__properties/{entities.PROPERTY}"
     roots = (entities.WORLD, entities.EXPLAIN, entities.BEV, entities.HEALTH, entities.CONFIG)
     for chunk in run.stream():
         path = chunk.entity_path
-        if path == how:
-            yield chunk.with_entity_path(how + entities.B.replace("/", "_"))
-        elif path not in brought and any(path == root or path.startswith(f"{root}/") for root in roots):
+        if path == property_path:
+            yield chunk.with_entity_path(property_path + entities.B.replace("/", "_"))
+        elif path not in input_paths and any(path == root or path.startswith(f"{root}/") for root in roots):
             yield chunk.with_entity_path(entities.B + path)
 
 
@@ -236,11 +240,11 @@ def _rows(chunk: Chunk) -> list[Row]:
 def _boxes(row: Row) -> tuple[Boxes3D, tuple[str, ...], np.ndarray[Any, np.dtype[np.float32]]]:
     if not row.get("Boxes3D:centers"):
         return Boxes3D.empty(), (), np.zeros(0, np.float32)
-    turns = np.array(row["Boxes3D:quaternions"], np.float32)
+    quaternions = np.array(row["Boxes3D:quaternions"], np.float32)
     boxes = Boxes3D(
         np.array(row["Boxes3D:centers"], np.float32),
         np.array(row["Boxes3D:half_sizes"], np.float32) * 2,
-        2 * np.arctan2(turns[:, 2], turns[:, 3]),
+        2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]),
     )
     return boxes, tuple(row["class_name"]), np.array(row["score"], np.float32)
 
@@ -248,7 +252,7 @@ def _boxes(row: Row) -> tuple[Boxes3D, tuple[str, ...], np.ndarray[Any, np.dtype
 def _image_boxes(row: Row) -> ImageBoxes:
     if not row.get("Boxes2D:centers"):
         return ImageBoxes.empty()
-    middle = np.array(row["Boxes2D:centers"], np.float32) - CORNER
-    half = np.array(row["Boxes2D:half_sizes"], np.float32)
+    centers = np.array(row["Boxes2D:centers"], np.float32) - CORNER
+    half_sizes = np.array(row["Boxes2D:half_sizes"], np.float32)
     names = tuple(label.rpartition(" ")[0] for label in row["Boxes2D:labels"])  # the score follows the name
-    return ImageBoxes(np.hstack([middle - half, middle + half]), names)
+    return ImageBoxes(np.hstack([centers - half_sizes, centers + half_sizes]), names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -16,7 +15,7 @@ from bevviz.compare.summary import ComparisonSummary
 from bevviz.compare.truth_score import judge
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate import Truth
+from bevviz.evaluate.ground_truth import Truths
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
@@ -45,17 +44,14 @@ class SideFailures(Observer[ComparedFrame]):
 
     def see(self, result: ComparedFrame) -> None:
         """Collect the failures of a frame."""
-        for side, made in (("A", result.a), ("B", result.b)):
-            if made is not None:
-                self._sides[side].see(made)
+        for side, frame_result in (("A", result.a), ("B", result.b)):
+            if frame_result is not None:
+                self._sides[side].see(frame_result)
 
     @property
     def warnings(self) -> list[str]:
         """One sentence for each failed stage of a side."""
-        return [f"{side}: {text}" for side, found in self._sides.items() for text in found.warnings]
-
-
-Truths = Callable[[Frame], Truth | None]
+        return [f"{side}: {text}" for side, failures in self._sides.items() for text in failures.warnings]
 
 
 class ComparedSessions:
@@ -83,7 +79,7 @@ class ComparedSessions:
         assert compared.a is not None
         assert compared.b is not None
         a, b = self._sessions.finish((compared.a, compared.b))
-        return _differing(compared.frame, a, b, self._truth)
+        return _compare_sides(compared.frame, a, b, self._truth)
 
 
 class ComparedRobot:
@@ -99,11 +95,13 @@ class ComparedRobot:
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         """Finish the result in frame order, and compare it with the robot's."""
         assert compared.a is not None
-        theirs = published(compared.frame, self._topic, compared.a.config)
-        return _differing(compared.frame, self._session.finish(compared.a), theirs, self._truth)
+        robot_result = published(compared.frame, self._topic, compared.a.config)
+        return _compare_sides(compared.frame, self._session.finish(compared.a), robot_result, self._truth)
 
 
-def _differing(frame: Frame, a: FrameResult, b: FrameResult | None, truths: Truths | None) -> ComparedFrame:
+def _compare_sides(
+    frame: Frame, a: FrameResult, b: FrameResult | None, truths: Truths | None
+) -> ComparedFrame:
     if b is None:
         return ComparedFrame(frame, a, b)
     truth = None if truths is None else truths(frame)
@@ -150,24 +148,26 @@ class ComparisonRecorder(Observer[ComparedFrame]):
 # --- the robot ---------------------------------------------------------------------------------
 
 
-def robot_topic(topics: tuple[str, ...], asked: str) -> str:
+def robot_topic(topics: tuple[str, ...], requested: str) -> str:
     """Return the requested topic, or the topic with the robot's classed boxes if its name shows it.
 
     Raises:
         UserError: there is no such topic, or there are several candidates.
     """
-    there = ", ".join(topics)
-    if asked:
-        if asked not in topics:
-            raise UserError(f"--robot {asked}: no such Detection3DArray topic; there are: {there or 'none'}")
-        return asked
+    known = ", ".join(topics)
+    if requested:
+        if requested not in topics:
+            raise UserError(
+                f"--robot {requested}: no such Detection3DArray topic; there are: {known or 'none'}"
+            )
+        return requested
     named = [topic for topic in topics if "fused" in topic or "fusion" in topic]
     classed = named or [topic for topic in topics if "cluster" not in topic]
     if len(classed) == 1:
         return classed[0]
     if not topics:
         raise UserError("--robot: the bag has no vision_msgs/Detection3DArray of the robot")
-    raise UserError(f"--robot: which of its topics? Give one: --robot TOPIC, of {there}")
+    raise UserError(f"--robot: which of its topics? Give one: --robot TOPIC, of {known}")
 
 
 def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
@@ -182,10 +182,10 @@ def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
 def _objects(labelled: LabelledBoxes3D, frame: Frame) -> Objects:
     """Return the robot's boxes in the frame of the points."""
     boxes = in_points_frame(frame, labelled)
-    none = np.full(len(boxes), -1, np.int32)
-    return Objects(boxes, labelled.labels, labelled.scores, none, ("",) * len(boxes), none)
+    unmatched = np.full(len(boxes), -1, np.int32)
+    return Objects(boxes, labelled.labels, labelled.scores, unmatched, ("",) * len(boxes), unmatched)
 
 
 def _published_2d(frame: Frame, camera: Camera) -> CameraResult:
-    mine = [found for found in frame.robot_detections if found.camera == camera.name]
-    return CameraResult(camera, detections_of(mine[0]) if mine else None, None)
+    detections = [candidate for candidate in frame.robot_detections if candidate.camera == camera.name]
+    return CameraResult(camera, detections_of(detections[0]) if detections else None, None)

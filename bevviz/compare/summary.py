@@ -74,31 +74,32 @@ class ComparisonSummary(Observer[Compared]):
         else:
             self.add(compared.found)
 
-    def add(self, found: FrameDifferences) -> None:
+    def add(self, differences: FrameDifferences) -> None:
         """Count the differences of a frame."""
-        for difference in found.objects:
+        for difference in differences.objects:
             _count(self._classes, difference)
             if difference.change is Change.MOVED:
                 self._moved.append(difference.distance)
-        for pairs in found.images.values():
+        for pairs in differences.images.values():
             for difference in pairs:
                 _count(self._detections, difference)
-        for side, what in ((found.a, "objects A"), (found.b, "objects B")):
+        for side, key in ((differences.a, "objects A"), (differences.b, "objects B")):
             if side.clusters is not None:
-                self._clusters[what] += side.clusters
-        self._other_clusters += found.a.clusters != found.b.clusters
-        self._detected |= bool(found.a.images or found.b.images)
-        if found.judged is not None:
-            self._judge(found.judged)
-        differing = [d for d in found.objects if d.change is not Change.SAME]
+                self._clusters[key] += side.clusters
+        self._other_clusters += differences.a.clusters != differences.b.clusters
+        self._detected |= bool(differences.a.images or differences.b.images)
+        judged = differences.judged
+        if judged is not None:
+            self._judge(judged)
+        differing = [d for d in differences.objects if d.change is not Change.SAME]
         self.frames.append(
             {
-                "frame": found.index,
-                "stamp": found.stamp,
-                "number": found.number,
-                "fixed": [] if found.judged is None else [*map(found.judged.text, found.judged.fixed)],
-                "broke": [] if found.judged is None else [*map(found.judged.text, found.judged.broken)],
-                "objects": [_row(d, found) for d in differing],
+                "frame": differences.index,
+                "stamp": differences.stamp,
+                "number": differences.number,
+                "fixed": [] if judged is None else [*map(judged.text, judged.fixed)],
+                "broke": [] if judged is None else [*map(judged.text, judged.broken)],
+                "objects": [_row(d, differences) for d in differing],
                 "detections": [
                     {
                         "change": d.change.value,
@@ -108,7 +109,7 @@ class ComparisonSummary(Observer[Compared]):
                         "text": d.text,
                         "place": f"in {camera}",
                     }
-                    for camera, pairs in found.images.items()
+                    for camera, pairs in differences.images.items()
                     for d in pairs
                     if d.change is not Change.SAME
                 ],
@@ -124,9 +125,9 @@ class ComparisonSummary(Observer[Compared]):
             counts["there"] += 1
             counts["A"] += bool(judged.a[row])
             counts["B"] += bool(judged.b[row])
-        for what, rows in (("fixed", judged.fixed), ("broke", judged.broken)):
+        for outcome, rows in (("fixed", judged.fixed), ("broke", judged.broken)):
             for row in rows:
-                self._judged[judged.labels[row].lower()][what] += 1
+                self._judged[judged.labels[row].lower()][outcome] += 1
 
     @property
     def truth(self) -> Mapping[str, Any] | None:
@@ -173,14 +174,16 @@ class ComparisonSummary(Observer[Compared]):
             return
         yield f"{len(worst)} of {len(self.frames)} frames differ; the worst:"
         for frame in worst[:WORST]:
-            found = [*frame["objects"], *frame["detections"]]
-            counts = Counter(d["change"] for d in found)
-            how = ", ".join(f"{counts[change]} {change}" for change in WORST_FIRST if counts[change])
-            found.sort(key=lambda d: WORST_FIRST.index(d["change"]))
-            examples = [f"{what} {text}" for what in ("broke", "fixed") for text in frame[what]]
-            examples = examples or [f"{d['text']} {d['place']}" for d in found]
+            differences = [*frame["objects"], *frame["detections"]]
+            counts = Counter(d["change"] for d in differences)
+            change_counts = ", ".join(
+                f"{counts[change]} {change}" for change in WORST_FIRST if counts[change]
+            )
+            differences.sort(key=lambda d: WORST_FIRST.index(d["change"]))
+            examples = [f"{outcome} {text}" for outcome in ("broke", "fixed") for text in frame[outcome]]
+            examples = examples or [f"{d['text']} {d['place']}" for d in differences]
             more = "; ..." if examples[EXAMPLES:] else ""
-            yield f"  frame {frame['frame']}: {how} ({'; '.join(examples[:EXAMPLES])}{more})"
+            yield f"  frame {frame['frame']}: {change_counts} ({'; '.join(examples[:EXAMPLES])}{more})"
 
     def _truth_lines(self) -> Iterator[str]:
         truth = self.truth
@@ -263,8 +266,8 @@ def _rows(counts: Mapping[str, Counter[str]], which: Sequence[str] = COLUMNS) ->
     yield ("all", *(str(total[column]) for column in which))
 
 
-def _row(difference: Difference, found: FrameDifferences) -> dict[str, Any]:
-    side, row = (found.a, difference.row_a) if difference.row_b < 0 else (found.b, difference.row_b)
+def _row(difference: Difference, differences: FrameDifferences) -> dict[str, Any]:
+    side, row = differences.side_with(difference)
     x, y, z = (round(v, 3) for v in side.boxes.center[row].tolist())
     pair = difference.row_a >= 0 and difference.row_b >= 0
     return {
@@ -277,5 +280,5 @@ def _row(difference: Difference, found: FrameDifferences) -> dict[str, Any]:
         "distance": round(difference.distance, 3) if pair else None,
         "iou": round(difference.iou, 3) if pair else None,
         "text": difference.text,
-        "place": place(difference, found),
+        "place": place(difference, differences),
     }

@@ -44,13 +44,13 @@ class Judged:
 
 def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
     """Compare both sides of a frame with its ground truth."""
-    must = np.flatnonzero(truth.must)
+    to_find = np.flatnonzero(truth.must)
     (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
     return Judged(
-        labels=tuple(truth.labels[k] for k in must),
-        boxes=truth.boxes.chosen(must),
-        a=found_a[must],
-        b=found_b[must],
+        labels=tuple(truth.labels[k] for k in to_find),
+        boxes=truth.boxes.chosen(to_find),
+        a=found_a[to_find],
+        b=found_b[to_find],
         wrong_a=wrong_a,
         wrong_b=wrong_b,
         names=frozenset().union(*truth.accepted),

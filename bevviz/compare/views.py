@@ -14,21 +14,23 @@ _SIDES = {"": ("A", Change.ONLY_A), entities.B: ("B", Change.ONLY_B)}
 
 def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
     """Return the 3D view of one run: obstacles, clusters, objects and their differences."""
-    name, only = _SIDES[root]
-    beside = [entities.TRUTH, *changes(only, Change.MOVED, Change.CLASS)]
-    return space(scene, raw=False, names=False, name=f"3D {name}", root=root, beside=beside)
+    name, only_here = _SIDES[root]
+    contents = [entities.TRUTH, *changes(only_here, Change.MOVED, Change.CLASS)]
+    return space(scene, raw=False, names=False, name=f"3D {name}", root=root, beside=contents)
 
 
 def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
     """Return the image view with one run's detections and with those missing in the other run."""
-    name, only = _SIDES[root]
-    image, own = entities.image(camera_name), entities.detections(camera_name)
-    different = [entities.image_difference(camera_name, change) for change in (only, Change.CLASS)]
+    name, only_here = _SIDES[root]
+    image, detections = entities.image(camera_name), entities.detections(camera_name)
+    differences = [entities.image_difference(camera_name, change) for change in (only_here, Change.CLASS)]
     return rrb.Spatial2DView(
         name=f"{camera_name} {name}",
         origin=entities.sensor(camera_name),
-        contents=[image, f"{root}{image}/**", *different],
-        overrides=dict.fromkeys((root + entities.weak(camera_name), root + entities.names(own)), HIDDEN),
+        contents=[image, f"{root}{image}/**", *differences],
+        overrides=dict.fromkeys(
+            (root + entities.weak(camera_name), root + entities.names(detections)), HIDDEN
+        ),
     )
 
 

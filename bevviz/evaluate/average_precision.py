@@ -70,8 +70,8 @@ def found_objects(result: FrameResult, truth: Truth) -> Found:
     detections = {camera.camera.name: camera.detections for camera in result.cameras}
     height = np.full(len(objects), np.inf, np.float32)
     for j, (camera, row) in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
-        if row >= 0 and (found := detections.get(camera)) is not None:
-            height[j] = found.xyxy[row, 3] - found.xyxy[row, 1]
+        if row >= 0 and (camera_detections := detections.get(camera)) is not None:
+            height[j] = camera_detections.xyxy[row, 3] - camera_detections.xyxy[row, 1]
     names = tuple(name.lower() for name in objects.names)
     return Found(names, objects.score, height, {"bev": above, "3d": volume}, {})
 
@@ -86,22 +86,22 @@ class Curve:
     def __post_init__(self) -> None:
         self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
 
-    def add(self, found: Found, det: Roles, label: Roles) -> None:
+    def add(self, objects: Found, det: Roles, label: Roles) -> None:
         """Add a frame.
 
         Args:
-            found: its objects.
+            objects: objects of the frame.
             det: (D,) COUNTS, IGNORED or OTHER for each object.
             label: (K,) the same for each label.
         """
         rows, columns = np.flatnonzero(det != OTHER), np.flatnonzero(label != OTHER)
         if len(rows) == 0 and not (label == COUNTS).any():
             return
-        excused = found.excused.get(self.view, np.zeros(len(det), np.float32)) > self.min_overlap
+        excused = objects.excused.get(self.view, np.zeros(len(det), np.float32)) > self.min_overlap
         self._frames.append(
             (
-                np.ascontiguousarray(found.overlaps[self.view][np.ix_(rows, columns)]),
-                np.ascontiguousarray(found.score[rows]),
+                np.ascontiguousarray(objects.overlaps[self.view][np.ix_(rows, columns)]),
+                np.ascontiguousarray(objects.score[rows]),
                 det[rows],
                 label[columns],
                 excused[rows],
@@ -118,10 +118,10 @@ class Curve:
         total = self.labels
         if not total:
             return float("nan")
-        found = [_matched(*frame, self.min_overlap, -np.inf, False)[2] for frame in self._frames]
+        scores = [_match(*frame, self.min_overlap, -np.inf, False)[2] for frame in self._frames]
         precision = np.zeros(RECALL_POINTS + 1)
-        for i, threshold in enumerate(_thresholds(np.concatenate(found), total)):
-            counts = [_matched(*frame, self.min_overlap, threshold, True)[:2] for frame in self._frames]
+        for i, threshold in enumerate(_thresholds(np.concatenate(scores), total)):
+            counts = [_match(*frame, self.min_overlap, threshold, True)[:2] for frame in self._frames]
             right, wrong = np.sum(counts, axis=0)
             precision[i] = right / (right + wrong) if right + wrong else 0.0
         precision = np.maximum.accumulate(precision[::-1])[::-1]
@@ -145,7 +145,7 @@ def _thresholds(scores: F32, total: int) -> Iterable[float]:
 
 
 @kernel
-def _matched(
+def _match(
     overlap: F32,
     score: F32,
     det: Roles,
@@ -204,24 +204,24 @@ class AveragePrecision:
         self._frames: list[tuple[Found, Truth]] = []  # frames with labels other than KITTI's
         self._judged = Classes()  # classes of these frames
 
-    def add(self, found: Found, truth: Truth) -> None:
+    def add(self, objects: Found, truth: Truth) -> None:
         """Add a frame."""
         if truth.image is None:
             self._judged.add(truth)
-            self._frames.append((found, truth))
+            self._frames.append((objects, truth))
             return
         labels = np.array(truth.labels, object)
         size = truth.image.xyxy[:, 3] - truth.image.xyxy[:, 1]
         for kind, (neighbours, names) in KITTI_CLASSES.items():
-            own, near = labels == kind, np.isin(labels.astype(str), neighbours)
-            mine = np.isin(np.array(found.names, str), names)
+            is_class, is_neighbour = labels == kind, np.isin(labels.astype(str), neighbours)
+            has_name = np.isin(np.array(objects.names, str), names)
             for name, limit in DIFFICULTIES.items():
                 within = (truth.image.occluded <= limit.occluded) & (truth.image.truncated <= limit.truncated)
-                counts = own & within & (size > limit.height)
-                label = _roles(counts, own | near)
-                small = found.height < limit.height
-                det = _roles(mine & ~small, mine | small)
-                self._add(self._curves, (kind.lower(), name), found, det, label)
+                counts = is_class & within & (size > limit.height)
+                label = _roles(counts, is_class | is_neighbour)
+                small = objects.height < limit.height
+                det = _roles(has_name & ~small, has_name | small)
+                self._add(self._curves, (kind.lower(), name), objects, det, label)
 
     def _by_label(self) -> dict[Key, Curve]:
         """Return the curves of labels other than KITTI's.
@@ -230,28 +230,34 @@ class AveragePrecision:
         """
         curves: dict[Key, Curve] = {}
         names = {label.lower() for _, truth in self._frames for label in truth.labels}
-        for found, truth in self._frames:
+        for objects, truth in self._frames:
             labels = np.array([label.lower() for label in truth.labels], object)
-            classes = np.array(_classes(found, truth, self._judged), object)
+            classes = np.array(_object_classes(objects, truth, self._judged), object)
             for name in sorted(names):
-                own, mine = labels == name, classes == name
-                self._add(curves, (name, ""), found, _roles(mine, mine), _roles(own & truth.must, own))
+                has_label, has_class = labels == name, classes == name
+                self._add(
+                    curves,
+                    (name, ""),
+                    objects,
+                    _roles(has_class, has_class),
+                    _roles(has_label & truth.must, has_label),
+                )
         return curves
 
     def _add(
-        self, curves: dict[Key, Curve], of: tuple[str, str], found: Found, det: Roles, label: Roles
+        self, curves: dict[Key, Curve], group: tuple[str, str], objects: Found, det: Roles, label: Roles
     ) -> None:
         for view in self._views:
             for overlap in OVERLAPS:
-                curves.setdefault((view, overlap, *of), Curve(view, overlap)).add(found, det, label)
+                curves.setdefault((view, overlap, *group), Curve(view, overlap)).add(objects, det, label)
 
     @property
     def labels(self) -> dict[tuple[str, str], int]:
         """(class, difficulty) -> number of labels to be found."""
-        found = {key[2:]: curve.labels for key, curve in self._curves.items()}
-        must = ((k, truth) for _, truth in self._frames for k in np.flatnonzero(truth.must).tolist())
-        found |= Counter((truth.labels[k].lower(), "") for k, truth in must)
-        return {of: count for of, count in found.items() if count}
+        counts = {key[2:]: curve.labels for key, curve in self._curves.items()}
+        to_find = ((k, truth) for _, truth in self._frames for k in np.flatnonzero(truth.must).tolist())
+        counts |= Counter((truth.labels[k].lower(), "") for k, truth in to_find)
+        return {group: count for group, count in counts.items() if count}
 
     def results(self) -> dict[Key, float]:
         """Return (view, overlap, class, difficulty) -> average precision, for curves with labels to be found.
@@ -267,14 +273,14 @@ def _roles(counts: Bool, ignored: Bool) -> Roles:
     return np.where(counts, COUNTS, np.where(ignored, IGNORED, OTHER)).astype(np.int8)
 
 
-def _classes(found: Found, truth: Truth, judged: Classes) -> list[str | None]:
+def _object_classes(objects: Found, truth: Truth, judged: Classes) -> list[str | None]:
     """Return the class of each detection.
 
     It is the class of the label with the largest overlap, among the labels that accept the detection's name.
     Without overlap it is the class for which the name is judged.
     """
-    overlap = np.where(accepts(truth, list(found.names)), found.overlaps[VIEWS[0]], 0)
-    classes = [judged.of(name) for name in found.names]
+    overlap = np.where(accepts(truth, list(objects.names)), objects.overlaps[VIEWS[0]], 0)
+    classes = [judged.of(name) for name in objects.names]
     for d in np.flatnonzero((overlap > 0).any(axis=1)).tolist():
         classes[d] = truth.labels[int(overlap[d].argmax())].lower()
     return classes

@@ -28,24 +28,24 @@ class DetectionScore:
 
     def add(self, result: CameraResult, truth: Truth) -> None:
         """Match one camera's detections with the labelled image boxes, best score first, and count."""
-        found, camera = result.detections, result.camera
-        if found is None or camera.intrinsics is None or camera.camera_from_points is None:
+        detections, camera = result.detections, result.camera
+        if detections is None or camera.intrinsics is None or camera.camera_from_points is None:
             return
         boxes = _image_boxes(truth, result)
-        kept = np.flatnonzero(found.kept)
-        kept = kept[np.argsort(-found.score[kept], kind="stable")]
-        names = [found.names[d].lower() for d in kept]
-        overlap = geometry.iou(found.xyxy[kept], boxes)
+        kept = np.flatnonzero(detections.kept)
+        kept = kept[np.argsort(-detections.score[kept], kind="stable")]
+        names = [detections.names[d].lower() for d in kept]
+        overlap = geometry.iou(detections.xyxy[kept], boxes)
         cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
         partner, free = pair_in_order(cost, 1.0)
-        excused = _in_regions(found.xyxy[kept], truth)
-        here = truth.must & np.isfinite(boxes).all(axis=1)
-        for name, k, out in zip(names, partner.tolist(), excused.tolist(), strict=True):
-            if k >= 0 and here[k]:
+        excused = _in_regions(detections.xyxy[kept], truth)
+        to_find = truth.must & np.isfinite(boxes).all(axis=1)
+        for name, k, is_excused in zip(names, partner.tolist(), excused.tolist(), strict=True):
+            if k >= 0 and to_find[k]:
                 self._labels[truth.labels[k].lower()]["true"] += 1
-            elif k < 0 and not out:
+            elif k < 0 and not is_excused:
                 self._false[name] += 1
-        for row in np.flatnonzero(free & here).tolist():
+        for row in np.flatnonzero(free & to_find).tolist():
             self._labels[truth.labels[row].lower()]["missed"] += 1
 
 
@@ -59,8 +59,8 @@ def _image_boxes(truth: Truth, result: CameraResult) -> F32:
         return truth.image.xyxy
     assert camera.intrinsics is not None
     assert camera.camera_from_points is not None
-    seen = geometry.apply(camera.camera_from_points, geometry.corners(truth.boxes).reshape(-1, 3))
-    uv, depth = geometry.project(seen, camera.intrinsics)
+    corners = geometry.apply(camera.camera_from_points, geometry.corners(truth.boxes).reshape(-1, 3))
+    uv, depth = geometry.project(corners, camera.intrinsics)
     uv, ahead = uv.reshape(-1, 8, 2), depth.reshape(-1, 8).min(axis=1) > geometry.MIN_DEPTH
     boxes = np.full((len(ahead), 4), np.nan, np.float32)
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)

@@ -75,12 +75,12 @@ class Evaluation(Observer[FrameResult]):
         if truth is None:
             self.without += 1
             return
-        self.unusable += [f"frame {result.frame.index}: {why}" for why in truth.unusable]
-        objects = result.objects if result.objects is not None else _nothing()
+        self.unusable += [f"frame {result.frame.index}: {reason}" for reason in truth.unusable]
+        objects = result.objects if result.objects is not None else _no_objects()
         matches = self._score.add(objects, truth)
         self.last = result, truth, matches
-        self.judged.append(_words(result.frame, objects, truth, matches))
-        self._place(objects, truth, matches)
+        self.judged.append(_judged_frame(result.frame, objects, truth, matches))
+        self._store_positions(objects, truth, matches)
         if result.objects is not None:
             self._precision.add(found_objects(result, truth), truth)
         self._tracks.add(result, truth, self._score.judged)
@@ -88,17 +88,17 @@ class Evaluation(Observer[FrameResult]):
             self._detections.add(camera, truth)
         count_ground(self._ground, result)
 
-    def _place(self, objects: Objects, truth: Truth, matches: Matches) -> None:
+    def _store_positions(self, objects: Objects, truth: Truth, matches: Matches) -> None:
         """Store class and distance of the true, false and missed objects."""
         for j in np.flatnonzero(matches.true).tolist():
             k = int(matches.partner[j])
             label = truth.labels[k].lower()
-            self._rows.append(("true", label, _away(truth.boxes, k)))
+            self._rows.append(("true", label, _distance(truth.boxes, k)))
             self._errors[label].append(float(matches.distance[j]))
         for row in np.flatnonzero(matches.missed).tolist():
-            self._rows.append(("missed", truth.labels[row].lower(), _away(truth.boxes, row)))
+            self._rows.append(("missed", truth.labels[row].lower(), _distance(truth.boxes, row)))
         for j in np.flatnonzero(matches.false).tolist():
-            self._rows.append(("false", objects.names[j].lower(), _away(objects.boxes, j)))
+            self._rows.append(("false", objects.names[j].lower(), _distance(objects.boxes, j)))
 
     # --- numbers -------------------------------------------------------------------------------
 
@@ -126,16 +126,16 @@ class Evaluation(Observer[FrameResult]):
                 yield f"error_m{tail}", float(np.median(errors))
                 yield f"error_90_m{tail}", float(np.quantile(errors, 0.9))
             for low, high in ranges():
-                there = self.counts(cls, low, high)
-                if there.total():
-                    yield from _rates(there, (f".{cls}" if cls else "") + f"@{low}-{high}")
+                range_counts = self.counts(cls, low, high)
+                if range_counts.total():
+                    yield from _rates(range_counts, (f".{cls}" if cls else "") + f"@{low}-{high}")
         total = self.counts()
         yield "missed_per_frame", total["missed"] / frames
         yield "false_per_frame", total["false"] / frames
         for (view, overlap, cls, difficulty), value in self._precision.results().items():
             yield f"ap_{view}_{overlap}.{cls}" + (f".{difficulty}" if difficulty else ""), value
-        for cls, found in self._tracks.results().items():
-            for name, value in found.items():
+        for cls, values in self._tracks.results().items():
+            for name, value in values.items():
                 yield (f"{name}.{cls}" if cls else name), value
         detections = self._detections.classes(self._score.judged)
         for cls in ("", *sorted(detections)):
@@ -164,16 +164,18 @@ class Evaluation(Observer[FrameResult]):
             high: distances are below this one.
         """
         return Counter(
-            what for what, name, away in self._judged_rows() if name == (cls or name) and low <= away < high
+            outcome
+            for outcome, name, distance in self._judged_rows()
+            if name == (cls or name) and low <= distance < high
         )
 
     def _judged_rows(self) -> Iterator[tuple[str, str, float]]:
         """Yield outcome, class and distance of the true, false and missed objects."""
-        classes = {name: self._score.judged.of(name) for what, name, _ in self._rows if what == "false"}
-        for what, name, away in self._rows:
-            cls = classes[name] if what == "false" else name
+        classes = {name: self._score.judged.of(name) for outcome, name, _ in self._rows if outcome == "false"}
+        for outcome, name, distance in self._rows:
+            cls = classes[name] if outcome == "false" else name
             if cls is not None:
-                yield what, cls, away
+                yield outcome, cls, distance
 
     @property
     def labels(self) -> Mapping[str, int]:
@@ -199,7 +201,7 @@ class Evaluation(Observer[FrameResult]):
             "stamp": frame.stamp,
             "true": list(frame.true),
             "missed": list(frame.missed),
-            "false": [words for name, words in frame.false if self.judges(name)],
+            "false": [text for name, text in frame.false if self.judges(name)],
         }
 
     # --- how it is shown -----------------------------------------------------------------------
@@ -228,8 +230,8 @@ class Evaluation(Observer[FrameResult]):
         rows = []
         for name, value in self.metrics.items():
             base = base_of(name) or name
-            cls, _, where = name.removeprefix(base).removeprefix(".").partition("@")
-            rows.append({"metric": base, "class": cls, "range": where, "value": value})
+            cls, _, range_name = name.removeprefix(base).removeprefix(".").partition("@")
+            rows.append({"metric": base, "class": cls, "range": range_name, "value": value})
         return data_frame(rows)
 
 
@@ -249,15 +251,15 @@ def _plain(value: float) -> float | None:
 # --- words -------------------------------------------------------------------------------------
 
 
-def _words(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> JudgedFrame:
-    def labelled(k: int) -> str:
+def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> JudgedFrame:
+    def label_text(k: int) -> str:
         return f"{truth.labels[k].lower()} {place(truth.boxes, k)}"
 
     return JudgedFrame(
         frame.index,
         frame.stamp,
-        tuple(labelled(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
-        tuple(labelled(k) for k in np.flatnonzero(matches.missed).tolist()),
+        tuple(label_text(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
+        tuple(label_text(k) for k in np.flatnonzero(matches.missed).tolist()),
         tuple(
             (objects.names[j].lower(), f"{objects.names[j].lower()} {place(objects.boxes, j)}")
             for j in np.flatnonzero(matches.false).tolist()
@@ -272,10 +274,10 @@ def place(boxes: Boxes3D, row: int) -> str:
     return f"at {math.hypot(x, y):.1f} m, {abs(angle):.0f}° {'left' if angle >= 0 else 'right'}"
 
 
-def _away(boxes: Boxes3D, row: int) -> float:
+def _distance(boxes: Boxes3D, row: int) -> float:
     return float(np.hypot(*boxes.center[row, :2]))
 
 
-def _nothing() -> Objects:
+def _no_objects() -> Objects:
     none = np.zeros(0, np.int32)
     return Objects(Boxes3D.empty(), (), np.zeros(0, np.float32), none, (), none)

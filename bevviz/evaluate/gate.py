@@ -41,9 +41,9 @@ def parse_limits(least: Sequence[str], most: Sequence[str]) -> list[Limit]:
     Raises:
         UserError: a value is not NAME=NUMBER, or there is no metric of that name.
     """
-    asked: list[tuple[Literal["min", "max"], str]] = [("min", text) for text in least]
-    asked += [("max", text) for text in most]
-    return [_limit(side, text) for side, text in asked]
+    values: list[tuple[Literal["min", "max"], str]] = [("min", text) for text in least]
+    values += [("max", text) for text in most]
+    return [_limit(side, text) for side, text in values]
 
 
 def _limit(side: Literal["min", "max"], text: str) -> Limit:
@@ -67,16 +67,16 @@ def _limit(side: Literal["min", "max"], text: str) -> Limit:
 
 def check(limits: Sequence[Limit], metrics: Mapping[str, float]) -> list[Kept]:
     """Compare the metrics with the limits. A limit whose metric could not be measured is not kept."""
-    return [_kept(limit, metrics) for limit in limits]
+    return [_check_limit(limit, metrics) for limit in limits]
 
 
-def _kept(limit: Limit, metrics: Mapping[str, float]) -> Kept:
+def _check_limit(limit: Limit, metrics: Mapping[str, float]) -> Kept:
     value = metrics.get(limit.metric, math.nan)
     if math.isnan(value):
         base, ranged = base_of(limit.metric), "@" in limit.metric
-        there = [name for name in metrics if base_of(name) == base and (ranged or "@" not in name)]
-        why = f"measured were {', '.join(there)}" if there else f"nothing there has a {base}"
-        return Kept(limit, value, f"{limit.metric} could not be measured: {why}")
+        measured = [name for name in metrics if base_of(name) == base and (ranged or "@" not in name)]
+        reason = f"measured were {', '.join(measured)}" if measured else f"nothing there has a {base}"
+        return Kept(limit, value, f"{limit.metric} could not be measured: {reason}")
     kept = value >= limit.value if limit.side == "min" else value <= limit.value
     return Kept(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
 
@@ -92,19 +92,19 @@ def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
         UserError: the file cannot be written.
     """
     root = ElementTree.Element("testsuites", name="bevviz evaluate")
-    for drive, found in suites.items():
+    for drive, results in suites.items():
         suite = ElementTree.SubElement(root, "testsuite", name=_plain(drive))
-        if isinstance(found, str):
+        if isinstance(results, str):
             case = ElementTree.SubElement(suite, "testcase", classname=_plain(drive), name="run")
-            ElementTree.SubElement(case, "error", message=_plain(found))
+            ElementTree.SubElement(case, "error", message=_plain(results))
             suite.attrib |= {"tests": "1", "failures": "0", "errors": "1"}
             continue
-        broken = sum(bool(kept.reason) for kept in found)
-        suite.attrib |= {"tests": str(len(found)), "failures": str(broken), "errors": "0"}
-        for kept in found:
-            case = ElementTree.SubElement(suite, "testcase", classname=_plain(drive), name=str(kept.limit))
-            if kept.reason:
-                ElementTree.SubElement(case, "failure", message=_plain(kept.reason))
+        failures = sum(bool(result.reason) for result in results)
+        suite.attrib |= {"tests": str(len(results)), "failures": str(failures), "errors": "0"}
+        for result in results:
+            case = ElementTree.SubElement(suite, "testcase", classname=_plain(drive), name=str(result.limit))
+            if result.reason:
+                ElementTree.SubElement(case, "failure", message=_plain(result.reason))
     ElementTree.indent(root)
     try:
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

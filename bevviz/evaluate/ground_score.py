@@ -22,10 +22,10 @@ def count_ground(counts: Counter[str], result: FrameResult) -> None:
         return
     kind = labels.astype(np.int64) & 0xFFFF
     known = ~np.isin(kind, UNLABELLED)
-    called = of_points(result.ground.mask, result.voxels.inverse)
-    ground, thing = np.isin(kind, GROUND_LABELS), np.isin(kind, OBJECT_LABELS)
-    counts["true"] += int((called & ground).sum())
-    counts["false"] += int((called & ~ground & known).sum())
-    counts["missed"] += int((~called & ground).sum())
-    counts["kept"] += int((~called & thing).sum())
-    counts["lost"] += int((called & thing).sum())
+    is_ground = of_points(result.ground.mask, result.voxels.inverse)
+    ground_points, object_points = np.isin(kind, GROUND_LABELS), np.isin(kind, OBJECT_LABELS)
+    counts["true"] += int((is_ground & ground_points).sum())
+    counts["false"] += int((is_ground & ~ground_points & known).sum())
+    counts["missed"] += int((~is_ground & ground_points).sum())
+    counts["kept"] += int((~is_ground & object_points).sum())
+    counts["lost"] += int((is_ground & object_points).sum())

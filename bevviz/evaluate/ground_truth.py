@@ -49,8 +49,8 @@ class Truth:
             return none
         assert self.camera.camera_from_points is not None
         assert self.camera.intrinsics is not None
-        seen = geometry.apply(self.camera.camera_from_points, boxes.center)
-        uv, _ = geometry.project(seen, self.camera.intrinsics)
+        centers = geometry.apply(self.camera.camera_from_points, boxes.center)
+        uv, _ = geometry.project(centers, self.camera.intrinsics)
         low, high = self.image.dont_care[:, :2], self.image.dont_care[:, 2:]
         with np.errstate(invalid="ignore"):
             inside = ((uv[:, None] >= low) & (uv[:, None] <= high)).all(axis=2)
@@ -81,20 +81,20 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
             return truth_of(frame, read_labels(files[frame.index]))
 
         return of_kitti
-    there = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
-    if topic is not None and topic not in there:
+    topics = (*roles.robot_detections_3d, *([roles.truth] if roles.truth else []))
+    if topic is not None and topic not in topics:
         raise UserError(
-            f"--truth {topic}: no such Detection3DArray topic; there are: {', '.join(there) or 'none'}"
+            f"--truth {topic}: no such Detection3DArray topic; there are: {', '.join(topics) or 'none'}"
         )
     if topic is None and not roles.truth:
         return None
 
-    def published(frame: Frame) -> Truth | None:
+    def of_topic(frame: Frame) -> Truth | None:
         labelled = frame.truth if topic in (None, roles.truth) else None
         labelled = labelled or next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
         return None if labelled is None else truth_of(frame, labelled)
 
-    return published
+    return of_topic
 
 
 def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None) -> Truths:
@@ -116,14 +116,14 @@ def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None
         if not frames.scene.truth:
             raise UserError(f"{frames.scene.name}: there is no ground truth")
         return lambda frame: None if frame.truth is None else truth_of(frame, frame.truth)
-    found = truth_source(roles, topic, kitti, len(frames.scans))
-    if found is None:
-        there = ", ".join(roles.robot_detections_3d) or "none"
+    truths = truth_source(roles, topic, kitti, len(frames.scans))
+    if truths is None:
+        topics = ", ".join(roles.robot_detections_3d) or "none"
         raise UserError(
             f"{frames.scene.name}: no .../ground_truth in it; give --truth TOPIC (Detection3DArray there: "
-            f"{there}) or --kitti-labels"
+            f"{topics}) or --kitti-labels"
         )
-    return found
+    return truths
 
 
 def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
@@ -162,18 +162,18 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
 
 def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
     """Return (K,) whether the centre lies in the image of some camera. Without a located camera, all do."""
-    seen, asked = np.zeros(len(boxes), bool), False
+    visible, has_camera = np.zeros(len(boxes), bool), False
     for camera in frame.cameras:
         if not _can_see(camera):
             continue
         assert camera.intrinsics is not None
         assert camera.camera_from_points is not None
-        asked = True
+        has_camera = True
         uv, _ = geometry.project(geometry.apply(camera.camera_from_points, boxes.center), camera.intrinsics)
         size = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
         with np.errstate(invalid="ignore"):
-            seen |= ((uv >= -0.5) & (uv < size - 0.5)).all(axis=1)
-    return seen if asked else ~seen
+            visible |= ((uv >= -0.5) & (uv < size - 0.5)).all(axis=1)
+    return visible if has_camera else ~visible
 
 
 def _can_see(camera: Camera) -> bool:

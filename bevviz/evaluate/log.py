@@ -22,7 +22,7 @@ from bevviz.recording.writer import WAIT, Writer
 from bevviz.support.text import markdown
 
 # Outcome, boxes, rows with this outcome, names of all boxes.
-Judged: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]
+BoxGroup: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]
 
 
 class EvaluationRecorder(Observer[FrameResult]):
@@ -39,12 +39,12 @@ class EvaluationRecorder(Observer[FrameResult]):
 
     def begin(self, items: Items[object]) -> None:
         """Log the colours and the names of the plots."""
-        for what, color in TRUTH.items():
+        for outcome, color in TRUTH.items():
             looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
-            self._writer.static(entities.judged(what), looks)
-            log_spoken_looks(self._writer, entities.judged(what))
-            series = rr.SeriesLines(colors=[color], names=[what], widths=[2])
-            self._writer.static(entities.judged_count(what), series)
+            self._writer.static(entities.judged(outcome), looks)
+            log_spoken_looks(self._writer, entities.judged(outcome))
+            series = rr.SeriesLines(colors=[color], names=[outcome], widths=[2])
+            self._writer.static(entities.judged_count(outcome), series)
 
     def see(self, result: FrameResult) -> None:
         """Log the evaluation of a frame."""
@@ -54,38 +54,50 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.begin(frame.index, frame.stamp, frame.received)
         _, truth, matches = self._evaluation.last
         judges = self._evaluation.judges
-        parts: list[Judged] = [("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)]
+        groups: list[BoxGroup] = [
+            ("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)
+        ]
         if (objects := result.objects) is not None:
             false = [j for j in np.flatnonzero(matches.false).tolist() if judges(objects.names[j].lower())]
-            parts.append(("false", objects.boxes, false, objects.names))
-            parts.append(("true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names))
-        self._boxes(result, [part for part in parts if part[2]])
-        said = self._evaluation.now
-        words = {what: said[what] for what in ("missed", "false", "true")}
-        for what, texts in words.items():
-            writer.scalar(entities.judged_count(what), float(len(texts)))
-        writer.put(entities.EVALUATE, document(_page(frame.index, truth, words)))
-        wrong = [("ERROR", f"{what} {text}") for what in ("missed", "false") for text in words[what]]
+            groups.append(("false", objects.boxes, false, objects.names))
+            groups.append(("true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names))
+        self._boxes(result, [group for group in groups if group[2]])
+        judged = self._evaluation.now
+        texts_by_outcome = {outcome: judged[outcome] for outcome in ("missed", "false", "true")}
+        for outcome, texts in texts_by_outcome.items():
+            writer.scalar(entities.judged_count(outcome), float(len(texts)))
+        writer.put(entities.EVALUATE, document(_page(frame.index, truth, texts_by_outcome)))
+        wrong = [
+            ("ERROR", f"{outcome} {text}")
+            for outcome in ("missed", "false")
+            for text in texts_by_outcome[outcome]
+        ]
         writer.lines(entities.EVALUATE_LOG, wrong)
         writer.end()
 
-    def _boxes(self, result: FrameResult, parts: Sequence[Judged]) -> None:
+    def _boxes(self, result: FrameResult, groups: Sequence[BoxGroup]) -> None:
         """Log the boxes. A right object shows its name only under the pointer.
 
         So does a wrong one without enough room for a label.
         """
-        centers = np.concatenate([np.zeros((0, 3), np.float32), *(b.center[rows] for _, b, rows, _ in parts)])
-        wrong = np.repeat([what != "true" for what, *_ in parts], [len(rows) for *_, rows, _ in parts])
+        centers = np.concatenate(
+            [np.zeros((0, 3), np.float32), *(b.center[rows] for _, b, rows, _ in groups)]
+        )
+        wrong = np.repeat(
+            [outcome != "true" for outcome, *_ in groups], [len(rows) for *_, rows, _ in groups]
+        )
         named = iter((named_in_space(centers, wrong) & wrong).tolist() if len(wrong) else [])
-        for what, boxes, rows, names in parts:
-            chosen, path = boxes.chosen(rows), entities.judged(what)
-            labels = [f"{what}: {names[row]}" for row in rows]
+        for outcome, boxes, rows, names in groups:
+            chosen, path = boxes.chosen(rows), entities.judged(outcome)
+            labels = [f"{outcome}: {names[row]}" for row in rows]
             logged = boxes3d(boxes, np.asarray(rows), labels)
             self._writer.put(path, transform(result.frame.pose), logged)
-            shown = [label if next(named) else "" for label in labels]
-            away = np.hypot(*chosen.center[:, :2].T).tolist()
-            said = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, away, strict=True)]
-            log_spoken(self._writer, path, chosen, shown, said, [TRUTH[what]] * len(rows))
+            visible_labels = [label if next(named) else "" for label in labels]
+            distances = np.hypot(*chosen.center[:, :2].T).tolist()
+            descriptions = [
+                f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)
+            ]
+            log_spoken(self._writer, path, chosen, visible_labels, descriptions, [TRUTH[outcome]] * len(rows))
 
     def end(self) -> None:
         """Log the tables of the whole run."""
@@ -93,10 +105,10 @@ class EvaluationRecorder(Observer[FrameResult]):
         self._writer.close()
 
 
-def _page(index: int, truth: Truth, words: dict[str, Sequence[str]]) -> str:
+def _page(index: int, truth: Truth, texts_by_outcome: dict[str, Sequence[str]]) -> str:
     lines = [f"### Frame {index}", "", f"{int(truth.must.sum())} objects had to be found"]
-    for what, texts in words.items():
+    for outcome, texts in texts_by_outcome.items():
         if texts:
-            lines += ["", f"#### {what[0].upper()}{what[1:]}: {len(texts)}", ""]
+            lines += ["", f"#### {outcome[0].upper()}{outcome[1:]}: {len(texts)}", ""]
             lines += [f"- {markdown(text)}" for text in texts]
     return "\n".join(lines)

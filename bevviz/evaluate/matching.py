@@ -45,23 +45,25 @@ class Classes:
         It is the class of the same name. If there is none, it is the accepting label with the fewest names: a
         "person" counts as a pedestrian rather than as a cyclist.
         """
-        fits = [label for label, names in self._accepted.items() if name in names]
-        return name if name in fits else min(fits, key=lambda f: (len(self._accepted[f]), f), default=None)
+        labels = [label for label, names in self._accepted.items() if name in names]
+        if name in labels:
+            return name
+        return min(labels, key=lambda label: (len(self._accepted[label]), label), default=None)
 
     def with_false(
-        self, labels: Mapping[str, Counter[str]], false: Mapping[str, int], what: str
+        self, labels: Mapping[str, Counter[str]], false: Mapping[str, int], key: str
     ) -> dict[str, Counter[str]]:
         """Return the counts by label, with the false ones added.
 
         Args:
             labels: counts by label.
             false: number of false objects by name.
-            what: key of the false ones in the counts.
+            key: key of the false ones in the counts.
         """
-        counts = {label: Counter(found) for label, found in labels.items()}
+        counts = {label: Counter(label_counts) for label, label_counts in labels.items()}
         for name, number in false.items():
             if (cls := self.of(name)) is not None:
-                counts.setdefault(cls, Counter())[what] += number
+                counts.setdefault(cls, Counter())[key] += number
         return counts
 
 
@@ -74,12 +76,12 @@ class Score:
     _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     _false: Counter[str] = field(default_factory=Counter)  # by name
 
-    def add(self, found: Objects, truth: Truth) -> Matches:
+    def add(self, objects: Objects, truth: Truth) -> Matches:
         """Match one frame's objects with the ground truth, best score first, and count."""
         self.judged.add(truth)
-        matches = judge(found, truth)
-        self._false.update(found.names[j].lower() for j in np.flatnonzero(matches.false))
-        best_first = np.argsort(-found.score, kind="stable")
+        matches = judge(objects, truth)
+        self._false.update(objects.names[j].lower() for j in np.flatnonzero(matches.false))
+        best_first = np.argsort(-objects.score, kind="stable")
         for j in best_first[matches.true[best_first]]:
             self._labels[truth.labels[matches.partner[j]].lower()]["tp"] += 1
             self.errors.append(float(matches.distance[j]))
@@ -121,28 +123,28 @@ def share(right: int, wrong: int) -> float:
     return right / (right + wrong) if right + wrong else float("nan")
 
 
-def judge(found: Objects, truth: Truth) -> Matches:
+def judge(objects: Objects, truth: Truth) -> Matches:
     """Match the objects of a frame with its ground truth and judge them."""
-    partner, distance = match(found, truth)
+    partner, distance = match(objects, truth)
     paired = partner >= 0
     missed = truth.must.copy()
     missed[partner[paired]] = False
     true = paired.copy()
     true[paired] = truth.must[partner[paired]]
-    return Matches(partner, distance, true, ~paired & ~truth.unlabelled(found.boxes), missed)
+    return Matches(partner, distance, true, ~paired & ~truth.unlabelled(objects.boxes), missed)
 
 
-def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
+def match(objects: Objects, truth: Truth) -> tuple[I32, F64]:
     """Match objects with labels of the same class: the nearest within 2 m, best score first.
 
     Returns:
         partner: (J,) row of the label, else -1.
         distance: (J,) metres on the ground plane to that label, else NaN.
     """
-    best_first = np.argsort(-found.score, kind="stable")
-    right = accepts(truth, [found.names[j] for j in best_first])
-    away = found.boxes.center[best_first][:, None, :2] - truth.boxes.center[None, :, :2]
-    distance = np.where(right, np.linalg.norm(away, axis=2), np.inf)
+    best_first = np.argsort(-objects.score, kind="stable")
+    accepted = accepts(truth, [objects.names[j] for j in best_first])
+    offsets = objects.boxes.center[best_first][:, None, :2] - truth.boxes.center[None, :, :2]
+    distance = np.where(accepted, np.linalg.norm(offsets, axis=2), np.inf)
     partners, _ = pair_in_order(distance, MAX_DISTANCE)
     partner, error = np.full(len(distance), -1, np.int32), np.full(len(distance), np.nan)
     partner[best_first] = partners
@@ -153,8 +155,10 @@ def match(found: Objects, truth: Truth) -> tuple[I32, F64]:
 
 def accepts(truth: Truth, names: list[str]) -> Bool:
     """Return (J, K) whether a name is accepted for a labelled box."""
-    right = np.array([[name.lower() in accepted for accepted in truth.accepted] for name in names], bool)
-    return right.reshape(len(names), len(truth.accepted))
+    accepted = np.array(
+        [[name.lower() in names_of_label for names_of_label in truth.accepted] for name in names], bool
+    )
+    return accepted.reshape(len(names), len(truth.accepted))
 
 
 def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int32]], Bool]:

@@ -21,39 +21,40 @@ EXAMPLES = 3  # number of objects shown for each frame
 Row = tuple[str, ...]
 
 
-def text(found: Evaluation) -> str:
+def text(evaluation: Evaluation) -> str:
     """Return the tables for the terminal."""
-    return "\n".join(map(printable, _lines(found, table.lines)))
+    return "\n".join(map(printable, _lines(evaluation, table.lines)))
 
 
-def page(found: Evaluation) -> str:
+def page(evaluation: Evaluation) -> str:
     """Return the tables in Markdown."""
-    return "\n".join(_lines(found, lambda rows: [table.markdown(rows)], "- "))
+    return "\n".join(_lines(evaluation, lambda rows: [table.markdown(rows)], "- "))
 
 
 def _lines(
-    found: Evaluation, laid_out: Callable[[list[Row]], Iterable[str]], bullet: str = "  "
+    evaluation: Evaluation, laid_out: Callable[[list[Row]], Iterable[str]], bullet: str = "  "
 ) -> Iterator[str]:
-    there = found.counts()
-    without = f", {found.without} without truth left out" if found.without else ""
-    yield f"{len(found.judged)} frames{without}; {there['true'] + there['missed']} objects had to be found"
-    if found.unusable:
-        count = "1 label is" if len(found.unusable) == 1 else f"{len(found.unusable)} labels are"
-        yield f"{count} left out, the first: {found.unusable[0]}"
-    for rows in tables(found):
+    totals = evaluation.counts()
+    without = f", {evaluation.without} without truth left out" if evaluation.without else ""
+    labels = totals["true"] + totals["missed"]
+    yield f"{len(evaluation.judged)} frames{without}; {labels} objects had to be found"
+    if evaluation.unusable:
+        count = "1 label is" if len(evaluation.unusable) == 1 else f"{len(evaluation.unusable)} labels are"
+        yield f"{count} left out, the first: {evaluation.unusable[0]}"
+    for rows in tables(evaluation):
         yield ""
         yield from laid_out(rows)
-    if any(labels <= RECALL_POINTS for labels in found.labels.values()):
+    if any(labels <= RECALL_POINTS for labels in evaluation.labels.values()):
         few = f"of {RECALL_POINTS} labels or fewer"
         yield f"({few} an average precision is (labels - 1) / {RECALL_POINTS} at best, by KITTI's rule)"
-    if "hota" in found.metrics and "mota" not in found.metrics:
+    if "hota" in evaluation.metrics and "mota" not in evaluation.metrics:
         yield f"({HINT})"
-    worst = found.worst
+    worst = evaluation.worst
     yield ""
     if not worst:
         yield "nothing missed, nothing false"
         return
-    yield f"{len(worst)} of {len(found.judged)} frames have something missed or false; the worst:"
+    yield f"{len(worst)} of {len(evaluation.judged)} frames have something missed or false; the worst:"
     for frame in worst[:WORST]:
         wrong = [f"{kind} {what}" for kind in ("missed", "false") for what in frame[kind]]
         more = "; ..." if wrong[EXAMPLES:] else ""
@@ -61,39 +62,44 @@ def _lines(
         yield f"{bullet}frame {frame['frame']}: {counts} ({'; '.join(wrong[:EXAMPLES])}{more})"
 
 
-def tables(found: Evaluation) -> Iterator[list[Row]]:
+def tables(evaluation: Evaluation) -> Iterator[list[Row]]:
     """Yield the rows of each table, headings first. Tables without metrics are left out."""
     heads: Row = ("objects", "there", "found", "missed", "false", "precision", "recall", "error m", "90 % m")
-    yield [heads, *(_row(found, name or "all", f".{name}" if name else "") for name in (*found.classes, ""))]
-    by_range = (_row(found, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
+    yield [
+        heads,
+        *(_row(evaluation, name or "all", f".{name}" if name else "") for name in (*evaluation.classes, "")),
+    ]
+    by_range = (_row(evaluation, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
     yield [("range", *heads[1:7]), *by_range]
-    m = found.metrics
-    if labels := found.labels:
+    metrics = evaluation.metrics
+    if labels := evaluation.labels:
         columns = [f"ap_{view}_{overlap}" for view in VIEWS for overlap in OVERLAPS]
         rows = [
-            (n.replace(".", ", "), str(labels[n]), *(_number(m, f"{c}.{n}") for c in columns))
+            (n.replace(".", ", "), str(labels[n]), *(_number(metrics, f"{c}.{n}") for c in columns))
             for n in sorted(labels, key=_by_difficulty)
         ]
         yield [("average precision", "labels", *(f"{v.upper()} {o}" for v in VIEWS for o in OVERLAPS)), *rows]
     tracked = ("hota", "deta", "assa", "mota", "motp_m", "idf1", "id_switches")
-    if "hota" in m:
+    if "hota" in metrics:
         heads = ("tracks", "HOTA", "DetA", "AssA", "MOTA", "MOTP m", "IDF1", "id switches")
-        yield [heads, *_by_class(m, tracked)]
+        yield [heads, *_by_class(metrics, tracked)]
     detected = ("detection_precision", "detection_recall")
-    if "detection_recall" in m:
-        yield [("image boxes, IoU 0.5", "precision", "recall"), *_by_class(m, detected)]
-    if "ground_iou" in m:
+    if "detection_recall" in metrics:
+        yield [("image boxes, IoU 0.5", "precision", "recall"), *_by_class(metrics, detected)]
+    if "ground_iou" in metrics:
         ground = ("ground_precision", "ground_recall", "ground_iou", "object_points_kept")
         heads = ("points", "precision", "recall", "IoU", "object points kept")
-        yield [heads, ("ground", *(_number(m, name) for name in ground))]
+        yield [heads, ("ground", *(_number(metrics, name) for name in ground))]
 
 
-def _row(found: Evaluation, title: str, tail: str) -> Row:
-    cls, _, where = tail.removeprefix(".").partition("@")
-    low, _, high = where.partition("-")
-    counts = found.counts(cls, float(low or 0), float(high or "inf"))
+def _row(evaluation: Evaluation, title: str, tail: str) -> Row:
+    cls, _, range_name = tail.removeprefix(".").partition("@")
+    low, _, high = range_name.partition("-")
+    counts = evaluation.counts(cls, float(low or 0), float(high or "inf"))
     numbers = (counts["true"] + counts["missed"], counts["true"], counts["missed"], counts["false"])
-    rates = (_number(found.metrics, f"{n}{tail}") for n in ("precision", "recall", "error_m", "error_90_m"))
+    rates = (
+        _number(evaluation.metrics, f"{n}{tail}") for n in ("precision", "recall", "error_m", "error_90_m")
+    )
     return (title, *map(str, numbers), *rates)
 
 

@@ -88,9 +88,9 @@ class Identities:
             worth = aligned[np.ix_(step.objects, step.tracks)] * similarity
             column = assign(np.where(worth > 0, -worth, np.inf), unmatched=0.0)
             row = np.flatnonzero(column >= 0)
-            own, other = step.objects[row], step.tracks[column[row]]
+            object_rows, track_rows = step.objects[row], step.tracks[column[row]]
             good = similarity[row, column[row]] >= ALPHAS[:, None] - 1e-9
-            matches[:, own, other] += good
+            matches[:, object_rows, track_rows] += good
         right = matches.sum(axis=(1, 2))
         deta = right / (of_object.sum() + of_track.sum() - right)
         kept = matches / np.maximum(of_object[:, None] + of_track[None] - matches, 1)
@@ -136,9 +136,9 @@ class TrackScore:
             boxes = geometry.apply(result.frame.pose, boxes)
         shown = np.flatnonzero(tracks.confirmed & (tracks.cluster >= 0))
         names = [tracks.names[t].lower() for t in shown]
-        away = boxes[:, None, :2] - tracks.boxes.center[shown][None, :, :2]
-        right = accepts(truth, names).T
-        distance = np.where(right, np.linalg.norm(away, axis=2), np.inf)
+        offsets = boxes[:, None, :2] - tracks.boxes.center[shown][None, :, :2]
+        accepted = accepts(truth, names).T
+        distance = np.where(accepted, np.linalg.norm(offsets, axis=2), np.inf)
         distance[distance > MAX_DISTANCE] = np.inf
         column = assign(distance, unmatched=MAX_DISTANCE + 1)
         free = np.setdiff1d(np.arange(len(shown)), column[~truth.must & (column >= 0)])
@@ -148,15 +148,17 @@ class TrackScore:
             classes[column[k]] = labels[k]
         for name in {"", *labels, *(cls for cls in classes if cls)}:
             rows = [k for k in np.flatnonzero(truth.must) if name in ("", labels[k])]
-            mine = [t for t in free if name in ("", classes[t])]
+            track_rows = [t for t in free if name in ("", classes[t])]
             self.classes[name].add(
-                [truth.ids[k] for k in rows], tracks.id[shown[mine]].tolist(), distance[np.ix_(rows, mine)]
+                [truth.ids[k] for k in rows],
+                tracks.id[shown[track_rows]].tolist(),
+                distance[np.ix_(rows, track_rows)],
             )
 
     def results(self) -> dict[str, dict[str, float]]:
         """Return class -> metric -> value for classes with objects to be found. "" means all classes."""
-        found = {}
+        results = {}
         for name, identities in sorted(self.classes.items()):
             if any(len(step.objects) for step in identities.steps):
-                found[name] = {**identities.hota(), **(identities.clear() or {})}
-        return found
+                results[name] = {**identities.hota(), **(identities.clear() or {})}
+        return results

@@ -71,18 +71,18 @@ def left_to_do(jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = l
 
 def whole_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
     """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
-    found: list[tuple[Path, RunInfo]] = []
+    results: list[tuple[Path, RunInfo]] = []
     unchecked = 0
-    for table in _checking([path for path in sorted(folder.glob("*.parquet")) if path.stem != NAME]):
+    for table in _with_bar([path for path in sorted(folder.glob("*.parquet")) if path.stem != NAME]):
         info = read_info(table)
         if damage := find_damage(table, table.with_suffix(".rrd")):
             warn(f"{table.stem}: {damage}; it is left out until its bag is run again")
         elif info is not None:
-            found.append((table, info))
+            results.append((table, info))
             unchecked += not info.recording_sha256
     if unchecked:
         warn(f"{unchecked} tables of an older version hold no checksum: their recordings are not checked")
-    return found
+    return results
 
 
 def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
@@ -93,7 +93,7 @@ def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
         warn: gets a line for each damaged result, and one for all tables of an older version.
     """
     older = 0
-    for job in _checking(jobs):
+    for job in _with_bar(jobs):
         info = read_info(job.table)
         if info is not None and info.key != job.key:
             continue  # It is out of date anyway.
@@ -108,6 +108,6 @@ def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
         warn(f"{older} tables of an older version hold no checksum of a recording; their bags are run again")
 
 
-def _checking(results: Iterable[T]) -> Iterable[T]:
+def _with_bar(results: Iterable[T]) -> Iterable[T]:
     """Show a bar, as recordings are read from end to end."""
     return cast(Iterable[T], progress.bar(results, desc="check", unit="bag", delay=1, leave=False))

@@ -45,10 +45,10 @@ def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], bluep
     try:
         dataset = CatalogClient(url).create_dataset(name, exist_ok=True)
         wanted = {info.recording_id: path for path, info in results}
-        there = set(dataset.segment_ids())
+        registered = set(dataset.segment_ids())
         stems = {path.stem for path in wanted.values()}
-        if old := [s for s in there - set(wanted) if s.rpartition("-")[0] in stems]:
-            dataset.unregister(segments_to_drop=old, layers_to_drop=[]).wait()
+        if outdated := [s for s in registered - set(wanted) if s.rpartition("-")[0] in stems]:
+            dataset.unregister(segments_to_drop=outdated, layers_to_drop=[]).wait()
         if wanted:
             uris = [path.resolve().as_uri() for path in wanted.values()]
             replace = OnDuplicateSegmentLayer.REPLACE

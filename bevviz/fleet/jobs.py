@@ -130,7 +130,7 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
     Raises:
         UserError: a path does not exist, or a folder has no bags.
     """
-    found: dict[Path, None] = {}
+    unique_bags: dict[Path, None] = {}
     for path in paths:
         matches = (
             [path] if path.exists() else sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
@@ -141,10 +141,10 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
             bags = [bag.resolve() for bag in _bags(match)]
             if not bags and match == path:
                 raise UserError(f"{path}: no bag in this folder (no .mcap, .db3 or .bag file)")
-            found.update(dict.fromkeys(bags))
-    if not found:
+            unique_bags.update(dict.fromkeys(bags))
+    if not unique_bags:
         raise UserError("no bag among " + ", ".join(map(str, paths)))
-    return list(found)
+    return list(unique_bags)
 
 
 def _bags(path: Path) -> Iterator[Path]:
@@ -175,15 +175,15 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
     """
     names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
     taken = {"summary", *owners.values()}
-    new = [bag for bag in bags if bag not in names]
-    deepest = max((len(bag.parts) for bag in new), default=0)
+    unnamed = [bag for bag in bags if bag not in names]
+    deepest = max((len(bag.parts) for bag in unnamed), default=0)
     for depth in range(1, deepest + 1):
-        candidates = {bag: _name(bag, depth) for bag in new}
-        often = Counter(candidates.values())
-        names |= {bag: n for bag, n in candidates.items() if often[n] == 1 and n not in taken}
-        new = [bag for bag in new if bag not in names]
+        candidates = {bag: _name(bag, depth) for bag in unnamed}
+        counts = Counter(candidates.values())
+        names |= {bag: n for bag, n in candidates.items() if counts[n] == 1 and n not in taken}
+        unnamed = [bag for bag in unnamed if bag not in names]
         taken |= set(names.values())
-    for bag in new:  # They differ only in characters that a file name should not have.
+    for bag in unnamed:  # They differ only in characters that a file name should not have.
         names[bag] = f"{_name(bag, 1)}-{hashlib.sha256(os.fsencode(bag)).hexdigest()[:8]}"
     return names
 

@@ -27,14 +27,14 @@ def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple
         results: table and description of each bag.
         link: fills the column ``link``; None: the column stays empty.
     """
-    parts, bags = [], []
+    tables, bags = [], []
     for path, info in results:
-        part = pq.read_table(path, schema=SCHEMA)
-        bags.append(_totals(path.stem, info, part))
-        links = [link(info.recording_id, f) if link else None for f in part["frame"].to_pylist()]
-        parts.append(part.append_column("link", pa.array(links, pa.string())))
+        bag_frames = pq.read_table(path, schema=SCHEMA)
+        bags.append(_totals(path.stem, info, bag_frames))
+        links = [link(info.recording_id, f) if link else None for f in bag_frames["frame"].to_pylist()]
+        tables.append(bag_frames.append_column("link", pa.array(links, pa.string())))
     empty = SCHEMA.append(pa.field("link", pa.string())).empty_table()
-    frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in parts)])
+    frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in tables)])
     order = [("badness", "descending"), ("recording", "ascending"), ("frame", "ascending")]
     return frames.sort_by(order), bags
 
@@ -47,27 +47,27 @@ def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _totals(name: str, info: RunInfo, part: pa.Table) -> BagTotals:
-    stamps = np.sort(part["stamp"].to_numpy().astype(np.int64))
-    times = part["time_ms_total"].to_numpy()
+def _totals(name: str, info: RunInfo, bag_frames: pa.Table) -> BagTotals:
+    stamps = np.sort(bag_frames["stamp"].to_numpy().astype(np.int64))
+    times = bag_frames["time_ms_total"].to_numpy()
     counts = [field.name for field in SCHEMA if field.type == pa.int32()]
     return BagTotals(
         name=name,
         info=info,
         first=int(stamps[0]),
         duration=float(stamps[-1] - stamps[0]) / 1e9,
-        totals={count: int(part[count].to_numpy().sum(dtype=np.int64)) for count in counts},
+        totals={count: int(bag_frames[count].to_numpy().sum(dtype=np.int64)) for count in counts},
         median_ms=float(np.median(times)),
         p95_ms=float(np.percentile(times, 95)),
-        kinds=_kinds(part),
-        worst=float(part["badness"].to_numpy().max()),
+        kinds=_kinds(bag_frames),
+        worst=float(bag_frames["badness"].to_numpy().max()),
     )
 
 
-def _kinds(part: pa.Table) -> dict[str, int]:
+def _kinds(bag_frames: pa.Table) -> dict[str, int]:
     columns = ["failures", "problems", "missed", "false", "anomalies", "unmatched"]
-    found = Counter(severity(row) for row in part.select(columns).to_pylist())
-    return {kind: found[kind] for kind in SEVERITIES}
+    counts = Counter(severity(row) for row in bag_frames.select(columns).to_pylist())
+    return {kind: counts[kind] for kind in SEVERITIES}
 
 
 def write_summary(

@@ -77,14 +77,14 @@ SEVERITIES = {  # of a frame, the gravest first -> description
 
 def severity(row: Mapping[str, Any]) -> str:
     """Return the gravest problem of a frame, a key of ``SEVERITIES``."""
-    found = {
+    numbers = {
         "failed": row["failures"],
         "lacking": row["problems"],
         "wrong": (row["missed"] or 0) + (row["false"] or 0),
         "strange": row["anomalies"],
         "unmatched": len(row["unmatched"]),
     }
-    return next((kind for kind, number in found.items() if number), "well")
+    return next((kind for kind, number in numbers.items() if number), "well")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,15 +117,15 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor. None: no sensor has a value.
     """
     frame = result.frame
-    found: Counter[str] = Counter(dict.fromkeys(_integers, 0))
-    found.update(counts_of(result))
+    counts: Counter[str] = Counter(dict.fromkeys(_integers, 0))
+    counts.update(counts_of(result))
     if result.ground is not None:
-        found["ground_points"] = int(result.ground.mask.sum())
+        counts["ground_points"] = int(result.ground.mask.sum())
     if result.clusters is not None:
-        found["set_aside"] = int((~result.clusters.kept).sum())
+        counts["set_aside"] = int((~result.clusters.kept).sum())
     if result.objects is not None:
-        found["objects"] = len(result.objects)
-    found["anomalies"] = len(result.anomalies)
+        counts["objects"] = len(result.objects)
+    counts["anomalies"] = len(result.anomalies)
     unmatched: list[str] = []
     weights = 0.0
     for camera in result.cameras:
@@ -133,21 +133,21 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
             continue
         for d, state in enumerate(camera.detections.state.tolist()):
             if state != DetectionState.KEPT:
-                found[DetectionState(state).name.lower()] += 1
+                counts[DetectionState(state).name.lower()] += 1
             elif camera.fusion is None:
-                found["not_compared"] += 1
+                counts["not_compared"] += 1
             else:
                 decision = Decision(int(camera.fusion.detection_decision[d])).name.lower()
-                found[decision] += 1
+                counts[decision] += 1
                 if decision in UNMATCHED:
                     unmatched.append(camera.detections.names[d])
                     weights += UNMATCHED[decision] * float(camera.detections.score[d])
     sync = _worst([abs(c.camera.sync_error) for c in result.cameras])
     tf_age = _worst([frame.tf_age, *(c.camera.tf_age for c in result.cameras)])
     badness = (
-        FAILURE * found["failures"]
-        + PROBLEM * found["problems"]
-        + ANOMALY * found["anomalies"]
+        FAILURE * counts["failures"]
+        + PROBLEM * counts["problems"]
+        + ANOMALY * counts["anomalies"]
         + weights
         + (sync or 0) / config.sync.tolerance
         + (tf_age or 0) / max(config.sync.tf_tolerance, 0.001)
@@ -155,7 +155,7 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     return {
         "frame": frame.index,
         "stamp": frame.stamp,
-        **{name: found[name] for name in _integers},
+        **{name: counts[name] for name in _integers},
         "sync_error_ms": None if sync is None else 1e3 * sync,
         "tf_age_ms": None if tf_age is None else 1e3 * tf_age,
         **{f"time_ms_{s}": 1e3 * result.timings[s] for s in STAGES if s in result.timings},

@@ -101,7 +101,7 @@ class Output(Closing):
         self._job, self._start = job, time.perf_counter()
         self._recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
         self._table = self._recording.with_suffix(".parquet")
-        self._rows: _Rows | None = None
+        self._rows: _RowCollector | None = None
         self._evaluation: Evaluation | None = None
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class Output(Closing):
             self._evaluation = Evaluation(truth_in(source, self._job.truth or None))
             observers += [self._evaluation, EvaluationRecorder(sinks.recording, self._evaluation)]
         assert sinks.file is not None
-        self._rows = _Rows(self._job, sinks.file, on_frame, self._evaluation, pictures)
+        self._rows = _RowCollector(self._job, sinks.file, on_frame, self._evaluation, pictures)
         return [*observers, self._rows, DiskWatch(sinks)]
 
     @property
@@ -195,16 +195,16 @@ WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's
 
 def pictures(result: FrameResult) -> Mapping[str, bytes]:
     """Return JPEGs of the first camera and of the bird's-eye view, by column of the table."""
-    found = {}
+    jpegs = {}
     cameras = (camera_picture(camera, WIDTH) for camera in result.cameras)
     if (picture := next((c for c in cameras if c is not None), None)) is not None:
-        found["picture"] = jpeg(picture)
+        jpegs["picture"] = jpeg(picture)
     if result.bev is not None:
-        found["above"] = jpeg(shrink(ahead(result.bev), ABOVE)[0])
-    return found
+        jpegs["above"] = jpeg(shrink(ahead(result.bev), ABOVE)[0])
+    return jpegs
 
 
-class _Worst:
+class _WorstPictures:
     """Collector of the pictures of the worst frames so far."""
 
     COUNT = 12
@@ -214,20 +214,20 @@ class _Worst:
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def see(self, badness: float, row: int, result: FrameResult) -> None:
-        place = (badness, -row)
-        if len(self._worst) == self.COUNT and place <= self._worst[0][:2]:
+        rank = (badness, -row)
+        if len(self._worst) == self.COUNT and rank <= self._worst[0][:2]:
             return
-        entry = (*place, self._pictures(result))
+        candidate = (*rank, self._pictures(result))
         if len(self._worst) == self.COUNT:
-            heapq.heapreplace(self._worst, entry)
+            heapq.heapreplace(self._worst, candidate)
         else:
-            heapq.heappush(self._worst, entry)
+            heapq.heappush(self._worst, candidate)
 
     def __iter__(self) -> Iterator[tuple[int, Mapping[str, bytes]]]:
         return ((-row, pictures) for _, row, pictures in self._worst)
 
 
-class _Rows(Observer[FrameResult]):
+class _RowCollector(Observer[FrameResult]):
     """Observer that makes a row for each frame. It ends the run if the recording was removed."""
 
     def __init__(
@@ -241,19 +241,19 @@ class _Rows(Observer[FrameResult]):
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
         self._evaluation = evaluation
-        self._worst = _Worst(pictures)
+        self._worst = _WorstPictures(pictures)
 
     def see(self, result: FrameResult) -> None:
-        found = row(result, result.config)
+        values = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
-            wrong = self._evaluation.now
-            found = judged(found, wrong["missed"], wrong["false"])
-        self._worst.see(found["badness"], len(self.rows), result)
-        self.rows.append({**found, "bag": path_text(self._job.bag), "recording": self._job.name})
+            judgement = self._evaluation.now
+            values = judged(values, judgement["missed"], judgement["false"])
+        self._worst.see(values["badness"], len(self.rows), result)
+        self.rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError
 
     def end(self) -> None:
-        for place, pictures in self._worst:
-            self.rows[place] |= pictures
+        for row_number, pictures in self._worst:
+            self.rows[row_number] |= pictures

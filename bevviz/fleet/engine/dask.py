@@ -34,8 +34,8 @@ class Cluster(Closing):
             from distributed import Client
         except ImportError:
             raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
-        where = urlsplit(address)
-        if where.hostname and where.port and not answers(where.hostname, where.port):
+        url = urlsplit(address)
+        if url.hostname and url.port and not answers(url.hostname, url.port):
             raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
         try:
             self._client = Client(address, timeout="10s")
@@ -61,11 +61,11 @@ class Cluster(Closing):
         """Run tasks as ``Engine.run`` does. The frames of a job are reported when it has ended."""
         from distributed import wait
 
-        coming, running = iter(jobs), dict[Any, Task]()
+        pending, running = iter(jobs), dict[Any, Task]()
 
         def submit(count: int) -> None:
             # The scheduler runs a key once, even if two clients submit it.
-            for job in islice(coming, count):
+            for job in islice(pending, count):
                 key = f"bevviz-{job.identity}"
                 running[self._client.submit(_work, job, key=key, retries=retries)] = job
 

@@ -67,17 +67,17 @@ class Processes(Closing):
 
         ``tick`` is called at least every ``TICK`` seconds. Busy workers are ended at the end.
         """
-        coming = iter(jobs)
-        again: deque[Task] = deque()
+        pending = iter(jobs)
+        to_retry: deque[Task] = deque()
         attempts: Counter[str] = Counter()
         busy: list[_Worker] = []
 
-        def following() -> Task | None:
-            return again.popleft() if again else next(coming, None)
+        def next_job() -> Task | None:
+            return to_retry.popleft() if to_retry else next(pending, None)
 
         try:
-            while len(busy) < self.count and (job := following()) is not None:
-                busy.append(self._given(self._idle.pop() if self._idle else self._start(), job))
+            while len(busy) < self.count and (job := next_job()) is not None:
+                busy.append(self._assign(self._idle.pop() if self._idle else self._start(), job))
             self.close()  # There are fewer jobs than processes.
             while busy:
                 ready = wait([worker.pipe for worker in busy], TICK)
@@ -91,15 +91,15 @@ class Processes(Closing):
                         on_frame()
                         continue
                     busy.remove(worker)
-                    done = worker.job
-                    assert done is not None
-                    retry, result = _judge(worker.process, done, message)
-                    retry = retry and attempts[done.name] < retries
+                    ended_job = worker.job
+                    assert ended_job is not None
+                    retry, result = _judge(worker.process, ended_job, message)
+                    retry = retry and attempts[ended_job.name] < retries
                     if retry:
-                        attempts[done.name] += 1
-                        again.append(done)
-                    if (job := following()) is not None:
-                        busy.append(self._given(worker, job))
+                        attempts[ended_job.name] += 1
+                        to_retry.append(ended_job)
+                    if (job := next_job()) is not None:
+                        busy.append(self._assign(worker, job))
                     else:
                         _end(worker)
                     if not retry:
@@ -114,20 +114,20 @@ class Processes(Closing):
     def _start(self, *, speaks: bool = False) -> _Worker:
         context = get_context("spawn")  # A fork would copy threads of Rerun and onnxruntime amid their work.
         ours, theirs = context.Pipe()
-        given = (theirs, self._threads, speaks)
-        process = context.Process(target=_work, args=given, name="bevviz batch", daemon=True)
+        arguments = (theirs, self._threads, speaks)
+        process = context.Process(target=_work, args=arguments, name="bevviz batch", daemon=True)
         # The worker inherits the signal mask: the batch alone handles signals of the terminal and ends its
         # workers. The batch must not be interrupted between the start of a worker and its storage.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             with _safe_path():
                 process.start()
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
         theirs.close()  # Without this, the pipe would not report the end of the process.
         return _Worker(process, ours)
 
-    def _given(self, worker: _Worker, job: Task) -> _Worker:
+    def _assign(self, worker: _Worker, job: Task) -> _Worker:
         """Send a job to a worker. If its process has ended, send it to a new one."""
         if worker.process.exitcode is None:
             try:
@@ -145,15 +145,15 @@ class Processes(Closing):
 @contextmanager
 def _safe_path() -> Iterator[None]:
     """Let a new process look for Python's own modules first, not for files of the working directory."""
-    before = os.environ.get(SAFE_PATH)
+    previous = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
         yield
     finally:
-        if before is None:
+        if previous is None:
             del os.environ[SAFE_PATH]
         else:
-            os.environ[SAFE_PATH] = before
+            os.environ[SAFE_PATH] = previous
 
 
 _FRAME = "frame"
@@ -167,9 +167,9 @@ def _judge(process: SpawnProcess, job: Task, message: JobResult | str | None) ->
         return True, JobResult(job.name, error=message)
     process.join()
     code = process.exitcode or 0
-    why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
+    reason = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    return True, JobResult(job.name, error=f"its process ended {why}{hint}")
+    return True, JobResult(job.name, error=f"its process ended {reason}{hint}")
 
 
 def _end(worker: _Worker) -> None:
