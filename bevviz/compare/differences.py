@@ -17,7 +17,7 @@ from bevviz.stages.fusion import assign
 
 REACH = 2.0  # metres between the centres of one object, in the bird's-eye view
 OVERLAP = 0.1  # least IoU of one object with two classes, in the bird's-eye view
-MOVED = 0.2  # metres: an object has moved if its centre is further away
+MOVED_DISTANCE = 0.2  # metres: an object has moved if its centre is further away
 IMAGE_OVERLAP = 0.5  # least IoU of one detection in the image
 
 
@@ -156,7 +156,7 @@ def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
     other_class = _names_differ(a.names, b.names)
     allowed = np.where(other_class, iou >= OVERLAP, distance <= REACH)
     cost = np.where(allowed, np.minimum(distance / REACH, 1) + (1 - iou) + other_class, np.inf)
-    return _make_pairs(a.names, b.names, cost, distance, iou, MOVED)
+    return _make_pairs(a.names, b.names, cost, distance, iou, MOVED_DISTANCE)
 
 
 def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
