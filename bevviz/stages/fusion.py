@@ -105,19 +105,19 @@ def fuse(
         pairs.cluster[best_cluster],
         reason[best_cluster],
     )
-    in_view = np.isfinite(cluster_uv[:, 0])
+    is_in_view = np.isfinite(cluster_uv[:, 0])
     cluster_decision, cluster_detection = _decide(
         np.where(
             ~clusters.kept,
             Decision.NOT_KEPT,
-            np.where(in_view, Decision.NO_DETECTION, Decision.OUT_OF_VIEW),
+            np.where(is_in_view, Decision.NO_DETECTION, Decision.OUT_OF_VIEW),
         ),
         pairs.cluster[best_detection],
         pairs.detection[best_detection],
         reason[best_detection],
     )
     # A centroid may be in front of the camera although its cluster is outside the image.
-    cluster_decision[~in_view & (cluster_decision == Decision.TOO_FAR)] = Decision.OUT_OF_VIEW
+    cluster_decision[~is_in_view & (cluster_decision == Decision.TOO_FAR)] = Decision.OUT_OF_VIEW
     return Fusion(
         detection_decision=detection_decision,
         detection_cluster=detection_cluster,

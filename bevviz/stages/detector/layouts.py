@@ -79,7 +79,7 @@ class ModelFacts:
 
 
 Finder = Callable[[ModelFacts], LayoutMatch | str | None]
-"""Which outputs to read; None: it is another layout; a sentence: it is this one, but cannot be read."""
+"""Return the outputs to read, None for another layout, or why a model of this layout cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +199,8 @@ def _is_rtdetr(facts: ModelFacts) -> bool:
 @_in_a_table
 def _rtdetr_list(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | str | None:
     """Find an RT-DETR of Ultralytics with a list of boxes."""
-    listed = table.shape[1] == 6 and _are_whole_numbers(table[:, 5])
-    return LayoutMatch((name,)) if listed and _is_rtdetr(facts) else None
+    is_list = table.shape[1] == 6 and _are_whole_numbers(table[:, 5])
+    return LayoutMatch((name,)) if is_list and _is_rtdetr(facts) else None
 
 
 @_in_a_table
@@ -398,11 +398,11 @@ def find_head(facts: ModelFacts) -> Head:
 
 def _prototypes(layout: Layout, match: LayoutMatch, facts: ModelFacts) -> str:
     """Return the output with mask prototypes if the table has weights for it, else an empty name."""
-    by_columns, listed = layout.split is read.columns, match.classes is None
+    by_columns, is_list = layout.split is read.columns, match.classes is None
     if len(match.outputs) > 1 or match.outputs[0] not in facts.tables or not facts.masks:
         return ""
     table = facts.tables[match.outputs[0]]
-    known = 6 if listed else (4 if by_columns else 5) + (match.classes or 0)
+    known = 6 if is_list else (4 if by_columns else 5) + (match.classes or 0)
     if table.shape[0 if by_columns else 1] - known != facts.masks:
         return ""
     return next(name for name, o in facts.outputs.items() if o.ndim == 4 and o.shape[1] == facts.masks)

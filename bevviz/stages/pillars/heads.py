@@ -197,7 +197,7 @@ class Anchors:
     score: OutputMap
     box: OutputMap
     direction: OutputMap | None
-    places: F64  # (A, 7) x, y, z of the centre, length, width, height, yaw
+    anchors: F64  # (A, 7) x, y, z of the centre, length, width, height, yaw
     params: PillarParams
 
     @property
@@ -210,12 +210,12 @@ class Anchors:
     def candidates(self, outputs: Mapping[str, Any]) -> Candidates:
         """Return the boxes with a sufficient score. See ``Head.candidates``."""
         params, each = self.params, len(self.params.anchors) * len(self.params.rotations)
-        score = _scores(self.score.at(outputs).reshape(len(self.places), len(params.classes)), params)
+        score = _scores(self.score.at(outputs).reshape(len(self.anchors), len(params.classes)), params)
         rows, class_id = _select_scores(score, params)
         cells, which = rows // each, (np.arange(len(rows)), rows % each)
         columns = self.box.at(outputs, cells)
         deltas = columns.reshape(len(rows), each, columns.shape[1] // each)[which][:, :7]
-        boxes = decoded(deltas.astype(np.float64), self.places[rows])
+        boxes = decoded(deltas.astype(np.float64), self.anchors[rows])
         if self.direction is not None:
             facing = self.direction.at(outputs, cells).reshape(len(rows), each, 2)[which].argmax(axis=1)
             boxes[:, 6] = resolve_direction(boxes[:, 6], facing, params)
