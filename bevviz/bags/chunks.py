@@ -169,7 +169,7 @@ class ChunkFormat:
     """Functions of one chunked file format."""
 
     open_rosbags: Callable[[Path], RosbagsReader]  # reader of rosbags
-    read_by_index: bool  # messages are read by our index, see SoundChunks
+    read_by_index: bool  # messages are read by our index, see ``SoundChunks``
     read_index: Callable[[Path], FileIndex]  # raises DamageError if the index cannot be right
     read_times: Callable[[Bytes, Chunk, int], I64]  # log times of a connection by the index
     read_messages: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # and the damage of the chunk
