@@ -75,12 +75,12 @@ class Parser(argparse.ArgumentParser):
         return f"usage: {' '.join(words)} [OPTION ...]    '{self.prog} --help' explains"
 
 
-def _no_command(given: str, known: Iterable[str]) -> str:
+def _no_command(argument: str, known: Iterable[str]) -> str:
     """Return the message for an argument that is neither a command nor an existing file."""
     path = Path(argument)
     if path.suffix or len(path.parts) > 1:
         siblings: list[str] = []
         with suppress(OSError, ValueError):
-            there = [str(other) for other in path.parent.iterdir()]
-        return f"{given}: no such file or folder{did_you_mean(given, there, CUTOFF)}"
-    return f"'{given}' is no command, nor a file{did_you_mean(given, known, CUTOFF)}"
+            siblings = [str(other) for other in path.parent.iterdir()]
+        return f"{argument}: no such file or folder{did_you_mean(argument, siblings, CUTOFF)}"
+    return f"'{argument}' is no command, nor a file{did_you_mean(argument, known, CUTOFF)}"
