@@ -62,9 +62,9 @@ class PillarParams(BaseModel):
     )
     features: tuple[Feature, ...] = Field(
         min_length=3,
-        description="of a point, in the network's order: x, y, z, intensity, time (0: of this scan); mean_x, "
-        "mean_y, mean_z from the mean of its pillar; center_x, center_y, center_z from its pillar's centre; "
-        "distance from the origin",
+        description="features of a point in the network's order: x, y, z, intensity, time (0: of this scan); "
+        "mean_x, mean_y, mean_z from the mean of its pillar; center_x, center_y, center_z from its pillar's "
+        "centre; distance from the origin",
     )
     classes: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = Field(
         min_length=1, description="class names in the network's order"
@@ -80,7 +80,7 @@ class PillarParams(BaseModel):
         40_000, ge=1, le=1_000_000, description="pillars of a cloud, later ones are left out"
     )
     intensity_scale: float = Field(
-        1.0, gt=0, description="the cloud's intensity times this is what the network was trained with"
+        1.0, gt=0, description="factor from the cloud's intensity to that of the training data"
     )
     z_offset: float = Field(
         0.0,
@@ -126,7 +126,7 @@ class PillarParams(BaseModel):
     )
 
     scores: Literal["logits", "probabilities"] = Field(
-        "logits", description="what the network answers; of logits the sigmoid is taken"
+        "logits", description="form of the output; logits pass through a sigmoid"
     )
     score_threshold: Share = Field(0.3, description="lowest score of an object")
     score_thresholds: Mapping[str, Share] = Field({}, description="the same of single classes, by name")
@@ -136,11 +136,11 @@ class PillarParams(BaseModel):
         "enough (mmdetection3d, OpenPCDet's centres)",
     )
     nms: Literal["all", "group", "class"] = Field(
-        "class", description="what suppresses one another: all, those of one head, those of one class"
+        "class", description="boxes that suppress one another: all, of one head, of one class"
     )
-    nms_iou: Share = Field(0.1, description="IoU from above that a weaker box goes at; 1: none does")
+    nms_iou: Share = Field(0.1, description="IoU from above at which the weaker box is removed; 1: never")
     nms_distance: float = Field(
-        0.0, ge=0, le=20, description="metres between centres that a weaker box goes at; 0: none does"
+        0.0, ge=0, le=20, description="metres between centres at which the weaker box is removed; 0: never"
     )
     nms_candidates: int = Field(
         1000, ge=1, le=100_000, description="places that enter it, best first, of each head"

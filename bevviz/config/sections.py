@@ -77,7 +77,7 @@ class SyncConfig(Section):
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
     offsets: Mapping[str, Seconds] = Field({}, description="topic -> time added to its stamps")
     by: Literal["stamp", "received"] = Field(
-        "stamp", description="what tells the time of a message: its own stamp, or when it was received"
+        "stamp", description="time of a message: its own stamp, or the time of receipt"
     )
     tf_tolerance: Seconds = Field(0.2, ge=0, le=60, description="how far past its samples TF is held")
     motion_compensation: bool = Field(
@@ -188,7 +188,7 @@ class FusionConfig(Section):
         0.05, ge=0, le=1, description="frustum: least score of a detection times how well points fit it"
     )
     max_gap: Metres = Field(
-        0.5, gt=0, le=20, description="frustum: what is nearer on the ground holds together in a frustum"
+        0.5, gt=0, le=20, description="frustum: points nearer to each other on the ground stay together"
     )
     split: bool = Field(
         True, description="frustum: detections split and merge clusters; false: they name whole ones"
@@ -197,7 +197,9 @@ class FusionConfig(Section):
         True,
         description="split: points in the mask instead of the whole 2D box, where the network gives masks",
     )
-    mask_margin: Pixels = Field(2.0, ge=0, le=50, description="masks: what is so near counts, too")
+    mask_margin: Pixels = Field(
+        2.0, ge=0, le=50, description="masks: points this near to a mask count as inside"
+    )
     max_depth: Metres = Field(120.0, gt=0, description="frustum: farther clusters are out of range")
 
 
@@ -224,7 +226,7 @@ class OpinionsConfig(Section):
         0.3,
         gt=0,
         le=1,
-        description="least IoU in the image at which a detection without a cluster is of a box",
+        description="least IoU in the image for a detection without a cluster to belong to a box",
     )
     min_shown: float = Field(
         0.5, ge=0, le=1, description="least share of a box in the image for a camera to contradict it"
@@ -247,9 +249,11 @@ class TrackingConfig(Section):
     method: Literal["kalman", "none"] = Field(
         "kalman", description="kalman: objects keep an id, with speed and trail; none: each frame for itself"
     )
-    gate: Metres = Field(1.5, gt=0, le=20, description="farthest on the ground from where it is expected")
+    gate: Metres = Field(1.5, gt=0, le=20, description="farthest on the ground from the expected place")
     position_noise: Metres = Field(0.2, gt=0, le=5, description="one sigma of the centre of a box")
-    acceleration: float = Field(2.0, gt=0, le=50, description="one sigma of an object's, in m/s^2")
+    acceleration: float = Field(
+        2.0, gt=0, le=50, description="one sigma of an object's acceleration, in m/s^2"
+    )
     min_hits: int = Field(3, ge=1, le=100, description="frames with a name until a track is shown")
     max_coast: Seconds = Field(1.0, ge=0, le=60, description="a track that is unseen for longer ends")
     class_memory: Seconds = Field(1.0, gt=0, le=60, description="time that the vote of a class decays in")
@@ -267,19 +271,21 @@ class AnomaliesConfig(Section):
         8.0,
         gt=0,
         le=100,
-        description="of an object, or a class, that is missed: -ln of its chance, by the object's own past",
+        description="least surprise of a missed object or class: -ln of its chance, by the object's own past",
     )
     visible: float = Field(
-        0.7, ge=0, le=1, description="share of an object that nothing may hide, else it is excused"
+        0.7, ge=0, le=1, description="least visible share of an object whose miss is an anomaly"
     )
-    jump: Metres = Field(1.0, gt=0, le=20, description="least of a box from where it was expected")
+    jump: Metres = Field(1.0, gt=0, le=20, description="least distance of a box from its expected place")
     alone_frames: int = Field(
-        5, ge=1, le=1000, description="frames until what only one sensor sees is an anomaly"
+        5, ge=1, le=1000, description="frames until an object that only one sensor sees is an anomaly"
     )
-    sync_error: Seconds = Field(0.05, gt=0, description="|image stamp - cloud stamp|")
-    tf_age: Seconds = Field(0.1, gt=0, description="from a stamp to the nearest transform")
-    stage_time: Seconds | None = Field(None, gt=0, description="of any stage, or 'total'; empty: no limit")
-    hold: Seconds = Field(1.0, ge=0, le=60, description="how long one that is over goes on being shown")
+    sync_error: Seconds = Field(0.05, gt=0, description="largest |image stamp - cloud stamp|")
+    tf_age: Seconds = Field(0.1, gt=0, description="longest time from a stamp to the nearest transform")
+    stage_time: Seconds | None = Field(
+        None, gt=0, description="longest time of any stage, or 'total'; empty: no limit"
+    )
+    hold: Seconds = Field(1.0, ge=0, le=60, description="how long an anomaly stays visible after its end")
 
 
 class BevConfig(Section):
@@ -375,10 +381,10 @@ class LiveConfig(Section):
     robot_tolerance: Metres = Field(
         0.5,
         ge=0,
-        description="--robot: distance of one object's centres, seen from above, that is the same yet",
+        description="--robot: largest distance of the two centres of one object, seen from above",
     )
     trigger_after: Seconds = Field(
-        2.0, ge=0, le=600, description="that still belong to an automatic save, after its reason"
+        2.0, ge=0, le=600, description="time after its trigger that an automatic save includes"
     )
     trigger_pause: Seconds = Field(60.0, ge=0, description="least time from one automatic save to the next")
 
