@@ -21,8 +21,8 @@ _HIGH = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
 
 def units(data: bytes) -> Iterator[bytes]:
     """Yield the first bytes of each unit of an H.264 or H.265 stream in Annex B format."""
-    for found in _START.finditer(data):
-        yield data[found.end() : found.end() + _HEAD]
+    for match in _START.finditer(data):
+        yield data[match.end() : match.end() + _HEAD]
 
 
 def is_key(codec: str, data: bytes) -> bool:
@@ -36,11 +36,11 @@ def is_key(codec: str, data: bytes) -> bool:
     if codec == "h265":
         return _begins_h265(data)
     if codec == "av1":
-        return 1 in _obus(data)  # type of a sequence header
+        return 1 in _obu_types(data)  # type of a sequence header
     if codec == "vp9":
         profile_3 = data[:1] and data[0] >> 4 & 3 == 3
-        rest = data[0] << (1 if profile_3 else 0) if data else 255
-        return not rest & 0b1100  # neither a repeated frame nor one that refers to other frames
+        frame_header = data[0] << (1 if profile_3 else 0) if data else 255
+        return not frame_header & 0b1100  # neither a repeated frame nor one that refers to other frames
     if codec == "vp8":
         return bool(data) and not data[0] & 1
     return bool(data) and data[0] & 0xC0 == 0  # the bit of Theora that marks inter frames
@@ -48,51 +48,51 @@ def is_key(codec: str, data: bytes) -> bool:
 
 def _begins_h264(data: bytes) -> bool:
     """Return whether decoding of H.264 can begin with a packet."""
-    said = recovers = False
+    has_parameters = recovers = False
     for unit in filter(None, units(data)):
         kind = unit[0] & 31
-        said |= kind == _H264_SPS
-        recovers |= kind == _H264_SEI and _RECOVERY in _messages(unit[1:])
+        has_parameters |= kind == _H264_SPS
+        recovers |= kind == _H264_SEI and _RECOVERY in _sei_types(unit[1:])
         if kind in _H264_SLICES:
             bits = _Bits(unit[1:])
             bits.number()  # first macroblock of the slice
-            return said and (recovers or kind == _H264_IDR or bits.number() in _H264_INTRA)
-    return said
+            return has_parameters and (recovers or kind == _H264_IDR or bits.number() in _H264_INTRA)
+    return has_parameters
 
 
 def _begins_h265(data: bytes) -> bool:
     """Return whether decoding of H.265 can begin with a packet."""
-    said = recovers = False
+    has_parameters = recovers = False
     for unit in filter(None, units(data)):
         kind = unit[0] >> 1 & 63
-        said |= kind == _H265_SPS
-        recovers |= kind == _H265_SEI and _RECOVERY in _messages(unit[2:])
+        has_parameters |= kind == _H265_SPS
+        recovers |= kind == _H265_SEI and _RECOVERY in _sei_types(unit[2:])
         if kind in _H265_SLICES:
-            return said and (recovers or kind in _H265_IRAP)
-    return said
+            return has_parameters and (recovers or kind in _H265_IRAP)
+    return has_parameters
 
 
-def _messages(sei: bytes) -> Iterator[int]:
+def _sei_types(sei: bytes) -> Iterator[int]:
     """Iterate over the types of the messages in an SEI unit.
 
     The type and the size of a message precede it. Each byte of 255 continues the number.
     """
-    plain = iter(sei.replace(b"\0\0\3", b"\0\0"))
-    for byte in plain:
-        kind, size = byte, next(plain, 0)
+    bytes_left = iter(sei.replace(b"\0\0\3", b"\0\0"))
+    for byte in bytes_left:
+        kind, size = byte, next(bytes_left, 0)
         while byte == 255:
-            byte, size = size, next(plain, 0)
+            byte, size = size, next(bytes_left, 0)
             kind += byte
         yield kind
-        rest = size
+        length = size
         while size == 255:
-            size = next(plain, 0)
-            rest += size
-        for _ in range(rest):
-            next(plain, 0)
+            size = next(bytes_left, 0)
+            length += size
+        for _ in range(length):
+            next(bytes_left, 0)
 
 
-def _obus(data: bytes) -> Iterator[int]:
+def _obu_types(data: bytes) -> Iterator[int]:
     """Iterate over the types of the units (OBUs) of an AV1 packet."""
     at = 0
     while at < len(data):

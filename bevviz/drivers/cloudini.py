@@ -110,25 +110,25 @@ def decode(data: bytes) -> tuple[Header, U8]:
         or any(f.offset + f.size > header.point_step for f in fields if f in adaptive or f.offset != NOWHERE)
     ):
         raise ValueError("its cloudini header is damaged: no field may end behind the point, 1 GiB is most")
-    together = [f for f in fields if f not in adaptive]
-    ways = np.array([_way(header, field) for field in together], np.int64)
-    sizes, offsets = (np.array([getattr(f, n) for f in together], np.int64) for n in ("size", "offset"))
-    resolutions = np.array([f.resolution for f in together], np.float64)
+    interleaved = [f for f in fields if f not in adaptive]
+    encodings = np.array([_encoding_of(header, field) for field in interleaved], np.int64)
+    sizes, offsets = (np.array([getattr(f, n) for f in interleaved], np.int64) for n in ("size", "offset"))
+    resolutions = np.array([f.resolution for f in interleaved], np.float64)
     out = np.zeros(header.points * header.point_step, np.uint8)
     first = 0
     while first < header.points:
         count = min(CHUNK, header.points - first)
         (length,) = struct.unpack_from("<I", data, at) if len(data) >= at + 4 else (len(data),)
-        chunk = _unpacked(header, data[at + 4 : at + 4 + length])
+        chunk = _decompress(header, data[at + 4 : at + 4 + length])
         if len(data) < at + 4 + length:
             raise ValueError("its cloudini data are cut")
         at += 4 + length
         points = out[first * header.point_step :]
-        done = _points(chunk, count, ways, sizes, offsets, resolutions, points, header.point_step)
+        end = _decode_fields(chunk, count, encodings, sizes, offsets, resolutions, points, header.point_step)
         for field in adaptive:
-            if done != CUT:
-                done = _column(chunk, done, count, field.size, field.offset, points, header.point_step)
-        if done != len(chunk):
+            if end != CUT:
+                end = _decode_column(chunk, end, count, field.size, field.offset, points, header.point_step)
+        if end != len(chunk):
             raise ValueError("its cloudini data are damaged")
         first += count
     return header, out
@@ -148,40 +148,40 @@ def read_header(data: bytes) -> tuple[Header, int]:
     try:
         if data[12:13] == b"\n" and data[13:14] != b"{":
             end = data.index(b"\0", 13, 13 + LONGEST_HEADER)
-            return _of_yaml(version, data[13:end].decode()), end + 1
-        return _of_binary(version, data)
+            return _parse_yaml(version, data[13:end].decode()), end + 1
+        return _parse_binary(version, data)
     except (ValueError, LookupError, TypeError, struct.error) as error:
         raise ValueError(f"its cloudini header is damaged ({first_line(error)})") from None
 
 
 # All messages of a topic have the same header. Parsing it takes longer than decoding the points.
 @lru_cache(maxsize=64)
-def _of_yaml(version: int, text: str) -> Header:
+def _parse_yaml(version: int, text: str) -> Header:
     """Parse a header in YAML. Raise ValueError, LookupError or TypeError if it is damaged."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        told = YAML(typ="safe", pure=True).load(text)
+        header = YAML(typ="safe", pure=True).load(text)
     except YAMLError as error:
         raise ValueError(first_line(error)) from None
     fields = [
-        Field(str(f["name"]), int(f["offset"]), TYPES.index(f["type"], 1), _single(f["resolution"]))
-        for f in told["fields"] or ()
+        Field(str(f["name"]), int(f["offset"]), TYPES.index(f["type"], 1), _single_precision(f["resolution"]))
+        for f in header["fields"] or ()
     ]
-    width, height, step = (int(told[name]) for name in ("width", "height", "point_step"))
-    encoding, compression = told["encoding_opt"], told["compression_opt"]
+    width, height, step = (int(header[name]) for name in ("width", "height", "point_step"))
+    encoding, compression = header["encoding_opt"], header["compression_opt"]
     return Header(
         version, width, height, step, ENCODINGS.index(encoding), COMPRESSIONS.index(compression), fields
     )
 
 
-def _single(resolution: object) -> float:
+def _single_precision(resolution: object) -> float:
     """Return a resolution in single precision, as cloudini stores it; 0 if there is none."""
     return float(np.float32(0 if resolution is None else str(resolution)))
 
 
-def _of_binary(version: int, data: bytes) -> tuple[Header, int]:
+def _parse_binary(version: int, data: bytes) -> tuple[Header, int]:
     """Parse a binary header. Return it and the byte at which the chunks begin."""
     width, height, step, encoding, compression, count = struct.unpack_from("<IIIBBH", data, 12)
     at, fields = 28, list[Field]()
@@ -196,7 +196,7 @@ def _of_binary(version: int, data: bytes) -> tuple[Header, int]:
     return Header(version, width, height, step, encoding, compression, fields), at
 
 
-def _way(header: Header, field: Field) -> int:
+def _encoding_of(header: Header, field: Field) -> int:
     """Return how a field is encoded: ``COPIED``, ``DELTAS``, ``MULTIPLES``, ``XORED`` or ``PACKED``."""
     encoding = ENCODINGS[header.encoding]
     if encoding == "NONE" or field.size == 1:
@@ -210,16 +210,16 @@ def _way(header: Header, field: Field) -> int:
     return XORED if field.resolution or header.version < 4 else PACKED
 
 
-def _unpacked(header: Header, chunk: bytes) -> U8:
+def _decompress(header: Header, chunk: bytes) -> U8:
     """Decompress a chunk. Raise ValueError if it is damaged or larger than a chunk can be."""
     compression = COMPRESSIONS[header.compression]
-    most = CHUNK * (sum(11 for _ in header.fields) + header.point_step) + 4096
+    limit = CHUNK * (sum(11 for _ in header.fields) + header.point_step) + 4096
     try:
         if compression == "LZ4":
-            chunk = lz4_decompress(chunk, uncompressed_size=most)
+            chunk = lz4_decompress(chunk, uncompressed_size=limit)
         elif compression == "ZSTD":
             stream = zstd.ZstdDecompressor()
-            chunk = stream.decompress(chunk, most)
+            chunk = stream.decompress(chunk, limit)
             if not stream.eof:
                 raise ValueError("it is cut, or too long")
     except (LZ4BlockError, zstd.ZstdError, ValueError) as error:
@@ -228,7 +228,7 @@ def _unpacked(header: Header, chunk: bytes) -> U8:
 
 
 @kernel
-def _varint(data: U8, at: int) -> tuple[np.uint64, int]:
+def _read_varint(data: U8, at: int) -> tuple[np.uint64, int]:
     """Read a varint. Return it and the next byte, ``CUT`` if the data end within it."""
     value, shift = np.uint64(0), np.uint64(0)
     while 0 <= at < len(data) and shift < 64:
@@ -242,17 +242,17 @@ def _varint(data: U8, at: int) -> tuple[np.uint64, int]:
 
 
 @kernel
-def _difference(value: np.uint64) -> np.int64:
+def _unzigzag(value: np.uint64) -> np.int64:
     """Decode a zigzag number. It is stored plus one, because 0 stands for NaN."""
     value -= np.uint64(1)
     return np.int64(value >> np.uint64(1)) ^ -np.int64(value & np.uint64(1))
 
 
 @kernel
-def _points(
+def _decode_fields(
     data: U8,
     count: int,
-    ways: I64,
+    encodings: I64,
     sizes: I64,
     offsets: I64,
     resolutions: F64,
@@ -260,39 +260,39 @@ def _points(
     step: int,
 ) -> int:
     """Decode the fields that are stored point by point. Return the byte behind them."""
-    at, fields = 0, len(ways)
-    before, bits = np.zeros(fields, np.int64), np.zeros(fields, np.uint64)
+    at, fields = 0, len(encodings)
+    previous, bits = np.zeros(fields, np.int64), np.zeros(fields, np.uint64)
     leading, meaningful = np.zeros(fields, np.int64), np.zeros(fields, np.int64)
     single, double = np.zeros(1, np.float32), np.zeros(1, np.float64)
     single_bits, double_bits = single.view(np.uint32), double.view(np.uint64)
     for point in range(count):
         for field in range(fields):
-            way, size = ways[field], sizes[field]
-            if way in (COPIED, XORED):
+            encoding, size = encodings[field], sizes[field]
+            if encoding in (COPIED, XORED):
                 if at + size > len(data):
                     return CUT
                 value = _load(data, at, size)
                 at += size
-                if way == XORED:
+                if encoding == XORED:
                     bits[field] ^= value
                     value = bits[field]
-            elif way == PACKED:
-                at = _packed(data, at, point == 0, field, bits, leading, meaningful)
+            elif encoding == PACKED:
+                at = _decode_double(data, at, point == 0, field, bits, leading, meaningful)
                 value = bits[field]
             else:
-                value, at = _varint(data, at)
-                if at == CUT or (value == 0 and way == DELTAS):
+                value, at = _read_varint(data, at)
+                if at == CUT or (value == 0 and encoding == DELTAS):
                     return CUT
                 missing = value == 0
-                before[field] = 0 if missing else before[field] + _difference(value)
-                if way == DELTAS:
-                    value = np.uint64(before[field])
+                previous[field] = 0 if missing else previous[field] + _unzigzag(value)
+                if encoding == DELTAS:
+                    value = np.uint64(previous[field])
                 elif size == 4:
-                    number = np.float32(before[field]) * np.float32(resolutions[field])
+                    number = np.float32(previous[field]) * np.float32(resolutions[field])
                     single[0] = np.float32(np.nan) if missing else number
                     value = np.uint64(single_bits[0])
                 else:
-                    double[0] = np.nan if missing else before[field] * resolutions[field]
+                    double[0] = np.nan if missing else previous[field] * resolutions[field]
                     value = double_bits[0]
             if at == CUT:
                 return CUT
@@ -302,46 +302,48 @@ def _points(
 
 
 @kernel
-def _packed(data: U8, at: int, first: bool, field: int, bits: U64, leading: I64, meaningful: I64) -> int:
+def _decode_double(
+    data: U8, at: int, first: bool, field: int, bits: U64, leading: I64, meaningful: I64
+) -> int:
     """Decode a double by Gorilla (Pelkonen et al. 2015), from a whole byte on. Return the byte behind it."""
-    place = at * 8
+    bit = at * 8
     if first:
-        value, place = _bits(data, place, 64)
+        value, bit = _read_bits(data, bit, 64)
         bits[field] = value
-        return place // 8 if place != CUT else CUT
-    changed, place = _bits(data, place, 1)
-    if place != CUT and changed:
-        fresh, place = _bits(data, place, 1)
-        if place != CUT and fresh:
-            lead, place = _bits(data, place, 5)
-            length, place = _bits(data, place, 6)
+        return bit // 8 if bit != CUT else CUT
+    changed, bit = _read_bits(data, bit, 1)
+    if bit != CUT and changed:
+        fresh, bit = _read_bits(data, bit, 1)
+        if bit != CUT and fresh:
+            lead, bit = _read_bits(data, bit, 5)
+            length, bit = _read_bits(data, bit, 6)
             leading[field], meaningful[field] = np.int64(lead), np.int64(length) + 1
         trailing = 64 - leading[field] - meaningful[field]
-        if place == CUT or meaningful[field] == 0 or trailing < 0:
+        if bit == CUT or meaningful[field] == 0 or trailing < 0:
             return CUT
-        value, place = _bits(data, place, meaningful[field])
+        value, bit = _read_bits(data, bit, meaningful[field])
         bits[field] ^= value << np.uint64(trailing)
-    return (place + 7) // 8 if place != CUT else CUT
+    return (bit + 7) // 8 if bit != CUT else CUT
 
 
 @kernel
-def _bits(data: U8, place: int, count: int) -> tuple[np.uint64, int]:
+def _read_bits(data: U8, bit: int, count: int) -> tuple[np.uint64, int]:
     """Read a number of ``count`` bits, the lowest first. Return it and the bit behind it."""
     value = np.uint64(0)
-    if place == CUT or place + count > len(data) * 8:
+    if bit == CUT or bit + count > len(data) * 8:
         return value, CUT
-    done = 0
-    while done < count:
-        shift = (place + done) & 7
-        some = min(8 - shift, count - done)
-        part = (np.uint64(data[(place + done) >> 3]) >> np.uint64(shift)) & np.uint64((1 << some) - 1)
-        value |= part << np.uint64(done)
-        done += some
-    return value, place + count
+    taken = 0
+    while taken < count:
+        shift = (bit + taken) & 7
+        step = min(8 - shift, count - taken)
+        part = (np.uint64(data[(bit + taken) >> 3]) >> np.uint64(shift)) & np.uint64((1 << step) - 1)
+        value |= part << np.uint64(taken)
+        taken += step
+    return value, bit + count
 
 
 @kernel
-def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step: int) -> int:
+def _decode_column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step: int) -> int:
     """Decode an integer field of all points of a chunk: differences, a palette, or runs of either.
 
     Return the byte behind it.
@@ -353,26 +355,26 @@ def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step
     value, row = np.uint64(0), 0
     if mode == 0:
         for row in range(count):
-            number, at = _varint(data, at)
+            number, at = _read_varint(data, at)
             if at == CUT or number == 0:
                 return CUT
-            value += np.uint64(_difference(number))
+            value += np.uint64(_unzigzag(number))
             _store(out, row * step + offset, size, value)
         return at
     if mode == 1:
         if at + 2 > len(data):
             return CUT
-        many, width = np.int64(_load(data, at, 2)), 0
+        palette_size, width = np.int64(_load(data, at, 2)), 0
         palette = at + 2
-        at = int(palette + many * size)
-        while (many - 1) >> width > 0:
+        at = int(palette + palette_size * size)
+        while (palette_size - 1) >> width > 0:
             width += 1
-        place, end = at * 8, at + (width * count + 7) // 8
-        if many == 0 or end > len(data):
+        bit, end = at * 8, at + (width * count + 7) // 8
+        if palette_size == 0 or end > len(data):
             return CUT
         for row in range(count):
-            index, place = _bits(data, place, width)
-            if np.int64(index) >= many:
+            index, bit = _read_bits(data, bit, width)
+            if np.int64(index) >= palette_size:
                 return CUT
             _store(out, row * step + offset, size, _load(data, palette + int(index) * size, size))
         return end
@@ -384,18 +386,18 @@ def _column(data: U8, at: int, count: int, size: int, offset: int, out: U8, step
         if mode == 2:
             if at + size > len(data):
                 return CUT
-            value, by = _load(data, at, size), np.uint64(0)
+            value, difference = _load(data, at, size), np.uint64(0)
             at += size
         else:
-            number, at = _varint(data, at)
+            number, at = _read_varint(data, at)
             if at == CUT or number == 0:
                 return CUT
-            by = np.uint64(_difference(number))
-        length, at = _varint(data, at)
+            difference = np.uint64(_unzigzag(number))
+        length, at = _read_varint(data, at)
         if at == CUT or length > np.uint64(count - row):
             return CUT
         for _ in range(np.int64(length)):
-            value += by
+            value += difference
             _store(out, row * step + offset, size, value)
             row += 1
     return at if row == count else CUT

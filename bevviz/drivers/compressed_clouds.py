@@ -28,16 +28,16 @@ def decompress(msg: Any) -> Any:
     # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
     data = memoryview(msg.compressed_data).tobytes()
     if msg.format == "cloudini":
-        return _of_cloudini(msg, data)
+        return _from_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)
     size = height * max(int(msg.row_step), width * int(msg.point_step))
     if msg.format == "zstd":
-        unpacked = np.frombuffer(_unpacked(zstd.ZstdDecompressor(), data, size), np.uint8)
+        unpacked = np.frombuffer(_unpack(zstd.ZstdDecompressor(), data, size), np.uint8)
     elif msg.format == "zlib":
         # 32 + 15: accepts headers of zlib and of gzip.
-        unpacked = np.frombuffer(_unpacked(zlib.decompressobj(47), data, size), np.uint8)
+        unpacked = np.frombuffer(_unpack(zlib.decompressobj(47), data, size), np.uint8)
     elif msg.format == "draco":
-        unpacked = _of_draco(msg, data)
+        unpacked = _from_draco(msg, data)
         width, height = len(unpacked) // max(int(msg.point_step), 1), 1
     else:
         raise ValueError(
@@ -57,43 +57,43 @@ def decompress(msg: Any) -> Any:
     )
 
 
-def _of_cloudini(msg: Any, data: bytes) -> Any:
+def _from_cloudini(msg: Any, data: bytes) -> Any:
     """Make a PointCloud2 from cloudini data.
 
     The size is that of the data's own header. The message may state more points.
     """
-    told, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
+    header, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
     fields = [
         make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)
-        for f in told.fields
+        for f in header.fields
         if f.type in SCALARS and f.offset != cloudini.NOWHERE
     ]
     return make(
         "sensor_msgs/msg/PointCloud2",
         header=msg.header,
-        height=told.height,
-        width=told.width,
+        height=header.height,
+        width=header.width,
         fields=fields if data else msg.fields,
         is_bigendian=False,
-        point_step=told.point_step or msg.point_step,
-        row_step=told.width * told.point_step,
+        point_step=header.point_step or msg.point_step,
+        row_step=header.width * header.point_step,
         data=points,
         is_dense=msg.is_dense,
     )
 
 
-def _unpacked(stream: Any, data: bytes, size: int) -> bytes:
+def _unpack(stream: Any, data: bytes, size: int) -> bytes:
     """Decompress a cloud. ``size`` is the number of bytes that the message states, and limits the memory."""
     try:
-        found: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
+        content: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
     except (zlib.error, zstd.ZstdError) as error:
         raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
     if not stream.eof:
         raise ValueError("the end of its compressed data is missing, or it is too long")
-    return found
+    return content
 
 
-def _of_draco(msg: Any, data: bytes) -> Any:
+def _from_draco(msg: Any, data: bytes) -> Any:
     """Decompress draco data into (N * point_step,) bytes.
 
     point_cloud_transport's plugin stores one attribute for each field, in their order.

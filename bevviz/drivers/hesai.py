@@ -133,7 +133,7 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
     shape, steps = (len(data), model.blocks), (data.strides[0], model.block.itemsize)
     blocks = np.ndarray(shape, model.block, data, model.first, steps)
     metres = 0.004 if model.scale is None else int(data[0, model.scale]) * 1e-3
-    elevation, offset = _read(angles, model) if angles else _nominal()[model.name]
+    elevation, offset = _read_angles(angles, model) if angles else _nominal_angles()[model.name]
 
     distance = np.ascontiguousarray(blocks["measured"]["distance"])  # (N, blocks, channels)
     grouped = distance[:, : model.blocks // returns * returns].reshape(len(data), -1, returns, model.channels)
@@ -141,18 +141,18 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
         same = (grouped[:, :, first, None] == grouped[:, :, first + 1 :]).any(axis=2)
         grouped[:, :, first][same] = 0
     met = np.asarray(grouped.any(axis=2))
-    packet, group, which, channel = np.nonzero(grouped)
-    block = group * returns + which
+    packet, group, rank, channel = np.nonzero(grouped)
+    block = group * returns + rank
 
     azimuth = np.deg2rad(blocks["azimuth"] * (360 / AZIMUTHS))  # (N, blocks)
     sine, cosine = (np.asarray(f(azimuth), np.float32)[packet, block] for f in (np.sin, np.cos))
     turn, tilt = (np.deg2rad(a) for a in (offset, elevation))
-    far = grouped[packet, group, which, channel] * np.float32(metres)
-    flat = far * np.cos(tilt)[channel]
-    points = np.empty(len(far), POINT)
+    metres_away = grouped[packet, group, rank, channel] * np.float32(metres)
+    flat = metres_away * np.cos(tilt)[channel]
+    points = np.empty(len(metres_away), POINT)
     points["x"] = flat * (sine * np.cos(turn)[channel] + cosine * np.sin(turn)[channel])
     points["y"] = flat * (cosine * np.cos(turn)[channel] - sine * np.sin(turn)[channel])
-    points["z"] = far * np.sin(tilt)[channel]
+    points["z"] = metres_away * np.sin(tilt)[channel]
     points["intensity"] = blocks["measured"]["reflectivity"][packet, block, channel]
     points["ring"] = channel
     points["time"] = _times(packets, usable, model, returns)[packet, group]
@@ -163,25 +163,25 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
 
 def _model_of(packets: Packets) -> tuple[Model, I64]:
     """Return the model of most packets, and the row numbers of its complete packets."""
-    most = np.zeros(0, np.int64)
-    found = None
+    rows = np.zeros(0, np.int64)
+    best = None
     for model in MODELS:
         wanted = [i for i, byte in enumerate(model.head) if byte is not None]
         head = np.array([byte for byte in model.head if byte is not None], np.uint8)
         fit = np.flatnonzero((packets.data[:, wanted] == head).all(axis=1))
-        if len(fit) > len(most):
-            most, found = fit, model
-    if found is None:
+        if len(fit) > len(rows):
+            rows, best = fit, model
+    if best is None:
         size, begin = int(packets.sizes[0]), bytes(packets.data[0, :12]).hex()
         raise ValueError(
             f"packets of {size} bytes that begin with {begin} are of no model that is decoded here "
             f"({', '.join(m.name for m in MODELS)}): play them through the driver and record its cloud"
         )
-    whole = most[packets.sizes[most] >= found.size]
+    whole = rows[packets.sizes[rows] >= best.size]
     if not len(whole):
-        size = int(packets.sizes[most].max())
-        raise ValueError(f"a packet of {size} bytes is too short for a {found.name}'s {found.size}")
-    return found, whole
+        size = int(packets.sizes[rows].max())
+        raise ValueError(f"a packet of {size} bytes is too short for a {best.name}'s {best.size}")
+    return best, whole
 
 
 def _times(packets: Packets, usable: I64, model: Model, returns: int) -> F32:
@@ -204,22 +204,22 @@ Angles = tuple[F32, F32]  # elevation and azimuth of each channel, degrees
 
 
 @cache
-def _nominal() -> dict[str, Angles]:
+def _nominal_angles() -> dict[str, Angles]:
     """Read the nominal angles of each model."""
     rows = list(csv.reader(NOMINAL.read_text().splitlines()))[1:]
     return {
-        model.name: _angles([[float(v) for v in row[1:]] for row in rows if row[0] == model.name])
+        model.name: _sorted_angles([[float(v) for v in row[1:]] for row in rows if row[0] == model.name])
         for model in MODELS
     }
 
 
-def _angles(rows: list[list[float]]) -> Angles:
+def _sorted_angles(rows: list[list[float]]) -> Angles:
     """Return elevation and azimuth of rows of channel, elevation and azimuth, sorted by channel."""
     _, elevation, azimuth = np.array(sorted(rows), np.float32).T
     return elevation, azimuth
 
 
-def _read(path: Path, model: Model) -> Angles:
+def _read_angles(path: Path, model: Model) -> Angles:
     """Read the CSV of the sensor's web page: channel number, elevation, azimuth."""
     rows = list[list[float]]()
     for row in csv.reader(StringIO(read_calibration(path))):
@@ -233,7 +233,7 @@ def _read(path: Path, model: Model) -> Angles:
             f"source.lidar_calibration: {path}: has {len(rows)} rows of channel, elevation and azimuth, but "
             f"the packets are a {model.name}'s, which has {model.channels} channels, numbered from 1"
         )
-    return _angles(rows)
+    return _sorted_angles(rows)
 
 
 def read_scan(data: Bytes, serialization: Serialization) -> Any:

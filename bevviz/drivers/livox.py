@@ -66,25 +66,25 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
         size += kind.itemsize
     step = size if ros1 else size + -size % max(kind.itemsize for kind in formats)
     # The last point has no padding behind it.
-    there = min(count, max(0, (len(data) - at - size) // step + 1))
+    complete = min(count, max(0, (len(data) - at - size) // step + 1))
     names = [name for name, _ in fields]
     point: np.dtype[np.void] = np.dtype(
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
     )
-    given = np.ndarray((there,), point, data, at, (step,))
-    return encode_points(sec * SECOND + nanosec, frame_id, _as_read(given), count)
+    rows = np.ndarray((complete,), point, data, at, (step,))
+    return encode_points(sec * SECOND + nanosec, frame_id, _to_points(rows), count)
 
 
-def _as_read(given: Any) -> Any:
+def _to_points(rows: Any) -> Any:
     """Return the points as a contiguous (N,) array with x, y and z first and the names of ``READ``."""
-    names = sorted(given.dtype.names, key=lambda name: (name not in ("x", "y", "z"), name != "reflectivity"))
+    names = sorted(rows.dtype.names, key=lambda name: (name not in ("x", "y", "z"), name != "reflectivity"))
     layout = [
-        (READ.get(name, name), "<f4" if name in READ else given.dtype[name].newbyteorder("<"))
+        (READ.get(name, name), "<f4" if name in READ else rows.dtype[name].newbyteorder("<"))
         for name in names
     ]
-    points = np.empty(len(given), np.dtype(layout))
+    points = np.empty(len(rows), np.dtype(layout))
     for name in names:
-        points[READ.get(name, name)] = given[name]
+        points[READ.get(name, name)] = rows[name]
     return points
 
 
@@ -97,12 +97,12 @@ def fields_of(definitions: Mapping[str, Any], msgtype: str) -> Sequence[tuple[st
     _, stated = definitions.get(msgtype.replace("CustomMsg", "CustomPoint"), (None, None))
     if stated is None:
         return FIELDS
-    found = []
+    point_fields = []
     for name, (kind, content) in stated:
         if kind.name != "BASE":
             raise ValueError(f"its points have a field {name} that is no number")
-        found.append((str(name), str(content[0])))
-    return found
+        point_fields.append((str(name), str(content[0])))
+    return point_fields
 
 
 def read_message(data: Bytes, serialization: Serialization) -> Any:

@@ -133,8 +133,8 @@ class Scans:
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
         self._current = -1
-        self._gone: deque[int] = deque(maxlen=2)  # numbers of the previous scans
-        self._held: dict[int, Packet] = {}  # packets of the current scan by their first column
+        self._finished: deque[int] = deque(maxlen=2)  # numbers of the previous scans
+        self._packets: dict[int, Packet] = {}  # packets of the current scan by their first column
 
     def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[Packet, ...]]:
         """Add a packet. Yield each scan that it ends.
@@ -144,22 +144,22 @@ class Scans:
             packet: ``sensor.size`` bytes.
         """
         number, begin = self.sensor.number(packet), self.sensor.begin(packet)
-        if number in self._gone or begin >= self.sensor.columns:
+        if number in self._finished or begin >= self.sensor.columns:
             return
         if number != self._current:
             yield from self.rest()
             self._current = number
-        self._held.setdefault(begin, (received, packet))
-        if len(self._held) == self.sensor.sent:
+        self._packets.setdefault(begin, (received, packet))
+        if len(self._packets) == self.sensor.sent:
             yield from self.rest()
 
     def rest(self) -> Iterator[tuple[Packet, ...]]:
         """Yield the incomplete scan. Its further packets are then too late."""
-        if self._held:
-            found, self._held = tuple(self._held.values()), {}
-            self._gone.append(self._current)
+        if self._packets:
+            packets, self._packets = tuple(self._packets.values()), {}
+            self._finished.append(self._current)
             self._current = -1
-            yield found
+            yield packets
 
 
 def is_packet(msgtype: str) -> bool:
@@ -191,20 +191,20 @@ def read_sensor(text: str, where: str) -> Sensor:
         UserError: the text is no metadata, or the packets of the sensor are not supported.
     """
     try:
-        told = json.loads(text)
-        beams = told.get("beam_intrinsics", told)
-        form = told.get("lidar_data_format") or told.get("data_format") or {}
-        profile = str(form.get("udp_profile_lidar", "LEGACY"))
-        mode = str(told.get("lidar_mode") or told.get("config_params", {}).get("lidar_mode", ""))
-        columns = int(form.get("columns_per_frame") or mode.partition("x")[0])
+        metadata = json.loads(text)
+        beams = metadata.get("beam_intrinsics", metadata)
+        data_format = metadata.get("lidar_data_format") or metadata.get("data_format") or {}
+        profile = str(data_format.get("udp_profile_lidar", "LEGACY"))
+        mode = str(metadata.get("lidar_mode") or metadata.get("config_params", {}).get("lidar_mode", ""))
+        columns = int(data_format.get("columns_per_frame") or mode.partition("x")[0])
         angles = [beams["beam_altitude_angles"], beams["beam_azimuth_angles"]]
         directions = np.deg2rad(np.array(angles, np.float64)).T
-        placed = np.array(beams.get("beam_to_lidar_transform") or np.eye(4), np.float64).reshape(4, 4)
-        origin = placed[[0, 2], 3]
+        transform = np.array(beams.get("beam_to_lidar_transform") or np.eye(4), np.float64).reshape(4, 4)
+        origin = transform[[0, 2], 3]
         if "beam_to_lidar_transform" not in beams:
             origin = np.array([float(beams["lidar_origin_to_beam_origin_mm"]), 0.0])
-        per_packet = int(form.get("columns_per_packet", 16))
-        first, last = form.get("column_window") or (0, columns - 1)
+        per_packet = int(data_format.get("columns_per_packet", 16))
+        first, last = data_format.get("column_window") or (0, columns - 1)
         if directions.ndim != 2 or not len(directions) or not 0 < per_packet <= columns <= 1 << 14:
             raise ValueError
         measured = (int(first) + np.arange((int(last) - int(first)) % columns + 1)) % columns
@@ -269,26 +269,26 @@ def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
     shape, steps = (len(packets), sensor.per_packet), (sensor.size, sensor.step)
     columns = np.ndarray(shape, column, data, profile.head, steps).reshape(-1)
     usable = (columns["status"] & profile.valid == profile.valid) & (columns["number"] < sensor.columns)
-    which = np.flatnonzero(usable)
+    rows = np.flatnonzero(usable)
     columns = columns[usable]
     stamp, times = int(received[0]), np.zeros(len(columns))
     if len(columns):
         clock = columns["clock"].astype(np.int64)
         times = (clock - clock[0]) * 1e-9
-        first = int(received[which[0] // sensor.per_packet])
+        first = int(received[rows[0] // sensor.per_packet])
         stamp = int(clock[0]) if abs(int(clock[0]) - first) < MINUTE else first
     ranges = (columns["measured"]["range"] & profile.mask) * np.float32(profile.scale * 1e-3)
     row, pixel = np.nonzero(ranges)
     encoder = 2 * np.pi * (1 - columns["number"] / sensor.columns)
     altitude, azimuth = sensor.directions.T
     out, up = sensor.origin
-    turned = encoder[row] - azimuth[pixel]
+    angle = encoder[row] - azimuth[pixel]
     # The range includes the distance from the axis to the start of the beam, which turns around the axis.
     length = ranges[row, pixel] - np.hypot(out, up)
     flat = length * np.cos(altitude)[pixel]
     points = np.empty(len(row), POINT)
-    points["x"] = flat * np.cos(turned) + out * np.cos(encoder)[row]
-    points["y"] = flat * np.sin(turned) + out * np.sin(encoder)[row]
+    points["x"] = flat * np.cos(angle) + out * np.cos(encoder)[row]
+    points["y"] = flat * np.sin(angle) + out * np.sin(encoder)[row]
     points["z"] = length * np.sin(altitude)[pixel] + up
     points["reflectivity"] = columns["measured"]["reflectivity"][row, pixel]
     points["intensity"] = columns["measured"]["signal"][row, pixel]

@@ -70,15 +70,15 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Pa
     packet = np.dtype({"names": names, "formats": formats})
     # CDR aligns the stamp of the next packet. The last packet has no padding behind it.
     step = packet.itemsize + (0 if ros1 else -packet.itemsize % 4)
-    there = min(count, max(0, (len(data) - at - packet.itemsize) // step + 1))
-    if not there:
+    complete = min(count, max(0, (len(data) - at - packet.itemsize) // step + 1))
+    if not complete:
         raise ValueError(f"none of the {count} packets is whole" if count else "there are no packets in it")
-    rows = np.ndarray((there,), packet, data, at, (step,))
+    rows = np.ndarray((complete,), packet, data, at, (step,))
     return Packets(
         stamp=sec * SECOND + nanosec,
         frame_id=frame_id,
         received=rows["sec"].astype(np.int64) * SECOND + rows["nanosec"],
         data=rows["data"],
-        sizes=np.minimum(rows["size"], size).astype(np.int64) if sized else np.full(there, size, np.int64),
-        lost=count - there,
+        sizes=np.minimum(rows["size"], size).astype(np.int64) if sized else np.full(complete, size, np.int64),
+        lost=count - complete,
     )

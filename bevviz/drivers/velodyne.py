@@ -31,7 +31,7 @@ def decode(packets: Packets) -> Any:
     kinds = packets.data[:, MODEL]
     # The library refuses a scan if one of its packets is unknown.
     usable = np.flatnonzero(kinds == np.bincount(kinds).argmax())
-    found = vd.PacketVector(
+    packet_vector = vd.PacketVector(
         [
             vd.VelodynePacket(received * 1e-9, data.tobytes())
             for received, data in zip(packets.received[usable].tolist(), packets.data[usable], strict=True)
@@ -40,7 +40,7 @@ def decode(packets: Packets) -> Any:
     # Each scan needs a new decoder: a decoder keeps the first model that it meets.
     decoder = vd.ScanDecoder(vd.Config(min_range=0.0, max_range=FAR))
     try:
-        _, points = decoder.decode(found, as_pcl_structs=True)
+        _, points = decoder.decode(packet_vector, as_pcl_structs=True)
     except RuntimeError as error:
         raise ValueError(f"velodyne-decoder does not take the packets ({first_line(error)})") from None
     # The library's times are relative to the last packet.

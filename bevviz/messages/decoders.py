@@ -85,13 +85,13 @@ def decoders() -> Mapping[str, Decoder]:
     Raises:
         UserError: a decoder of an installed package cannot be loaded.
     """
-    found: dict[str, Decoder] = {}
+    by_type: dict[str, Decoder] = {}
     points = [*(EntryPoint(name, name, GROUP) for name in BUILT_IN), *entry_points(group=GROUP)]
     for point in points:
         for decoder in _loaded(point):
             for msgtype in decoder.types:
-                found.setdefault(msgtype, decoder)
-    return found
+                by_type.setdefault(msgtype, decoder)
+    return by_type
 
 
 def _loaded(point: EntryPoint) -> Iterable[Decoder]:

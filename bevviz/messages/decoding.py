@@ -25,16 +25,16 @@ def stamp_ns(stamp: Any) -> int:
     return nanoseconds(stamp.sec, stamp.nanosec)
 
 
-def nanoseconds(seconds: Any, rest: Any) -> int:
+def nanoseconds(seconds: Any, fraction: Any) -> int:
     """Convert a stamp to nanoseconds.
 
     Raises:
         ValueError: the stamp does not fit into 64 bits.
     """
-    found = int(seconds) * 1_000_000_000 + int(rest)
-    if abs(found) > LATEST:
+    total = int(seconds) * 1_000_000_000 + int(fraction)
+    if abs(total) > LATEST:
         raise ValueError(f"a stamp of {seconds} s is too large")
-    return found
+    return total
 
 
 def text_of(value: Any) -> str:

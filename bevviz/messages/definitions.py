@@ -41,11 +41,11 @@ def store_of(name: str) -> Typestore:
         return _learned[name]
     package = name.partition("/")[0]
     try:
-        found = _installed(name, {})
+        types = _parse_installed(name, {})
         store = Typestore()
         store.fielddefs.update(known.fielddefs)
         store.types.update(known.types)
-        store.register(found)
+        store.register(types)
     except FileNotFoundError as error:
         place = Path(error.filename)
         raise UserError(
@@ -78,15 +78,15 @@ def learn(name: str, sources: Mapping[str, tuple[str, str]], digest: str) -> Non
                 raise UserError(f"it has no source of {kind}")
             types = get_types_from_msg(text, kind) if encoding == "msg" else get_types_from_idl(text)
             store.register({**types})
-        found = store.hash_rihs01(name)
+        actual = store.hash_rihs01(name)
     except (TypesysError, KeyError, ValueError) as error:
         raise UserError(f"its sources of {name} cannot be read: {error}") from None
-    if found != digest:
+    if actual != digest:
         raise UserError(f"its sources are of another {name}")
     _learned[name] = store
 
 
-def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:
+def _parse_installed(name: str, collected: dict[str, Any]) -> dict[str, Any]:
     """Parse the .msg file of an installed package, and those of the types in it."""
     package, _, short = name.split("/")
     for prefix in (*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix):
@@ -94,18 +94,18 @@ def _installed(name: str, found: dict[str, Any]) -> dict[str, Any]:
         if prefix and path.exists():
             break
     types = get_types_from_msg(path.read_text(encoding="utf-8"), name)
-    found.update(types)
+    collected.update(types)
     for _, fields in types.values():
         for _, field in fields:
-            kind = _named(field)
-            if kind is not None and kind not in found and kind not in typestore().types:
-                _installed(kind, found)
-    return found
+            kind = _type_of_field(field)
+            if kind is not None and kind not in collected and kind not in typestore().types:
+                _parse_installed(kind, collected)
+    return collected
 
 
-def _named(field: Any) -> str | None:
+def _type_of_field(field: Any) -> str | None:
     """Return the message type of a field, or of its elements; None for basic types."""
     kind, content = field
     if kind.name == "NAME":
         return str(content)
-    return _named(content[0]) if kind.name in ("ARRAY", "SEQUENCE") else None
+    return _type_of_field(content[0]) if kind.name in ("ARRAY", "SEQUENCE") else None

@@ -36,19 +36,19 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         x, y, theta, w, h = values
         return why_unusable((x, y, theta, w, h, 0.0))
 
-    found = _rows(msg, row, 5, why)
-    x, y, theta, w, h = found.values.T
+    rows = _rows(msg, row, 5, why)
+    x, y, theta, w, h = rows.values.T
     cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
     return LabelledBoxes2D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id) or next(iter(found.frames), ""),
+        frame_id=frame_name(msg.header.frame_id) or next(iter(rows.frames), ""),
         xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
-        labels=found.labels,
-        scores=found.scores,
+        labels=rows.labels,
+        scores=rows.scores,
         received=received,
-        unusable=found.unusable,
+        unusable=rows.unusable,
     )
 
 
@@ -75,22 +75,22 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
         p, q = center.position, center.orientation
         return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
 
-    found = _rows(msg, row, 10, why_unusable)
+    rows = _rows(msg, row, 10, why_unusable)
     stated = frame_name(msg.header.frame_id)
-    boxes, turns = turned_boxes(found.values)
+    boxes, turns = turned_boxes(rows.values)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp) or (0 if len(boxes) else received),
-        frame_id=stated or next(iter(found.frames), ""),
+        frame_id=stated or next(iter(rows.frames), ""),
         boxes=boxes,
-        labels=found.labels,
-        scores=found.scores,
+        labels=rows.labels,
+        scores=rows.scores,
         received=received,
-        ids=found.ids if all(found.ids) else (),
-        image=_image_labels(msg, found.usable),
+        ids=rows.ids if all(rows.ids) else (),
+        image=_image_labels(msg, rows.usable),
         turns=turns,
-        frames=found.frames if not stated and len(set(found.frames)) > 1 else (),
-        unusable=(*map(str, getattr(msg, "unusable", ())), *found.unusable),
+        frames=rows.frames if not stated and len(set(rows.frames)) > 1 else (),
+        unusable=(*map(str, getattr(msg, "unusable", ())), *rows.unusable),
     )
 
 
@@ -136,7 +136,7 @@ def _rows(
         for number, ((_, label, _, identity, _), reason) in enumerate(zip(rows, reasons, strict=True))
         if reason
     ]
-    kept = [found for found, reason in zip(rows, reasons, strict=True) if not reason]
+    kept = [numbers for numbers, reason in zip(rows, reasons, strict=True) if not reason]
     return _Rows(
         np.array([values for values, *_ in kept], np.float64).reshape(-1, width),
         tuple(label for _, label, *_ in kept),

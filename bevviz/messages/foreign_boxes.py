@@ -119,8 +119,8 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
             unusable.append(f"{name_box(number, label, identity)}: {why}")
             continue
         rows.append(row)
-        own = getattr(item, "header", None)
-        headers.append(header if own is None or (header and header.frame_id) else own)
+        item_header = getattr(item, "header", None)
+        headers.append(header if item_header is None or (header and header.frame_id) else item_header)
         labels.append(label)
         scores.append(_read(float, item, where.score) if _has(item, where.score) else 1.0)
         ids.append(identity)
@@ -190,7 +190,7 @@ def _boxes(
     boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
     header = next(iter(headers), None)
     stamp = received if header is None else stamp_ns(header.stamp)
-    frames = tuple("" if one is None else frame_name(str(one.frame_id)) for one in headers)
+    frames = tuple("" if about is None else frame_name(str(about.frame_id)) for about in headers)
     return LabelledBoxes3D(
         topic=topic,
         stamp=stamp,
@@ -251,12 +251,12 @@ def _follow(item: Any, path: str) -> tuple[Any, Any]:
     holder, value = item, item
     for name in path.split("."):
         holder = _likeliest(value)
-        found = next((one for one in name.split("|") if hasattr(holder, one)), None)
-        if found is None:
+        attribute = next((option for option in name.split("|") if hasattr(holder, option)), None)
+        if attribute is None:
             raise ValueError(
                 f"no field {name} (of {path}); there are {', '.join(field_names(holder) or ['none'])}"
             )
-        value = getattr(holder, found)
+        value = getattr(holder, attribute)
     return holder, value
 
 
@@ -286,7 +286,11 @@ def _likeliest(value: Any) -> Any:
         return value
     if not value:
         return None
-    return max(value, key=lambda one: float(getattr(one, "probability", getattr(one, "score", 0.0))))
+    return max(value, key=_probability)
+
+
+def _probability(candidate: Any) -> float:
+    return float(getattr(candidate, "probability", getattr(candidate, "score", 0.0)))
 
 
 def _only_list(msg: Any) -> Any:

@@ -45,8 +45,8 @@ _MODELS = {"kannala_brandt": "equidistant"}
 
 def short_of(msgtype: str) -> str:
     """Return ``PointCloud`` for ``foxglove.PointCloud`` and ``foxglove_msgs/msg/PointCloud``; else ""."""
-    found = TYPE.match(msgtype)
-    return found.group(1) if found and found.group(1) in KINDS else ""
+    match = TYPE.match(msgtype)
+    return match.group(1) if match and match.group(1) in KINDS else ""
 
 
 def parse(data: bytes | memoryview, msgtype: str, encoding: str, schema: str) -> Any:
@@ -74,13 +74,13 @@ def _message_class(msgtype: str, schema: str) -> Callable[[], Any]:
 
     files = descriptor_pb2.FileDescriptorSet.FromString(schema.encode("latin-1"))
     pool = descriptor_pool.DescriptorPool()
-    for file in _in_order(files.file):
+    for file in _sorted_files(files.file):
         pool.Add(file)
     made: Callable[[], Any] = message_factory.GetMessageClass(pool.FindMessageTypeByName(msgtype))
     return made
 
 
-def _in_order(files: Iterable[Any]) -> list[Any]:
+def _sorted_files(files: Iterable[Any]) -> list[Any]:
     """Sort files so that each comes after the files that it needs."""
     waiting = {file.name: file for file in files}
     ordered: list[Any] = []
@@ -132,14 +132,14 @@ def _stamp(message: Any) -> int:
     time = getattr(message, "timestamp", None)
     if time is None:
         return 0
-    seconds, rest = _first(time, "seconds", "sec"), _first(time, "nanos", "nsec", "nanosec")
+    seconds, rest = _first_field(time, "seconds", "sec"), _first_field(time, "nanos", "nsec", "nanosec")
     try:
         return nanoseconds(seconds or 0, rest or 0)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"the field 'timestamp' is no time: {seconds!r} s and {rest!r} ns") from None
 
 
-def _first(message: Any, *names: str) -> Any:
+def _first_field(message: Any, *names: str) -> Any:
     """Return the first of these fields that exists."""
     return next((v for n in names if (v := getattr(message, n, None)) is not None), None)
 
@@ -160,22 +160,22 @@ def _header(message: Any) -> Any:
 
 
 def _cloud(message: Any) -> Any:
-    data, step = _data(message), _whole(message, "point_stride")
+    data, step = _data(message), _integer(message, "point_stride")
     fields = [
         make(
             "sensor_msgs/msg/PointField",
             name=str(field.name),
-            offset=_whole(field, "offset"),
-            datatype=_POINT_FIELD.get(_whole(field, "type"), 0),
+            offset=_integer(field, "offset"),
+            datatype=_POINT_FIELD.get(_integer(field, "type"), 0),
             count=1,
         )
         for field in message.fields or ()
     ]
     count = len(data) // step if step > 0 else 0
-    pose = _matrix(message.pose) if _given(message, "pose") else np.eye(4)
+    pose = _matrix(message.pose) if _is_set(message, "pose") else np.eye(4)
     values = np.frombuffer(data, np.uint8)
     if not np.array_equal(pose, np.eye(4)):
-        values = _moved(values, step, fields, pose)
+        values = _transform_points(values, step, fields, pose)
     return make(
         "sensor_msgs/msg/PointCloud2",
         header=_header(message),
@@ -190,7 +190,7 @@ def _cloud(message: Any) -> Any:
     )
 
 
-def _moved(data: U8, step: int, fields: Iterable[Any], pose: F64) -> U8:
+def _transform_points(data: U8, step: int, fields: Iterable[Any], pose: F64) -> U8:
     """Transform points of ``step`` bytes into the frame of the message."""
     at = {field.name: field for field in fields if field.name in _AXES and field.datatype in _FLOATS}
     if len(at) < len(_AXES):
@@ -225,11 +225,11 @@ def _raw(message: Any) -> Any:
     return make(
         "sensor_msgs/msg/Image",
         header=_header(message),
-        height=_whole(message, "height"),
-        width=_whole(message, "width"),
+        height=_integer(message, "height"),
+        width=_integer(message, "width"),
         encoding=str(message.encoding or ""),
         is_bigendian=0,
-        step=_whole(message, "step"),
+        step=_integer(message, "step"),
         data=np.frombuffer(_data(message), np.uint8),
     )
 
@@ -239,13 +239,13 @@ def _calibration(message: Any) -> Any:
     if k.size != 9:
         raise ValueError("K has not the nine numbers of a matrix")
     model = str(message.distortion_model or "")
-    size = _whole(message, "width"), _whole(message, "height")
+    size = _integer(message, "width"), _integer(message, "height")
     return encode_camera(_header(message), size, _MODELS.get(model, model), d, k, p)
 
 
 def _matrix_of(message: Any, name: str) -> F64:
     """Return the numbers of a field, which the ROS definition spells in lower case."""
-    return np.array(_first(message, name, name.lower()) or [], np.float64)
+    return np.array(_first_field(message, name, name.lower()) or [], np.float64)
 
 
 def _transforms(message: Any) -> Any:
@@ -254,32 +254,32 @@ def _transforms(message: Any) -> Any:
     )
     edges = []
     for item in items:
-        place = _pose_of(item.translation if _given(item, "translation") else None, item.rotation)
+        place = _pose_of(item.translation if _is_set(item, "translation") else None, item.rotation)
         edges.append((_header(item), str(item.child_frame_id or ""), place))
     return encode_pose_edges(edges)
 
 
 def _scene(message: Any) -> Any:
     """Convert cubes and cylinders to boxes in the frame of their entity. Boxes enclose the cylinders."""
-    found = []
+    boxes = []
     for entity in message.entities or ():
         for solid in (*(entity.cubes or ()), *(entity.cylinders or ())):
-            pose = _matrix(solid.pose) if _given(solid, "pose") else np.eye(4)
+            pose = _matrix(solid.pose) if _is_set(solid, "pose") else np.eye(4)
             size, results = _numbers(solid.size, "xyz"), [(_label(entity), 1.0)]
-            found.append(encode_box_3d(_header(entity), pose, size, results, str(entity.id or "")))
-    time = next((one.header.stamp for one in found), _header(message).stamp)
+            boxes.append(encode_box_3d(_header(entity), pose, size, results, str(entity.id or "")))
+    time = next((box_message.header.stamp for box_message in boxes), _header(message).stamp)
     header = make("std_msgs/msg/Header", stamp=time, frame_id="")
-    return make("vision_msgs/msg/Detection3DArray", header=header, detections=found)
+    return make("vision_msgs/msg/Detection3DArray", header=header, detections=boxes)
 
 
 def _label(entity: Any) -> str:
     """Return the class in the metadata of an entity; else its first text; else an empty text."""
     stated = {str(pair.key).lower(): str(pair.value) for pair in entity.metadata or ()}
-    told = next((stated[name] for name in _LABELS if name in stated), "")
-    return told or next((str(text.text) for text in entity.texts or ()), "")
+    label = next((stated[name] for name in _LABELS if name in stated), "")
+    return label or next((str(text.text) for text in entity.texts or ()), "")
 
 
-def _given(message: Any, name: str) -> bool:
+def _is_set(message: Any, name: str) -> bool:
     """Return whether a field that is a message was set."""
     if isinstance(message, _Fields) or not hasattr(message, "HasField"):
         return getattr(message, name, None) is not None
@@ -301,7 +301,7 @@ def _numbers(message: Any, names: str) -> list[float]:
     return [_number(message, name, float) for name in names]
 
 
-def _whole(message: Any, name: str) -> int:
+def _integer(message: Any, name: str) -> int:
     return int(_number(message, name, int))
 
 

@@ -54,8 +54,8 @@ def _layer(array: Any, what: str) -> F32:
     if len(dims) != 2 or dims[0].size * dims[1].size != len(values) - array.layout.data_offset:
         sizes = " x ".join(str(dim.size) for dim in dims)
         raise MessageError(f"{what}: {len(values)} values in {sizes or 'no'} cells")
-    found = values[array.layout.data_offset :].reshape(dims[0].size, dims[1].size)
-    return found if dims[0].label == "row_index" else found.T
+    cells = values[array.layout.data_offset :].reshape(dims[0].size, dims[1].size)
+    return cells if dims[0].label == "row_index" else cells.T
 
 
 def _surface(values: F32, x: F64, y: F64, pose: F64, *, flat: bool) -> Surface | None:

@@ -99,9 +99,9 @@ def decode_message(
 def _reason(error: Exception, content: Any, msgtype: str) -> str:
     """Describe the fault in the content of a message, in a few words."""
     if isinstance(error, AttributeError) and (names := field_names(error.obj)) is not None:
-        there = ", ".join(names) or "none"
+        existing = ", ".join(names) or "none"
         part = "it" if error.obj is content else f"a {_type_of(error.obj) or 'message'} in it"
-        return f"{part} has no field '{error.name}'; there are {there}"
+        return f"{part} has no field '{error.name}'; there are {existing}"
     if wrong := next(_wrong_fields(content, msgtype, ""), ""):
         return wrong
     kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "

@@ -201,8 +201,8 @@ def find_roles(
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
     around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
     if results:
-        free = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]
-        around += [(t.name, "shape", t.kind) for t in free if RESULTS[t.kind].search(t.name)]
+        unused = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]
+        around += [(t.name, "shape", t.kind) for t in unused if RESULTS[t.kind].search(t.name)]
     helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
     notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
@@ -234,8 +234,8 @@ def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topi
     Robots of one kind have equal frame names, so their transforms must not be mixed.
     """
     namespace = topic.name.rpartition("/")[0] + "/"
-    own = [t for t in of_kind(topics, "PointCloud2", *IMAGES) if t.name.startswith(namespace)]
-    return bool(own and used) and not any(t in used for t in own)
+    sensors = [t for t in of_kind(topics, "PointCloud2", *IMAGES) if t.name.startswith(namespace)]
+    return bool(sensors and used) and not any(t in used for t in sensors)
 
 
 def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
@@ -250,20 +250,20 @@ def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
 
 
 def _no_lidar(topics: Sequence[Topic]) -> str:
-    said = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
-    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "LiDAR"))]:
-        return f"{said}; {'; '.join(held)}"
-    if taken := names_of(of_kind(topics, "PointCloud2")):
-        return f"no LiDAR: {', '.join(taken)} is the result of a stage"
+    summary = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
+    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "LiDAR"))]:
+        return f"{summary}; {'; '.join(unsupported)}"
+    if clouds := names_of(of_kind(topics, "PointCloud2")):
+        return f"no LiDAR: {', '.join(clouds)} is the result of a stage"
     if len(topics) > MANY:
-        return f"{said}; 'bevviz info' shows them"
-    return f"{said}; there are {', '.join(f'{t.name} ({t.kind})' for t in topics) or 'none'}"
+        return f"{summary}; 'bevviz info' shows them"
+    return f"{summary}; there are {', '.join(f'{t.name} ({t.kind})' for t in topics) or 'none'}"
 
 
 def _no_camera(topics: Sequence[Topic]) -> str:
     images = of_kind(topics, *IMAGES)
-    if held := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "camera"))]:
-        return f"no camera that can be read: {'; '.join(held)}"
+    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "camera"))]:
+        return f"no camera that can be read: {'; '.join(unsupported)}"
     if with_messages := names_of(t for t in images if t.count != 0):
         return f"no camera among the images: --set source.camera_topics=[{with_messages[0]}]"
     if images:

@@ -70,7 +70,7 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
     if best in (2, 3):
         candidates = candidates[:1]  # results are not merged like sensors
-    chosen = _one_a_frame(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")
+    chosen = _one_per_sensor(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")
     return sorted(chosen, key=lambda t: t.name)
 
 
@@ -92,7 +92,7 @@ def _is_moved(topic: Topic, base_frame: str) -> bool:
     return topic.frame_id.lower() in (base_frame, "base_link", "base_footprint")
 
 
-def _one_a_frame(
+def _one_per_sensor(
     candidates: Iterable[Topic], sensor: Callable[[Topic], str], notes: dict[str, str], why: str
 ) -> list[Topic]:
     """Choose the first candidate of each sensor. Add the reason for each candidate to ``notes``."""
@@ -153,7 +153,7 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
         )
 
     usable.sort(key=distance)
-    chosen = _one_a_frame(usable, lambda t: t.frame_id or _stem(t.name), notes, "camera, by type and name")
+    chosen = _one_per_sensor(usable, lambda t: t.frame_id or _stem(t.name), notes, "camera, by type and name")
     return sorted(chosen, key=lambda t: t.name)
 
 

@@ -39,12 +39,12 @@ def decode_mark(msg: Any) -> str:
 
 def decode_statuses(msg: Any) -> list[Status]:
     """Return the statuses of a diagnostic_msgs/DiagnosticArray."""
-    found = []
+    statuses = []
     for status in msg.status:
         number = int(status.level)
         level = LEVELS[number] if 0 <= number < len(LEVELS) else "error"
-        found.append(Status(text_of(status.name), level, text_of(status.message)))
-    return found
+        statuses.append(Status(text_of(status.name), level, text_of(status.message)))
+    return statuses
 
 
 def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
@@ -79,13 +79,13 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[Shape]:
         points = directions[within] * ranges[within, None]
         return [Shape(*about, points=points.astype(np.float32))]
     if short == "Path":
-        way = np.array([[*_xyz(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
-        return [Shape(*about, strips=(way,))] if len(way) else []
+        positions = np.array([[*_xyz(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
+        return [Shape(*about, strips=(positions,))] if len(positions) else []
     if short == "PoseStamped":
         return [Shape(*about, axes=_pose(msg.pose))]
     if short == "NavSatFix":
-        there = np.isfinite([msg.latitude, msg.longitude]).all() and msg.status.status >= 0
-        return [Shape(*about, fix=(float(msg.latitude), float(msg.longitude)))] if there else []
+        has_fix = np.isfinite([msg.latitude, msg.longitude]).all() and msg.status.status >= 0
+        return [Shape(*about, fix=(float(msg.latitude), float(msg.longitude)))] if has_fix else []
     return [Shape(*about, grid=_grid(msg, topic))]
 
 
@@ -103,13 +103,13 @@ _CUBE, _SPHERE, _CYLINDER, _STRIP, _LINES, _CUBES, _SPHERES, _POINTS, _TEXT = 1,
 
 def _markers(markers: Sequence[Any], topic: str) -> list[Shape]:
     """Return a shape for each marker with the action ADD. A deleted marker disappears with the next array."""
-    found = []
+    shapes = []
     for marker in markers:
         if marker.action == 0:
             stamp = stamp_ns(marker.header.stamp)
             shape = _marker(marker, f"{topic}/{marker.ns}/{marker.id}", marker.header.frame_id, stamp)
-            found += [] if shape is None else [shape]
-    return found
+            shapes += [] if shape is None else [shape]
+    return shapes
 
 
 def _marker(marker: Any, name: str, frame: str, stamp: int) -> Shape | None:

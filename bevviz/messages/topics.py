@@ -104,7 +104,10 @@ def foreign(topic: Topic, sensor: str = "") -> str:
         return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != NOT_LIDAR) else ""
     if decoder is not None and sensor in ("", "LiDAR") and (why := decoder.missing()):
         return why
-    return next((why for of, kind, why in _FOREIGN if sensor in ("", of) and kind.search(topic.type)), "")
+    for name, types, reason in _FOREIGN:
+        if sensor in ("", name) and types.search(topic.type):
+            return reason
+    return ""
 
 
 def names_of(topics: Iterable[Topic]) -> tuple[str, ...]:
@@ -137,8 +140,8 @@ def stated_topic(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> T
             helps = f"; it holds {why}" if why else ""
             raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}{helps}")
     near = difflib.get_close_matches(name, names_of(fitting), n=3, cutoff=0.4) or names_of(fitting)
-    there = f"the nearest are {', '.join(near)}" if near else f"there is no {' or '.join(kinds)} topic"
-    raise UserError(f"{key}: there is no topic {name}; {there}")
+    hint = f"the nearest are {', '.join(near)}" if near else f"there is no {' or '.join(kinds)} topic"
+    raise UserError(f"{key}: there is no topic {name}; {hint}")
 
 
 # --- names -------------------------------------------------------------------------------------

@@ -38,10 +38,10 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     """
     transforms, problems = [], []
     for item in msg.transforms:
-        moved = item.transform
+        transform = item.transform
         try:
             transforms.append(
-                _stamped(item.header, item.child_frame_id, moved.translation, moved.rotation, topic)
+                _stamped(item.header, item.child_frame_id, transform.translation, transform.rotation, topic)
             )
         except MessageError as error:
             problems.append(error)
@@ -86,23 +86,25 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
     """
     if msg.linear_acceleration_covariance[0] == -1:
         raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
-    felt = msg.linear_acceleration
+    measured = msg.linear_acceleration
     return Acceleration(
         stamp_ns(msg.header.stamp),
         frame_name(msg.header.frame_id),
-        np.array([felt.x, felt.y, felt.z], np.float64),
+        np.array([measured.x, measured.y, measured.z], np.float64),
     )
 
 
 def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
     """Return rotation rate, acceleration and stamp of a sensor_msgs/Imu. Missing values are NaN."""
     none = (math.nan, math.nan, math.nan)
-    turn, felt = msg.angular_velocity, msg.linear_acceleration
+    rotation, acceleration = msg.angular_velocity, msg.linear_acceleration
     return (
-        none if msg.angular_velocity_covariance[0] == -1 else (float(turn.x), float(turn.y), float(turn.z)),
+        none
+        if msg.angular_velocity_covariance[0] == -1
+        else (float(rotation.x), float(rotation.y), float(rotation.z)),
         none
         if msg.linear_acceleration_covariance[0] == -1
-        else (float(felt.x), float(felt.y), float(felt.z)),
+        else (float(acceleration.x), float(acceleration.y), float(acceleration.z)),
         stamp_ns(msg.header.stamp),
     )
 

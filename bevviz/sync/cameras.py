@@ -15,9 +15,9 @@ from bevviz.messages.roles import Roles
 from bevviz.messages.sensors import CameraRole
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Image, Intrinsics
-from bevviz.sync.pose_lookup import Place, Placing
+from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
-from bevviz.sync.topic_buffer import Track, too_far
+from bevviz.sync.topic_buffer import TopicBuffer, describe_distance
 from bevviz.sync.transform_tree import TransformError
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
@@ -25,7 +25,7 @@ MOST_OFF = 0.2  # farthest principal point from the image centre without a warni
 
 
 @dataclass(frozen=True, slots=True)
-class Undecoded:
+class UndecodedImage:
     """Image that is not decoded yet.
 
     Attributes:
@@ -56,16 +56,18 @@ class Cameras:
     """
 
     def __init__(
-        self, roles: Roles, config: Config, report: SyncReport, placing: Placing, horizon: int
+        self, roles: Roles, config: Config, report: SyncReport, placing: PoseLookup, horizon: int
     ) -> None:
         self._roles, self._config, self._report, self._placing = roles, config, report, placing
         self._driver, self._horizon = roles.driver, horizon
         self._tolerance = round(config.sync.tolerance * 1e9)
         self._tf = report.tf
-        self.images: dict[str, Track[Undecoded]] = {c.topic: Track(horizon) for c in roles.cameras}
+        self.images: dict[str, TopicBuffer[UndecodedImage]] = {
+            c.topic: TopicBuffer(horizon) for c in roles.cameras
+        }
         self.frames: dict[str, str] = {}
         self.intrinsics: dict[str, Intrinsics] = {}
-        self._infos: dict[str, Track[Intrinsics]] = {}  # by topic
+        self._infos: dict[str, TopicBuffer[Intrinsics]] = {}  # by topic
         self._refused: dict[str, str] = {}  # why the calibrations of a topic cannot be used
         self._info_counts: Counter[str] = Counter()
         self._image_counts: Counter[str] = Counter()
@@ -79,13 +81,13 @@ class Cameras:
         """Add an image. Return whether it replaces an image with the same stamp."""
         self.frames[topic] = frame_id
         self._image_counts[topic] += 1
-        return self.images[topic].add(stamp, Undecoded(stamp, frame_id, load))
+        return self.images[topic].add(stamp, UndecodedImage(stamp, frame_id, load))
 
     def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics) -> None:
         """Add a calibration. An image uses the calibration with the nearest stamp."""
         self.intrinsics[topic] = intrinsics
         self._info_counts[topic] += 1
-        self._infos.setdefault(topic, Track(self._horizon)).add(stamp, intrinsics)
+        self._infos.setdefault(topic, TopicBuffer(self._horizon)).add(stamp, intrinsics)
 
     def refuse_info(self, topic: str, reason: str) -> None:
         """Note why the calibrations of a topic cannot be used."""
@@ -93,25 +95,25 @@ class Cameras:
 
     def info_reaches(self, role: CameraRole, stamp: int, absent: Collection[str]) -> bool:
         """Return whether the calibration of the image at a stamp has come, if each image has its own."""
-        track, image = self._infos.get(role.info_topic), self.images[role.topic].nearest(stamp)
-        if track is None or track.newest is None or image is None or role.info_topic in absent:
+        buffer, image = self._infos.get(role.info_topic), self.images[role.topic].nearest(stamp)
+        if buffer is None or buffer.newest is None or image is None or role.info_topic in absent:
             return True
         one_each = self._info_counts[role.info_topic] * 2 > self._image_counts[role.topic] > 1
-        return not one_each or track.newest >= image[0]
+        return not one_each or buffer.newest >= image[0]
 
-    def at(self, role: CameraRole, place: Place) -> Camera:
+    def at(self, role: CameraRole, reference: ReferenceFrames) -> Camera:
         """Return the camera of a frame: image, calibration and pose, with a sentence for each problem."""
         problems: list[str] = []
-        image, stamp = self._image(role, place.stamp, problems)
+        image, stamp = self._image(role, reference.stamp, problems)
         intrinsics = self._camera_intrinsics(role, image, stamp, problems)
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
-            camera = replace(camera, sync_error=(stamp - place.stamp) * 1e-9)
-            off = self._report.clocks.apart(role.topic, self._driver)
-            if off:
+            camera = replace(camera, sync_error=(stamp - reference.stamp) * 1e-9)
+            offset = self._report.clocks.apart(role.topic, self._driver)
+            if offset:
                 self._report.complain(
                     problems,
-                    f"the clocks of camera '{role.name}' and the LiDAR are {abs(off):.2f} s apart: "
+                    f"the clocks of camera '{role.name}' and the LiDAR are {abs(offset):.2f} s apart: "
                     f"its image is of another time",
                 )
                 camera = replace(camera, problems=tuple(problems))
@@ -119,26 +121,26 @@ class Cameras:
         if frame is None:
             return camera
         try:
-            found, compensated = self._placing.moved(place, stamp, frame)
+            lookup, compensated = self._placing.moved(reference, stamp, frame)
         except TransformError as error:
-            lacking = frame and place.points_frame and not self._tf.knows(place.points_frame, frame)
+            lacking = frame and reference.points_frame and not self._tf.knows(reference.points_frame, frame)
             self._report.complain(
                 problems, f"{error}; source.extrinsics can state it" if lacking else str(error)
             )
             return replace(camera, problems=tuple(problems))
-        if image is not None and not compensated and self._placing.compensates(place):
+        if image is not None and not compensated and self._placing.compensates(reference):
             self._report.complain(
-                problems, f"no motion compensation: '{place.inertial_frame}' is out of reach"
+                problems, f"no motion compensation: '{reference.inertial_frame}' is out of reach"
             )
-        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        world = np.eye(4) if reference.world_from_points is None else reference.world_from_points
         first_from_camera = self._second_of_stereo(role, intrinsics, frame)
-        points_from_camera = found.matrix @ first_from_camera
-        mounting = self._placing.mounting(place, frame) if compensated else None
+        points_from_camera = lookup.matrix @ first_from_camera
+        mounting = self._placing.mounting(reference, frame) if compensated else None
         return replace(
             camera,
             camera_from_points=geometry.inverse(points_from_camera),
             world_from_camera=world @ points_from_camera,
-            tf_age=found.age,
+            tf_age=lookup.age,
             motion_compensated=compensated,
             mounting=None if mounting is None else geometry.inverse(first_from_camera) @ mounting,
             problems=tuple(problems),
@@ -153,7 +155,7 @@ class Cameras:
         pose = np.eye(4)
         if intrinsics is None or intrinsics.baseline == (0.0, 0.0):
             return pose
-        if any(there == frame for topic, there in self.frames.items() if topic != role.topic):
+        if any(other_frame == frame for topic, other_frame in self.frames.items() if topic != role.topic):
             pose[:2, 3] = intrinsics.baseline
         else:
             self._report.oddities.setdefault(
@@ -168,7 +170,9 @@ class Cameras:
         nearest = self.images[role.topic].nearest(stamp)
         if nearest is None or abs(nearest[0] - stamp) > self._tolerance:
             self._report.without_image[role.name] += 1
-            problems.append(f"no image of camera '{role.name}' {too_far(nearest, stamp, self._tolerance)}")
+            problems.append(
+                f"no image of camera '{role.name}' {describe_distance(nearest, stamp, self._tolerance)}"
+            )
             return None, stamp
         try:
             image = replace(nearest[1].load(), stamp=nearest[0])

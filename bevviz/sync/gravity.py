@@ -44,7 +44,7 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(slots=True)
-class Upright:
+class VerticalEstimate:
     """Estimate of the vertical during a drive.
 
     Args:
@@ -68,15 +68,15 @@ class Upright:
     # LiDAR frames that are turned; they stay so during the drive.
     _tilted: set[str] = field(default_factory=set)
 
-    def add_acceleration(self, felt: Acceleration) -> None:
+    def add_acceleration(self, sample: Acceleration) -> None:
         """Add an acceleration of an Imu. At rest it points up."""
-        norm = float(np.linalg.norm(felt.acceleration))
+        norm = float(np.linalg.norm(sample.acceleration))
         if not math.isfinite(norm) or norm == 0:
             return
-        frame, now = felt.frame_id.lstrip("/"), felt.acceleration / norm
-        stamp, mean = self._gravity.get(frame, (felt.stamp, now))
-        share = min(1.0, max(0.0, (felt.stamp - stamp) * 1e-9 / GRAVITY_TIME))
-        self._gravity[frame] = felt.stamp, mean + share * (now - mean)
+        frame, now = sample.frame_id.lstrip("/"), sample.acceleration / norm
+        stamp, mean = self._gravity.get(frame, (sample.stamp, now))
+        share = min(1.0, max(0.0, (sample.stamp - stamp) * 1e-9 / GRAVITY_TIME))
+        self._gravity[frame] = sample.stamp, mean + share * (now - mean)
 
     def turn(self, cloud: Cloud, fixed_frame: str) -> F64 | None:
         """Return the (4, 4) rotation that makes the points of a LiDAR upright; None if they are.
@@ -87,17 +87,18 @@ class Upright:
         """
         frame = cloud.frame_id.lstrip("/")
         base = self._rotation(self.base_frame, frame, cloud.stamp)
-        up, who = (
+        up, source = (
             (base[2], f"'{self.base_frame}'") if base is not None else self._up(cloud, frame, fixed_frame)
         )
-        self.needs_gravity = up is None or who.startswith("gravity")
+        self.needs_gravity = up is None or source.startswith("gravity")
         ground = self._seen_ground(cloud, frame)
         if up is None:
-            return self._by_ground(frame, ground)
+            return self._turn_by_ground(frame, ground)
         if ground is not None and _angle(up, ground) > DISAGREEMENT:
             self.warnings[frame] = (
                 f"the ground that LiDAR frame '{frame}' sees is tilted by {_degrees(up, ground):.0f} degrees "
-                f"against the vertical of {who}: one of them is wrong (source.extrinsics states transforms)"
+                f"against the vertical of {source}: one of them is wrong "
+                "(source.extrinsics states transforms)"
             )
         if _angle(up, _Z) > (TILT if base is not None else SLOPE):
             self._tilted.add(frame)
@@ -111,14 +112,14 @@ class Upright:
         if world is not None:
             down = "ned" in re.split(r"[/_]", fixed_frame.lower())
             return (-world[2] if down else world[2]), f"'{fixed_frame}'"
-        for there, (_, felt) in self._gravity.items():
-            turned = np.eye(3) if there == frame else self._rotation(frame, there, cloud.stamp)
-            if turned is not None:
-                up = turned @ felt
-                return up / np.linalg.norm(up), f"gravity, as '{there}' feels it"
+        for imu_frame, (_, acceleration) in self._gravity.items():
+            rotation = np.eye(3) if imu_frame == frame else self._rotation(frame, imu_frame, cloud.stamp)
+            if rotation is not None:
+                up = rotation @ acceleration
+                return up / np.linalg.norm(up), f"gravity, as '{imu_frame}' feels it"
         return None, ""
 
-    def _by_ground(self, frame: str, ground: F64 | None) -> F64 | None:
+    def _turn_by_ground(self, frame: str, ground: F64 | None) -> F64 | None:
         """Return the rotation that makes the ground level. Warn, because no transform states it."""
         if ground is None:
             if self._tries[frame] == TRIES:
@@ -149,9 +150,9 @@ class Upright:
         """Return the up direction by the ground. Only the first scans of a LiDAR are searched for it."""
         if frame not in self._ground and self._tries.setdefault(frame, 0) < TRIES:
             self._tries[frame] += 1
-            found = ground_normal(cloud.xyz)
-            if found is not None:
-                self._ground[frame] = found
+            normal = ground_normal(cloud.xyz)
+            if normal is not None:
+                self._ground[frame] = normal
         return self._ground.get(frame)
 
 
@@ -183,7 +184,8 @@ def ground_normal(points: F32) -> F64 | None:
     # Otherwise few planes of a small floor are drawn.
     low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]
     normals, heights = (
-        np.concatenate(pair) for pair in zip(*(_planes(some, random) for some in (sample, low)), strict=True)
+        np.concatenate(pair)
+        for pair in zip(*(_planes(drawn, random) for drawn in (sample, low)), strict=True)
     )
     distance = sample @ normals.T + heights  # (points, planes) height above the plane
     support = (np.abs(distance) < THICKNESS).mean(axis=0)

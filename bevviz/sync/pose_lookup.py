@@ -14,9 +14,9 @@ from bevviz.errors import UserError
 from bevviz.messages.transforms import StampedTransform
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Cloud, Frame, LabelledBoxes3D
-from bevviz.sync.gravity import Upright
+from bevviz.sync.gravity import VerticalEstimate
 from bevviz.sync.report import SyncReport
-from bevviz.sync.transform_tree import Lookup, Origin, TransformError
+from bevviz.sync.transform_tree import Origin, TransformError, TransformResult
 
 FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
 GLOBE_FRAMES = {"earth", "ecef", "utm"}  # their coordinates are too large for the float32 of a viewer
@@ -24,7 +24,7 @@ LEVEL = math.cos(math.radians(20))  # boxes in a frame that leans less, as on a 
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ReferenceFrames:
     """Reference frames of the points of a frame.
 
     Attributes:
@@ -45,7 +45,7 @@ class Place:
     world_from_points: F64 | None = None
     tf_age: float = float("nan")
 
-    def points_from(self, frame: Lookup) -> Lookup:
+    def points_from(self, frame: TransformResult) -> TransformResult:
         """Convert a transform to ``points_frame`` into one to the points."""
         return frame if self.upright is None else replace(frame, matrix=self.upright @ frame.matrix)
 
@@ -54,7 +54,7 @@ class Place:
         return matrix if self.upright is None else matrix @ geometry.inverse(self.upright)
 
 
-class Placing:
+class PoseLookup:
     """Finder of poses: the reference frames of each cloud, and the transforms to them.
 
     Args:
@@ -69,7 +69,7 @@ class Placing:
     """
 
     def __init__(
-        self, config: Config, report: SyncReport, upright: Upright, *, turned: bool, merged: bool
+        self, config: Config, report: SyncReport, upright: VerticalEstimate, *, turned: bool, merged: bool
     ) -> None:
         self._config, self._report, self._upright = config, report, upright
         self._tf = report.tf
@@ -78,24 +78,24 @@ class Placing:
         for names, pose in config.source.extrinsics.items():
             self._tf.add(_extrinsic(names, pose), static=True, origin=Origin.CONFIG)
 
-    def take_over(self, former: Placing) -> None:
+    def take_over(self, former: PoseLookup) -> None:
         """Continue with the transforms of ``former``."""
         self._report, self._upright, self._tf = former._report, former._upright, former._tf
         self.odometry_frames = former.odometry_frames
 
-    def of(self, cloud: Cloud, problems: list[str] | None = None) -> Place:
+    def of(self, cloud: Cloud, problems: list[str] | None = None) -> ReferenceFrames:
         """Find the reference frames of a cloud. With ``problems``, also find its pose in the world."""
         points_frame = cloud.frame_id.lstrip("/")
         base = self._config.source.base_frame
         if self._merged and self._tf.knows(base, points_frame):
             points_frame = base
         world, inertial = self.fixed(points_frame)
-        place = Place(cloud.stamp, points_frame, world, inertial)
+        reference = ReferenceFrames(cloud.stamp, points_frame, world, inertial)
         if problems is None:
-            return place
+            return reference
         turn = self._upright.turn(cloud, world) if self._turned else None
         if points_frame == cloud.frame_id.lstrip("/"):
-            place = replace(place, upright=turn)
+            reference = replace(reference, upright=turn)
         if self._merged and points_frame != base:
             self._report.complain(
                 problems,
@@ -103,27 +103,27 @@ class Placing:
                 f"the LiDARs are merged in '{points_frame}'",
             )
         if not world and not self._turned:
-            return place
+            return reference
         if not world:
             self._report.problems[
                 f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
                 f"compensated; odometry is taken from source.odometry_topic"
             ] += 1
-            return place
+            return reference
         try:
-            found = self._tf.lookup(world, points_frame, cloud.stamp, self._config.sync.tf_tolerance)
+            lookup = self._tf.lookup(world, points_frame, cloud.stamp, self._config.sync.tf_tolerance)
         except TransformError as error:
             self._report.complain(problems, f"{error}: the cloud has no place in the world")
-            return place
-        return replace(place, world_from_points=place.from_points(found.matrix), tf_age=found.age)
+            return reference
+        return replace(reference, world_from_points=reference.from_points(lookup.matrix), tf_age=lookup.age)
 
     def fixed(self, points_frame: str) -> tuple[str, str]:
         """Return the world frame and the smoothest fixed frame above ``points_frame``; empty if none."""
         path = self._tf.ancestors(points_frame)
         fixed = [f for f in path if f in self.odometry_frames or _words(f) & FIXED_FRAMES]
         near = [f for f in fixed if not _words(f) & GLOBE_FRAMES] or fixed
-        given = self._config.source.fixed_frame.lstrip("/")
-        return given or (near[-1] if near else ""), near[0] if near else given
+        stated = self._config.source.fixed_frame.lstrip("/")
+        return stated or (near[-1] if near else ""), near[0] if near else stated
 
     def pose(self, frame: Frame, stamp: int) -> F64 | None:
         """Return (4, 4) smoothest fixed frame from points; None if the transforms do not reach the stamp."""
@@ -131,47 +131,53 @@ class Placing:
         if not inertial:
             return None
         try:
-            found = self._tf.lookup(inertial, frame.points_frame, stamp, self._config.sync.tf_tolerance)
+            lookup = self._tf.lookup(inertial, frame.points_frame, stamp, self._config.sync.tf_tolerance)
         except TransformError:
             return None
-        return found.matrix if frame.upright is None else found.matrix @ geometry.inverse(frame.upright)
+        return lookup.matrix if frame.upright is None else lookup.matrix @ geometry.inverse(frame.upright)
 
-    def moved(self, place: Place, stamp: int, frame: str) -> tuple[Lookup, bool]:
+    def moved(self, reference: ReferenceFrames, stamp: int, frame: str) -> tuple[TransformResult, bool]:
         """Return points at the cloud's stamp from ``frame`` at ``stamp``; and if motion is compensated."""
         tolerance = self._config.sync.tf_tolerance
-        if self.compensates(place):
+        if self.compensates(reference):
             try:
-                found = self._tf.lookup_moving(
-                    place.points_frame, place.stamp, frame, stamp, place.inertial_frame, tolerance
+                lookup = self._tf.lookup_moving(
+                    reference.points_frame, reference.stamp, frame, stamp, reference.inertial_frame, tolerance
                 )
-                return place.points_from(found), True
+                return reference.points_from(lookup), True
             except TransformError:
                 pass  # fall back to no motion compensation
-        return place.points_from(self._tf.lookup(place.points_frame, frame, place.stamp, tolerance)), False
+        return reference.points_from(
+            self._tf.lookup(reference.points_frame, frame, reference.stamp, tolerance)
+        ), False
 
-    def compensates(self, place: Place) -> bool:
+    def compensates(self, reference: ReferenceFrames) -> bool:
         """Return whether motion is to be compensated."""
-        return self._config.sync.motion_compensation and bool(place.inertial_frame)
+        return self._config.sync.motion_compensation and bool(reference.inertial_frame)
 
-    def mounting(self, place: Place, frame: str) -> F64 | None:
+    def mounting(self, reference: ReferenceFrames, frame: str) -> F64 | None:
         """Return (4, 4) frame from points at the cloud's stamp; None if they are not connected."""
         try:
-            found = self._tf.lookup(place.points_frame, frame, place.stamp, self._config.sync.tf_tolerance)
+            lookup = self._tf.lookup(
+                reference.points_frame, frame, reference.stamp, self._config.sync.tf_tolerance
+            )
         except TransformError:
             return None
-        return geometry.inverse(place.points_from(found).matrix)
+        return geometry.inverse(reference.points_from(lookup).matrix)
 
-    def world_from(self, place: Place, frame: str) -> F64 | None:
+    def world_from(self, reference: ReferenceFrames, frame: str) -> F64 | None:
         """Return (4, 4) world from a frame at the cloud's stamp; None if they are not connected."""
         if not frame:
             return None
-        from_points = self.mounting(place, frame)
+        from_points = self.mounting(reference, frame)
         if from_points is None:
             return None
-        world = np.eye(4) if place.world_from_points is None else place.world_from_points
+        world = np.eye(4) if reference.world_from_points is None else reference.world_from_points
         return world @ geometry.inverse(from_points)
 
-    def placed(self, boxes: LabelledBoxes3D, place: Place, problems: list[str]) -> LabelledBoxes3D:
+    def placed(
+        self, boxes: LabelledBoxes3D, reference: ReferenceFrames, problems: list[str]
+    ) -> LabelledBoxes3D:
         """Return the boxes with their pose in the world.
 
         Boxes that lean in the frame of the points, or are in several frames, become upright boxes in the
@@ -179,14 +185,14 @@ class Placing:
         """
         if not len(boxes.boxes):
             return boxes  # an empty message may lack a frame
-        world = place.world_from_points
-        stamp = place.stamp if world is None else boxes.stamp
-        target = place.points_frame if world is None else place.world_frame
+        world = reference.world_from_points
+        stamp = reference.stamp if world is None else boxes.stamp
+        target = reference.points_frame if world is None else reference.world_frame
         poses = dict[str, F64]()  # (4, 4) world from each frame of the boxes
         for frame in dict.fromkeys(boxes.frames or (boxes.frame_id,)):
             try:
-                found = self._tf.lookup(target, frame, stamp, self._config.sync.tf_tolerance)
-                poses[frame] = (place.points_from(found) if world is None else found).matrix
+                lookup = self._tf.lookup(target, frame, stamp, self._config.sync.tf_tolerance)
+                poses[frame] = (reference.points_from(lookup) if world is None else lookup).matrix
             except TransformError as error:
                 lost = "are left out" if boxes.frames else "have no place in the world"
                 self._report.complain(problems, f"{error}: the boxes of {boxes.topic} {lost}")
@@ -197,24 +203,28 @@ class Placing:
             pose = poses[boxes.frame_id]
             if (points_from_world @ pose)[2, 2] > LEVEL:
                 return replace(boxes, world_from_boxes=pose)
-        return _upright(boxes, {name: points_from_world @ pose for name, pose in poses.items()}, place)
+        return _make_upright(
+            boxes, {name: points_from_world @ pose for name, pose in poses.items()}, reference
+        )
 
 
-def _upright(boxes: LabelledBoxes3D, poses: Mapping[str, F64], place: Place) -> LabelledBoxes3D:
+def _make_upright(
+    boxes: LabelledBoxes3D, poses: Mapping[str, F64], reference: ReferenceFrames
+) -> LabelledBoxes3D:
     """Return upright boxes in the frame of the points. Boxes in frames that ``poses`` lacks are left out."""
     frames = boxes.frames or (boxes.frame_id,) * len(boxes.boxes)
     rows = [row for row, frame in enumerate(frames) if frame in poses]
     kept = boxes.boxes.chosen(rows)
-    turned = np.empty((len(rows), 4, 4))
+    box_poses = np.empty((len(rows), 4, 4))
     for k, row in enumerate(rows):
         half = float(kept.yaw[k]) / 2
         turn = [0, 0, math.sin(half), math.cos(half)] if boxes.turns is None else boxes.turns[row]
-        turned[k] = poses[frames[row]] @ geometry.transform(kept.center[k], turn)
-    world = place.world_from_points
+        box_poses[k] = poses[frames[row]] @ geometry.transform(kept.center[k], turn)
+    world = reference.world_from_points
     return replace(
         boxes,
-        frame_id=place.points_frame,
-        boxes=geometry.upright(turned[:, :3, 3], kept.size, turned[:, :3, :3]),
+        frame_id=reference.points_frame,
+        boxes=geometry.upright(box_poses[:, :3, 3], kept.size, box_poses[:, :3, :3]),
         labels=tuple(boxes.labels[row] for row in rows),
         scores=boxes.scores[rows],
         ids=tuple(boxes.ids[row] for row in rows) if boxes.ids else (),

@@ -79,10 +79,10 @@ class SyncReport:
     overtaken: Counter[str] = field(default_factory=Counter)
     slowest: dict[str, float] = field(default_factory=dict)
 
-    def note_boxes(self, found: LabelledBoxes2D | LabelledBoxes3D) -> None:
+    def note_boxes(self, boxes: LabelledBoxes2D | LabelledBoxes3D) -> None:
         """Count the boxes of a message that were left out."""
-        for why in found.unusable:
-            self.boxes.add(found.topic, why)
+        for why in boxes.unusable:
+            self.boxes.add(boxes.topic, why)
 
     def complain(self, problems: list[str], text: str) -> None:
         """Add a sentence to the problems of a frame.
@@ -113,43 +113,45 @@ class SyncReport:
             (self.duplicates, "{} had the stamp of another one and {} dropped"),
             (self.unwaited, "{} went on early because sync.queue was full"),
         ]
-        found = [
+        sentences = [
             text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
             for n, text in counted
             if n
         ]
         if self.resets:
-            found.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
+            sentences.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
         if self.gaps:
             gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
-            found.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
+            sentences.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
         if self.idle:
-            found.append(
+            sentences.append(
                 f"no cloud on {self.idle}, which should drive: set source.lidar_topics, the driving one first"
             )
         for topic, n in self.unstamped.items():
-            found.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
+            sentences.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
         for topic, n in (+self.repeated).items():
-            found.append(f"{topic}: {n} of its messages had the stamp of another one, whose place they took")
+            sentences.append(
+                f"{topic}: {n} of its messages had the stamp of another one, whose place they took"
+            )
         for topic, n in self.overtaken.items():
-            found.append(
+            sentences.append(
                 f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"{_after(self.slowest[topic])}: shown at that stamp, and not compared"
+                f"{_describe_delay(self.slowest[topic])}: shown at that stamp, and not compared"
             )
         for camera, n in self.without_image.items():
-            found.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
-        found += self.losses()
+            sentences.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
+        sentences += self.losses()
         for (topic, codec), n in self.untold.items():
             gaps = "1 gap" if n == 1 else f"{n} gaps"
-            found.append(
+            sentences.append(
                 f"{topic}: {gaps} between the stamps of its {codec.upper()} video, whose packets do not tell "
                 "whether one is lost: pictures from a lost one to the next key frame are wrong"
             )
-        found += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*self.doubts(), *found, *self.tf.problems)
+        sentences += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
+        return (*self.doubts(), *sentences, *self.tf.problems)
 
 
-def _after(seconds: float) -> str:
+def _describe_delay(seconds: float) -> str:
     """Describe the delay of the latest result. Stamps may be ahead of their receipt."""
     if seconds < 0.005:
         return "none of them later than its stamp"

@@ -54,20 +54,20 @@ class Surroundings:
         """Replace the shapes of a topic."""
         self._shapes[topic] = shapes[-MANY:]
 
-    def take(self, place: Callable[[str], F64 | None]) -> Around | None:
+    def take(self, pose_of: Callable[[str], F64 | None]) -> Around | None:
         """Return the surroundings for a frame; None if there are none.
 
         Args:
-            place: returns (4, 4) world from a frame at the stamp of the cloud; None: not connected.
+            pose_of: returns (4, 4) world from a frame at the stamp of the cloud; None: not connected.
         """
         if not (self._marks or self._statuses or self._shapes or self._samples):
             return None
-        shapes = [shape for found in self._shapes.values() for shape in found]
-        places = {frame: place(frame) for frame in dict.fromkeys(shape.frame_id for shape in shapes)}
+        shapes = [shape for topic_shapes in self._shapes.values() for shape in topic_shapes]
+        poses = {frame: pose_of(frame) for frame in dict.fromkeys(shape.frame_id for shape in shapes)}
         around = Around(
             marks=tuple(self._marks),
             statuses=tuple(self._statuses.values()),
-            shapes=tuple(replace(shape, world_from_shape=places[shape.frame_id]) for shape in shapes),
+            shapes=tuple(replace(shape, world_from_shape=poses[shape.frame_id]) for shape in shapes),
             motions=tuple(_motion(topic, samples) for topic, samples in self._samples.items()),
         )
         self._marks, self._samples = [], {}

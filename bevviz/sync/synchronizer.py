@@ -32,21 +32,18 @@ from bevviz.model.frame import (
 )
 from bevviz.sync.cameras import Cameras
 from bevviz.sync.clocks import Clocks
-from bevviz.sync.gravity import Upright
-from bevviz.sync.pose_lookup import Place, Placing
+from bevviz.sync.gravity import VerticalEstimate
+from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
 from bevviz.sync.surroundings import Surroundings
-from bevviz.sync.topic_buffer import JUMP, Track, too_far
+from bevviz.sync.topic_buffer import JUMP, TopicBuffer, describe_distance
 from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
 
 SECOND = 1_000_000_000
 LATENCY = 2 * SECOND  # longest delay of a cloud after an image of the same stamp
-FIXED_FRAMES = {"map", "odom", "world", "earth", "global", "utm", "enu", "ned", "mocap", "vicon", "init"}
 FAR = 500.0  # metres; no LiDAR has half of its points farther away
 OVERTAKEN = 64  # late results, and frames to compare them with, that are kept
-GLOBE_FRAMES = {"earth", "ecef", "utm"}  # their coordinates are too large for the float32 of a viewer
-TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +87,7 @@ class Synchronizer:
         self.followed = ""
         self.absent: frozenset[str] = frozenset()
         self.tf = self.report.tf
-        self.upright = Upright(self.tf, config.source.base_frame, config.sync.tf_tolerance)
+        self.upright = VerticalEstimate(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
         self.around = Surroundings()
         self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
@@ -106,24 +103,28 @@ class Synchronizer:
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
-        self._partners: dict[str, Track[Cloud]] = self._make_tracks(*roles.lidars[1:])
+        self._partners: dict[str, TopicBuffer[Cloud]] = self._make_buffers(*roles.lidars[1:])
         self.videos: dict[str, Video] = {}
         self._lidar_frames: dict[str, str] = {}  # frame by cloud topic
-        self._boxes: dict[str, Track[LabelledBoxes3D]] = self._make_tracks(*roles.robot_detections_3d)
-        self._detections: dict[str, Track[LabelledBoxes2D]] = self._make_tracks(*roles.robot_detections_2d)
-        self._robot_clouds: dict[str, Track[Cloud]] = self._make_tracks(*roles.robot_clouds)
-        self._truth: dict[str, Track[_UndecodedBoxes]] = self._make_tracks(*filter(None, [roles.truth]))
+        self._boxes: dict[str, TopicBuffer[LabelledBoxes3D]] = self._make_buffers(*roles.robot_detections_3d)
+        self._detections: dict[str, TopicBuffer[LabelledBoxes2D]] = self._make_buffers(
+            *roles.robot_detections_2d
+        )
+        self._robot_clouds: dict[str, TopicBuffer[Cloud]] = self._make_buffers(*roles.robot_clouds)
+        self._truth: dict[str, TopicBuffer[_UndecodedBoxes]] = self._make_buffers(
+            *filter(None, [roles.truth])
+        )
         self._beside = frozenset(beside)
         self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
         # Reference frames and poses of the last frames.
-        self._places: deque[tuple[Place, F64]] = deque(maxlen=OVERTAKEN)
-        self.placing = Placing(
+        self._past_references: deque[tuple[ReferenceFrames, F64]] = deque(maxlen=OVERTAKEN)
+        self.placing = PoseLookup(
             config, self.report, self.upright, turned=bool(roles.lidars), merged=bool(self._partners)
         )
         self.cameras = Cameras(roles, config, self.report, self.placing, self._horizon)
 
-    def _make_tracks(self, *topics: str) -> dict[str, Track[Any]]:
-        return {topic: Track(self._horizon) for topic in topics}
+    def _make_buffers(self, *topics: str) -> dict[str, TopicBuffer[Any]]:
+        return {topic: TopicBuffer(self._horizon) for topic in topics}
 
     def take_over(self, former: Synchronizer) -> None:
         """Continue with the transforms, calibrations and counts of ``former`` when the roles change."""
@@ -134,7 +135,7 @@ class Synchronizer:
         self.around, self.videos = former.around, former.videos
         self.placing.take_over(former.placing)
         self.cameras.take_over(former.cameras)
-        self._overtaken, self._places = former._overtaken, former._places
+        self._overtaken, self._past_references = former._overtaken, former._past_references
 
     # --- what comes in -------------------------------------------------------------------------
 
@@ -150,20 +151,20 @@ class Synchronizer:
         if cloud.topic in self._partners:
             self.report.repeated[cloud.topic] += self._partners[cloud.topic].add(cloud.stamp, cloud)
             return
-        self._drive(cloud)
+        self._queue(cloud)
 
-    def _drive(self, cloud: Cloud) -> None:
+    def _queue(self, cloud: Cloud) -> None:
         """Queue a cloud of the driving LiDAR for a frame."""
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
-        place = bisect_left(stamps, cloud.stamp)
+        row = bisect_left(stamps, cloud.stamp)
         if cloud.stamp == self._last or cloud.stamp in stamps:
             self.report.duplicates += 1
         elif self._last is not None and cloud.stamp < self._last:
             self.report.late += 1
         else:
-            self.report.reordered += place < len(stamps)
-            self._clouds.insert(place, cloud)
+            self.report.reordered += row < len(stamps)
+            self._clouds.insert(row, cloud)
 
     def add_image(
         self, topic: str, stamp: int, frame_id: str, received: int, load: Callable[[], Image]
@@ -185,7 +186,7 @@ class Synchronizer:
                 self.report.repeated[topic] += repeated
             if topic == self._roles.driver:  # without a LiDAR the camera drives
                 self.report.clouds += 1
-                self._drive(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
+                self._queue(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
     def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
         """Add a calibration on a CameraInfo topic. An image uses the calibration with the nearest stamp."""
@@ -235,17 +236,19 @@ class Synchronizer:
                 boxes are ignored.
         """
         stamp = self._arrived(topic, stamp, received)
-        track = self._truth.setdefault(topic, Track(self._horizon))
-        self.report.repeated[topic] += track.add(stamp, _UndecodedBoxes(stamp, load))
+        buffer = self._truth.setdefault(topic, TopicBuffer(self._horizon))
+        self.report.repeated[topic] += buffer.add(stamp, _UndecodedBoxes(stamp, load))
 
-    def _add_result(self, tracks: dict[str, Track[Any]], result: LabelledBoxes2D | LabelledBoxes3D) -> None:
+    def _add_result(
+        self, buffers: dict[str, TopicBuffer[Any]], result: LabelledBoxes2D | LabelledBoxes3D
+    ) -> None:
         stamp = self._arrived(result.topic, result.stamp, result.received)
         result = replace(result, stamp=stamp)
         if result.topic in self._beside and self._is_past(stamp):
-            self._overtake(result)
+            self._add_late_result(result)
         else:
-            track = tracks.setdefault(result.topic, Track(self._horizon))
-            self.report.repeated[result.topic] += track.add(stamp, result)
+            buffer = buffers.setdefault(result.topic, TopicBuffer(self._horizon))
+            self.report.repeated[result.topic] += buffer.add(stamp, result)
 
     def _is_past(self, stamp: int) -> bool:
         """Return whether the frame nearest to a stamp has been delivered."""
@@ -254,27 +257,27 @@ class Synchronizer:
         after = self._clouds[0].stamp if self._clouds else self._last + self._step
         return stamp <= min(self._last + self._tolerance, (self._last + after) / 2)
 
-    def _overtake(self, result: LabelledBoxes2D | LabelledBoxes3D) -> None:
+    def _add_late_result(self, result: LabelledBoxes2D | LabelledBoxes3D) -> None:
         """Note a result of the robot that no frame takes, with the frame nearest to it."""
         self.report.overtaken[result.topic] += 1
         late = (result.received - result.stamp) * 1e-9
         self.report.note_boxes(result)
         self.report.slowest[result.topic] = max(self.report.slowest.get(result.topic, late), late)
-        if not self._places:
+        if not self._past_references:
             return
-        place, pose = min(self._places, key=lambda at: abs(at[0].stamp - result.stamp))
+        reference, pose = min(self._past_references, key=lambda past: abs(past[0].stamp - result.stamp))
         if isinstance(result, LabelledBoxes3D):
-            result = self.placing.placed(result, place, [])
+            result = self.placing.placed(result, reference, [])
         elif not result.camera:
             names = {self.cameras.frames.get(role.topic): role.name for role in self._roles.cameras}
             result = replace(result, camera=names.get(result.frame_id, ""))
-        self._overtaken.append(LateResult(result, place.stamp, pose))
+        self._overtaken.append(LateResult(result, reference.stamp, pose))
 
     def overtaken(self) -> tuple[LateResult, ...]:
         """Return the robot's results that no frame has taken since the last call."""
-        found = tuple(self._overtaken)
+        results = tuple(self._overtaken)
         self._overtaken.clear()
-        return found
+        return results
 
     def _arrived(self, topic: str, stamp: int, received: int) -> int:
         """Return the stamp to use."""
@@ -287,15 +290,15 @@ class Synchronizer:
     def _check_units(self, cloud: Cloud) -> None:
         """Warn of coordinates in millimetres or far from the origin of a map, which no stage reaches."""
         if cloud.topic not in self.report.oddities and len(cloud.xyz):
-            some = cloud.xyz[::16]
-            x, y, z = np.abs(some).T  # maximum of each point, faster than max(axis=1)
+            sample = cloud.xyz[::16]
+            x, y, z = np.abs(sample).T  # maximum of each point, faster than max(axis=1)
             middle = float(np.median(np.maximum(np.maximum(x, y), z)))
             if middle > FAR:
-                around = float(np.median(np.abs(some - np.median(some, axis=0)).max(axis=1)))
+                spread = float(np.median(np.abs(sample - np.median(sample, axis=0)).max(axis=1)))
                 why = (
                     "millimetres are; a PointCloud2 is in metres (REP 103): correct its driver"
-                    if around > FAR
-                    else f"a map (UTM) are, with most within {around:,.0f} m of each other; they are wanted "
+                    if spread > FAR
+                    else f"a map (UTM) are, with most within {spread:,.0f} m of each other; they are wanted "
                     "in the frame of the LiDAR: take its position away"
                 )
                 far = f"{cloud.topic}: half of its points are farther than {middle:,.0f} m"
@@ -320,12 +323,12 @@ class Synchronizer:
         self._done.extend(self._build_all())
         self._last = None
         self.tf.forget_after(stamp + JUMP)
-        for _, track in self._tracks():
-            track.keep(0, stamp + JUMP)
+        for _, buffer in self._buffers():
+            buffer.keep(0, stamp + JUMP)
 
-    def _tracks(self) -> Iterator[tuple[str, Track[Any]]]:
+    def _buffers(self) -> Iterator[tuple[str, TopicBuffer[Any]]]:
         """Iterate over all topics and their buffers."""
-        groups: tuple[Mapping[str, Track[Any]], ...] = (
+        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
             self._partners,
             self.cameras.images,
             self._boxes,
@@ -387,17 +390,17 @@ class Synchronizer:
         """Return whether no further message can change the frame of the oldest cloud."""
         stamp = self._clouds[0].stamp
         beside = self.absent | self._beside
-        waited = [track for topic, track in self._tracks() if topic not in beside]
-        if any(track.newest is None or track.newest < stamp for track in waited):
+        waited = [buffer for topic, buffer in self._buffers() if topic not in beside]
+        if any(buffer.newest is None or buffer.newest < stamp for buffer in waited):
             return False
-        groups: tuple[Mapping[str, Track[Any]], ...] = (
+        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
             self._boxes,
             self._detections,
             self._robot_clouds,
             self._truth,
         )
-        results = [track for group in groups for topic, track in group.items() if topic not in self._beside]
-        if len(self._clouds) == 1 and any(self._may_be_of_next(track, stamp) for track in results):
+        results = [buffer for group in groups for topic, buffer in group.items() if topic not in self._beside]
+        if len(self._clouds) == 1 and any(self._may_be_of_next(buffer, stamp) for buffer in results):
             return False
         infos = {camera.info_topic for camera in self._roles.cameras} - {""}
         if infos - self.absent - self.cameras.intrinsics.keys():
@@ -407,27 +410,27 @@ class Synchronizer:
         lacking = not self.absent.isdisjoint((*self._roles.tf, self._roles.odometry))
         return lacking or self._transforms_reach(self._clouds[0])
 
-    def _may_be_of_next(self, track: Track[Any], stamp: int) -> bool:
-        nearest = track.nearest(stamp)
+    def _may_be_of_next(self, buffer: TopicBuffer[Any], stamp: int) -> bool:
+        nearest = buffer.nearest(stamp)
         return nearest is not None and 0 < nearest[0] - stamp <= self._tolerance
 
     def _transforms_reach(self, cloud: Cloud) -> bool:
         """Return whether the transforms reach the stamps of the cloud and the messages joined with it."""
-        place = self.placing.of(cloud)
+        reference = self.placing.of(cloud)
         moving = self._roles.tf or self._roles.odometry
-        if moving and not place.world_frame:
+        if moving and not reference.world_frame:
             return False
-        asked = [(cloud.stamp, cloud.frame_id)]
-        joined: list[Track[Any]] = [*self.cameras.images.values(), *self._partners.values()]
-        for track in joined:
-            nearest = track.nearest(cloud.stamp)
+        needed = [(cloud.stamp, cloud.frame_id)]
+        joined: list[TopicBuffer[Any]] = [*self.cameras.images.values(), *self._partners.values()]
+        for buffer in joined:
+            nearest = buffer.nearest(cloud.stamp)
             if nearest is not None and abs(nearest[0] - cloud.stamp) <= self._tolerance:
-                asked.append((max(nearest[0], cloud.stamp), nearest[1].frame_id))
-        anchors = {place.points_frame, place.world_frame or place.points_frame}
+                needed.append((max(nearest[0], cloud.stamp), nearest[1].frame_id))
+        anchors = {reference.points_frame, reference.world_frame or reference.points_frame}
         if self._partners:
             anchors.add(self._config.source.base_frame)
         try:
-            ends = [(self.tf.latest(anchor, frame), stamp) for stamp, frame in asked for anchor in anchors]
+            ends = [(self.tf.latest(anchor, frame), stamp) for stamp, frame in needed for anchor in anchors]
         except TransformError:
             return False
         return all(end is None or end >= stamp for end, stamp in ends)
@@ -437,15 +440,15 @@ class Synchronizer:
     def _build(self) -> Frame:
         cloud = self._clouds.pop(0)
         problems: list[str] = []
-        place = self.placing.of(cloud, problems)
-        clouds, poses = self._gather(cloud, place, problems)
-        in_place = place.upright is None and cloud.frame_id.lstrip("/") == place.points_frame
+        reference = self.placing.of(cloud, problems)
+        clouds, poses = self._gather(cloud, reference, problems)
+        in_place = reference.upright is None and cloud.frame_id.lstrip("/") == reference.points_frame
         points, fields = _merge(clouds, poses, in_place)
-        cameras = tuple(self.cameras.at(role, place) for role in self._roles.cameras)
+        cameras = tuple(self.cameras.at(role, reference) for role in self._roles.cameras)
         first, last = self._window(cloud.stamp)
-        boxes = [track.take(cloud.stamp, first, last) for track in self._boxes.values()]
-        placed = [self.placing.placed(b, place, problems) for b in boxes if b is not None]
-        for robot_boxes in placed:
+        boxes = [buffer.take(cloud.stamp, first, last) for buffer in self._boxes.values()]
+        posed_boxes = [self.placing.placed(b, reference, problems) for b in boxes if b is not None]
+        for robot_boxes in posed_boxes:
             self.report.note_boxes(robot_boxes)
         truth = self._taken_truth(cloud.stamp, first, last)
         frame = Frame(
@@ -454,38 +457,38 @@ class Synchronizer:
             received=cloud.received,
             lidar="lidars" if self._partners else cloud.name,
             points=points,
-            points_frame=place.points_frame,
-            upright=place.upright,
+            points_frame=reference.points_frame,
+            upright=reference.upright,
             fields=fields,
-            world_frame=place.world_frame or place.points_frame,
-            world_from_points=place.world_from_points,
+            world_frame=reference.world_frame or reference.points_frame,
+            world_from_points=reference.world_from_points,
             clouds=clouds,
             points_from_clouds=poses,
             cameras=cameras,
-            robot_boxes=tuple(placed),
+            robot_boxes=tuple(posed_boxes),
             robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
-            robot_clouds=self._taken_clouds(place, first, last, problems),
-            truth=None if truth is None else self.placing.placed(truth, place, problems),
-            tf_age=place.tf_age,
+            robot_clouds=self._taken_clouds(reference, first, last, problems),
+            truth=None if truth is None else self.placing.placed(truth, reference, problems),
+            tf_age=reference.tf_age,
             problems=tuple(problems),
-            around=self.around.take(lambda name: self.placing.world_from(place, name)),
+            around=self.around.take(lambda name: self.placing.world_from(reference, name)),
         )
-        return self._passed(place, frame)
+        return self._finish(reference, frame)
 
-    def _passed(self, place: Place, frame: Frame) -> Frame:
+    def _finish(self, reference: ReferenceFrames, frame: Frame) -> Frame:
         """Note that the frame is delivered. Return it."""
         last = self._window(frame.stamp)[1]
         self._index += 1
         self._last = frame.stamp
         self.report.frames += 1
-        self._places.append((place, frame.pose))
-        unused: tuple[Mapping[str, Track[Any]], ...] = (self._boxes, self._detections)
+        self._past_references.append((reference, frame.pose))
+        unused: tuple[Mapping[str, TopicBuffer[Any]], ...] = (self._boxes, self._detections)
         for group in unused:
             for topic in self._beside & group.keys():
                 for result in group[topic].shed(last):
-                    self._overtake(result)
-        for _, track in self._tracks():
-            track.forget(frame.stamp - self._tolerance)
+                    self._add_late_result(result)
+        for _, buffer in self._buffers():
+            buffer.forget(frame.stamp - self._tolerance)
         return frame
 
     def _lidar_name(self, cloud: Cloud) -> str:
@@ -493,28 +496,30 @@ class Synchronizer:
         return names.get(cloud.topic) or entity_name(cloud.topic, cloud.frame_id)
 
     def _gather(
-        self, cloud: Cloud, place: Place, problems: list[str]
+        self, cloud: Cloud, reference: ReferenceFrames, problems: list[str]
     ) -> tuple[tuple[Cloud, ...], tuple[F64, ...]]:
         """Return the clouds of all LiDARs nearest to ``cloud``, and points_from_cloud of each."""
-        clouds, poses = [cloud], [np.eye(4) if place.upright is None else place.upright]
-        if place.points_frame != cloud.frame_id.lstrip("/"):
+        clouds, poses = [cloud], [np.eye(4) if reference.upright is None else reference.upright]
+        if reference.points_frame != cloud.frame_id.lstrip("/"):
             try:
-                poses[0] = self.placing.moved(place, cloud.stamp, cloud.frame_id)[0].matrix
+                poses[0] = self.placing.moved(reference, cloud.stamp, cloud.frame_id)[0].matrix
             except TransformError as error:
                 self.report.complain(problems, f"{error}: the points of {cloud.topic} stay where they are")
-        for topic, track in self._partners.items():
-            nearest = track.nearest(cloud.stamp)
+        for topic, buffer in self._partners.items():
+            nearest = buffer.nearest(cloud.stamp)
             if nearest is None or abs(nearest[0] - cloud.stamp) > self._tolerance:
-                problems.append(f"no cloud of LiDAR {topic} {too_far(nearest, cloud.stamp, self._tolerance)}")
+                problems.append(
+                    f"no cloud of LiDAR {topic} {describe_distance(nearest, cloud.stamp, self._tolerance)}"
+                )
                 continue
             partner = nearest[1]
             try:
-                found, _ = self.placing.moved(place, partner.stamp, partner.frame_id)
+                lookup, _ = self.placing.moved(reference, partner.stamp, partner.frame_id)
             except TransformError as error:
                 self.report.complain(problems, f"{error}: the points of {topic} are left out")
                 continue
             clouds.append(partner)
-            poses.append(found.matrix)
+            poses.append(lookup.matrix)
         return tuple(clouds), tuple(poses)
 
     def _window(self, stamp: int) -> tuple[int, int]:
@@ -527,15 +532,15 @@ class Synchronizer:
         return first, last
 
     def _taken_truth(self, stamp: int, first: int, last: int) -> LabelledBoxes3D | None:
-        for topic, track in self._truth.items():
-            while (found := track.take(stamp, first, last)) is not None:
+        for topic, buffer in self._truth.items():
+            while (undecoded := buffer.take(stamp, first, last)) is not None:
                 try:
-                    truth = found.load()
+                    truth = undecoded.load()
                 except UserError as error:
                     self.report.damage.add(topic, str(error))
                 else:
                     self.report.note_boxes(truth)
-                    return replace(truth, stamp=found.stamp)
+                    return replace(truth, stamp=undecoded.stamp)
         return None
 
     def _robot_detections(
@@ -543,26 +548,28 @@ class Synchronizer:
     ) -> tuple[LabelledBoxes2D, ...]:
         """Return the robot's image boxes of this time, with the camera that has their frame."""
         names = {c.image.frame_id: c.name for c in cameras if c.image is not None}
-        taken = (track.take(stamp, first, last) for track in self._detections.values())
-        found = [detections for detections in taken if detections is not None]
-        for detections in found:
+        nearest = (buffer.take(stamp, first, last) for buffer in self._detections.values())
+        messages = [detections for detections in nearest if detections is not None]
+        for detections in messages:
             self.report.note_boxes(detections)
-        return tuple(d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in found)
+        return tuple(d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in messages)
 
-    def _taken_clouds(self, place: Place, first: int, last: int, problems: list[str]) -> tuple[Cloud, ...]:
+    def _taken_clouds(
+        self, reference: ReferenceFrames, first: int, last: int, problems: list[str]
+    ) -> tuple[Cloud, ...]:
         """Return the robot's clouds of this time, in the frame of the points."""
-        found = []
-        for track in self._robot_clouds.values():
-            cloud = track.take(place.stamp, first, last)
+        clouds = []
+        for buffer in self._robot_clouds.values():
+            cloud = buffer.take(reference.stamp, first, last)
             if cloud is None:
                 continue
             try:
-                pose, _ = self.placing.moved(place, cloud.stamp, cloud.frame_id)
+                pose, _ = self.placing.moved(reference, cloud.stamp, cloud.frame_id)
             except TransformError as error:
                 self.report.complain(problems, f"{error}: the points of {cloud.topic} are left out")
                 continue
-            found.append(replace(cloud, xyz=geometry.apply(pose.matrix, cloud.xyz)))
-        return tuple(found)
+            clouds.append(replace(cloud, xyz=geometry.apply(pose.matrix, cloud.xyz)))
+        return tuple(clouds)
 
 
 def _merge(

@@ -11,7 +11,7 @@ T = TypeVar("T")
 JUMP = 1_000_000_000
 
 
-class Track(Generic[T]):
+class TopicBuffer(Generic[T]):
     """Buffer of the messages of one topic, in order of stamp. It keeps the last ``horizon`` nanoseconds."""
 
     def __init__(self, horizon: int) -> None:
@@ -61,9 +61,9 @@ class Track(Generic[T]):
     def shed(self, last: int) -> list[T]:
         """Remove and return the messages up to a stamp."""
         end = bisect_left(self._stamps, last + 1)
-        gone, self._items = self._items[:end], self._items[end:]
+        removed, self._items = self._items[:end], self._items[end:]
         del self._stamps[:end]
-        return gone
+        return removed
 
     def forget(self, before: int) -> None:
         """Drop older messages, except the last of them: it may be the nearest to the next cloud."""
@@ -76,7 +76,7 @@ class Track(Generic[T]):
         self._stamps, self._items = self._stamps[low:high], self._items[low:high]
 
 
-def too_far(nearest: tuple[int, object] | None, stamp: int, tolerance: int) -> str:
+def describe_distance(nearest: tuple[int, object] | None, stamp: int, tolerance: int) -> str:
     """Describe how far the nearest message is from a stamp (nanoseconds), for the end of a sentence."""
     within = f"within {tolerance * 1e-9:.2f} s"
     if nearest is None:

@@ -35,7 +35,7 @@ class Origin(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Lookup:
+class TransformResult:
     """Transform between two frames.
 
     Attributes:
@@ -192,7 +192,7 @@ class TransformBuffer:
                 if not edge.stamps:
                     del self._edges[child]
 
-    def lookup(self, target: str, source: str, stamp: int, tolerance: float) -> Lookup:
+    def lookup(self, target: str, source: str, stamp: int, tolerance: float) -> TransformResult:
         """Return target_from_source at ``stamp``, interpolated along the chain through the common ancestor.
 
         Raises:
@@ -202,11 +202,11 @@ class TransformBuffer:
         up, down = self._chains(target, source)
         to_common, age = self._climb(up, target, source, stamp, tolerance)
         to_target, other_age = self._climb(down, target, source, stamp, tolerance)
-        return Lookup(geometry.inverse(to_target) @ to_common, max(age, other_age))
+        return TransformResult(geometry.inverse(to_target) @ to_common, max(age, other_age))
 
     def lookup_moving(
         self, target: str, target_stamp: int, source: str, source_stamp: int, fixed: str, tolerance: float
-    ) -> Lookup:
+    ) -> TransformResult:
         """Return target at ``target_stamp`` from source at ``source_stamp``.
 
         Objects at rest in ``fixed`` stay in place.
@@ -217,7 +217,7 @@ class TransformBuffer:
         fixed_from_source = self.lookup(fixed, source, source_stamp, tolerance)
         fixed_from_target = self.lookup(fixed, target, target_stamp, tolerance)
         matrix = geometry.inverse(fixed_from_target.matrix) @ fixed_from_source.matrix
-        return Lookup(matrix, max(fixed_from_source.age, fixed_from_target.age))
+        return TransformResult(matrix, max(fixed_from_source.age, fixed_from_target.age))
 
     def latest(self, target: str, source: str) -> int | None:
         """Return the newest stamp that all edges of the chain reach; None if the chain is static.

@@ -153,25 +153,25 @@ class Video:
         Raises:
             MessageError: the packets are not available.
         """
-        found = self._among(place)
-        if found is None and place[0] > self._keyless and self._rewind is not None:
+        rows = self._rows_of(place)
+        if rows is None and place[0] > self._keyless and self._rewind is not None:
             earlier = list(self._rewind(self.topic, place[0]))
             self._headers |= {packet.data: None for packet in earlier if packet.is_header}
             earlier = [packet for packet in earlier if not packet.is_header]
             self._packets = earlier + [p for p in self._packets if p.received > place[0]]
             self._size = sum(len(packet.data) for packet in self._packets)
             self._decoder = None
-            found = self._among(place)
-            if found is None:
+            rows = self._rows_of(place)
+            if rows is None:
                 self._keyless = place[0]
-        if found is None:
+        if rows is None:
             raise MessageError(
                 f"{self.topic}: the video begins between two key frames: what comes before the first one "
                 "cannot be decoded"
             )
-        return found
+        return rows
 
-    def _among(self, place: tuple[int, int]) -> tuple[int, int] | None:
+    def _rows_of(self, place: tuple[int, int]) -> tuple[int, int] | None:
         rows = [row for row, packet in enumerate(self._packets) if packet.place == place]
         if not rows:
             return None
@@ -187,8 +187,8 @@ class Video:
         self._forget(ends[-1] if ends else 0)
 
     def _forget(self, count: int) -> None:
-        gone, self._packets = self._packets[:count], self._packets[count:]
-        self._size -= sum(len(packet.data) for packet in gone)
+        dropped, self._packets = self._packets[:count], self._packets[count:]
+        self._size -= sum(len(packet.data) for packet in dropped)
         self._next -= count
         if self._next < 0:
             self._decoder, self._next = None, 0
@@ -230,10 +230,10 @@ class _Decoder:
             self.failures.clear()
         elif lost:
             self._broken = f"{lost} packet(s) before it are lost"
-        given = av.Packet(packet.data)
-        given.pts = len(self._places)
+        av_packet = av.Packet(packet.data)
+        av_packet.pts = len(self._places)
         self._places.append(packet.place)
-        self._take(given)
+        self._take(av_packet)
 
     def _missing(self, packet: Packet) -> int:
         """Return the number of packets that are missing before a packet."""
@@ -270,10 +270,10 @@ class _Decoder:
 
     def waits_for(self, place: tuple[int, int]) -> bool:
         """Return whether the next packet may complete the picture."""
-        there = place in self._pictures or place in self.failures
-        return self.reorders and not there and not self._finished
+        is_known = place in self._pictures or place in self.failures
+        return self.reorders and not is_known and not self._finished
 
     def picture(self, place: tuple[int, int]) -> U8 | None:
         """Return the (H, W, 3) BGR picture; None if it was not decoded."""
-        found = self._pictures.get(place)
-        return None if found is None else np.ascontiguousarray(found.to_ndarray(format="bgr24"))
+        picture = self._pictures.get(place)
+        return None if picture is None else np.ascontiguousarray(picture.to_ndarray(format="bgr24"))
