@@ -1,7 +1,7 @@
-"""What is worth a look in a drive: strange objects, what one sensor alone sees, clocks, transforms.
+"""Detection of anomalies in a drive: odd object behaviour, one-sensor objects, clock and transform errors.
 
-Plain rules over the results of consecutive frames, each of which knows only those before it; their limits
-are the section ``anomalies``.
+Plain rules over the results of consecutive frames. Each frame is judged with the frames before it alone. The
+limits are in the configuration section ``anomalies``.
 """
 
 from __future__ import annotations
@@ -22,25 +22,28 @@ from bevviz.model.results import Anomaly, CameraResult, Decision, FrameResult
 KINDS: tuple[AnomalyKind, ...] = get_args(AnomalyKind)
 UNMATCHED = (Decision.NO_CLUSTER, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP, Decision.MISFIT)
 SAME_BOX = 0.3  # IoU of the image boxes of one object in consecutive frames
-STRONG = 0.5  # score of a detection that the LiDAR has to have something for
-NEAR = 25.0  # metres, by the usual height of its class, that such a thing may be away
-THROUGH = 0.7  # share of the points in its box that must lie far behind it
-BEHIND = 1.3  # times as far
+STRONG = 0.5  # least score of a camera detection that the LiDAR should confirm
+NEAR = 25.0  # metres, largest distance of such a detection, estimated from the usual height of its class
+THROUGH = 0.7  # least share of the points in its box that must lie far behind it
+BEHIND = 1.3  # ratio of depth to estimated distance from which a point lies far behind
 
 
 class AnomalyDetector:
-    """Looks at the results of consecutive frames. What lasts is one anomaly, with the stamp it began at."""
+    """Detector of anomalies in consecutive frames. A lasting anomaly keeps the stamp at which it began."""
 
     def __init__(self) -> None:
-        self._active: dict[tuple[str, str], tuple[Anomaly, int]] = {}  # with the stamp it was last true at
+        self._active: dict[tuple[str, str], tuple[Anomaly, int]] = {}  # with the stamp it last held at
         self._objects = ObjectWatch()
         self._alone: dict[str, list[tuple[F32, str, int]]] = {}  # camera -> box, class, frames
-        self._placed: set[str] = set()  # sensors whose transforms were there
+        self._placed: set[str] = set()  # sensors that had a transform
         self._imaged: set[str] = set()  # cameras that had an image
         self._stamp = 0
 
     def update(self, result: FrameResult, config: AnomaliesConfig) -> tuple[Anomaly, ...]:
-        """Those of this frame, and those that ended within ``anomalies.hold``, worst first."""
+        """Return the anomalies of this frame, worst first.
+
+        An anomaly that ended less than ``anomalies.hold`` ago is still returned.
+        """
         stamp = result.frame.stamp
         if stamp < self._stamp:
             self._active.clear()
@@ -59,6 +62,7 @@ class AnomalyDetector:
         return tuple(sorted((anomaly for anomaly, _ in self._active.values()), key=lambda a: -a.rank))
 
     def _found(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        """Yield the anomalies of this frame from every rule."""
         if result.tracks is not None:
             yield from self._objects.update(result, result.tracks, config)
         yield from self._detections(result, config)
@@ -67,7 +71,10 @@ class AnomalyDetector:
         yield from _stages(result, config)
 
     def _detections(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
-        """What a camera alone sees, followed from frame to frame by the overlap of its boxes."""
+        """Yield detections of a camera that the LiDAR does not confirm for several frames.
+
+        Detections of consecutive frames are associated by the overlap of their boxes.
+        """
         texts = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
         for camera in result.cameras:
             name, found, fusion = camera.camera.name, camera.detections, camera.fusion
@@ -92,6 +99,7 @@ class AnomalyDetector:
     # --- sensors and stages --------------------------------------------------------------------
 
     def _clocks(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        """Yield cameras whose image is missing or far from the cloud in time."""
         for camera in result.frame.cameras:
             if abs(camera.sync_error) > config.sync_error:
                 text = f"{camera.name} is {1e3 * camera.sync_error:+.0f} ms off the cloud"
@@ -102,6 +110,7 @@ class AnomalyDetector:
         self._imaged |= {camera.name for camera in result.frame.cameras if camera.image is not None}
 
     def _transforms(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+        """Yield sensors whose transform is old or lost."""
         frame = result.frame
         ages = {frame.lidar: frame.tf_age} if frame.lidar else {}
         ages |= {camera.name: camera.tf_age for camera in frame.cameras}
@@ -117,7 +126,11 @@ class AnomalyDetector:
 
 
 def _seen_through(result: FrameResult, camera: CameraResult, row: int) -> bool:
-    """Whether the LiDAR sees what is behind a detection, if its class is as near as it looks."""
+    """Return whether the LiDAR sees through a detection.
+
+    The distance of the detection is estimated from the usual height of its class. Most points in its box must
+    lie far behind that distance.
+    """
     found, about = camera.detections, camera.camera
     assert found is not None
     size = result.config.objects.sizes.get(found.names[row].lower())
@@ -138,6 +151,7 @@ def _seen_through(result: FrameResult, camera: CameraResult, row: int) -> bool:
 
 
 def _stages(result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
+    """Yield stages that failed or were slow."""
     for failure in result.failures:
         yield Anomaly("stage", failure.stage, f"{failure.stage}: {failure.reason}", "ERROR", rank=1.0)
     failed = {failure.stage for failure in result.failures}

@@ -1,10 +1,10 @@
-"""Objects that behave as they never did: gone from one sensor, elsewhere at once, a class gone altogether.
+"""Anomalies of objects: lost by one sensor, moved in a jump, or missing with their whole class.
 
-How strange it is that an object is not seen is told by its own past. Of one found in ``n`` of the
-last ``m`` frames in which it was plainly in view, the chance to miss it once is taken as
-``1 - (n + 1) / (m + 2)`` (Laplace's rule); the surprise of missing it ``k`` times is ``-k ln`` of that.
-What the past explains, a weak detector or a small object, is no surprise. What is half hidden, cut off by
-the border of the image or near the detector's threshold is not counted at all.
+The history of an object decides how surprising a miss is. For an object that was found in ``n`` of the last
+``m`` frames in which it was plainly in view, the chance of one miss is ``1 - (n + 1) / (m + 2)`` (Laplace's
+rule). The surprise of missing it ``k`` times is ``-k ln`` of that. So a weak detector or a small object
+causes no surprise. An object is not counted while it is half hidden, cut off by the image border, or near the
+detector's threshold.
 """
 
 from __future__ import annotations
@@ -23,31 +23,32 @@ from bevviz.model.results import Anomaly, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import in_view
 from bevviz.stages.visibility import range_image, visible
 
-MEMORY = 20  # frames that the past of an object counts
-PAST = 5  # frames that an object must have been found in before it can be missed
-SAME = 0.3  # least IoU of an object's place in the image and a detection of it
-INSIDE = 0.9  # least share of an object's place that is in the image
-NOISE = 0.15  # metres, least spread of how far an object is from where it is expected
-SPREADS = 6.0  # a jump is so many times what the object's own past spreads
-LOST_SPREADS = 4.0  # where its own place is empty, and one of its length has turned up elsewhere
-REACH = 3.0  # metres that an object may have jumped
-LATEST = 0.25  # seconds that a track may be unseen for when it turns up elsewhere
-GROWTH = 0.5  # metres that what is measured may have become longer or shorter in a jump: else it was cut anew
-EMPTY = 3  # obstacle points, at most, where nothing is
+MEMORY = 20  # frames of the history of an object
+PAST = 5  # least frames with the object found, before a miss counts
+SAME = 0.3  # least IoU of a projected track and its detection
+INSIDE = 0.9  # least share of a projected track that must be in the image
+NOISE = 0.15  # metres, least spread of the distance between expected and measured position
+SPREADS = 6.0  # a jump is larger than this multiple of the object's own spread
+LOST_SPREADS = 4.0  # the same where the track's box is empty and a new track of the same length appeared
+REACH = 3.0  # metres, largest jump that is searched for a new track
+LATEST = 0.25  # seconds, largest time without a cluster before the new track appears
+GROWTH = 0.5  # metres, largest change of length in a jump; a larger one is a new segmentation
+EMPTY = 3  # most obstacle points in a box that counts as empty
 
 
 @dataclass(slots=True)
 class Past:
-    """What became of one thing, frame after frame: found or not."""
+    """History of one object and one sensor: in how many frames it was found or missed."""
 
     found: float = 0.0
     asked: float = 0.0
-    missed: int = 0  # in a row, until now
+    missed: int = 0  # misses in a row up to now
 
     def add(self, found: bool) -> None:
+        """Count one more frame. Old frames fade with a memory of ``MEMORY`` frames."""
         if found:
             fade = 1 - 1 / MEMORY
-            # What was missed before belongs to the past now.
+            # Earlier misses are part of the history now.
             self.found, self.asked = fade * self.found + 1, fade * self.asked + 1 + self.missed
             self.missed = 0
         else:
@@ -55,7 +56,7 @@ class Past:
 
     @property
     def surprise(self) -> float:
-        """Of having missed it until now; zero where it was not found often enough before."""
+        """Surprise of the current misses in a row. Zero while it was found too rarely."""
         if self.found < PAST:
             return 0.0
         return -self.missed * math.log(1 - (self.found + 1) / (self.asked + 2))
@@ -63,39 +64,39 @@ class Past:
 
 @dataclass(slots=True)
 class _Known:
-    """What is remembered of a track."""
+    """State of one track: its history and its last measurement."""
 
     camera: Past
     lidar: Past
     name: str = ""
-    steps: int = 0  # frames that it was followed in
-    spread: float = 0.0  # square metres, mean of how far it was from where it was expected
-    length: float = 0.0  # metres, longer side of what was measured last
-    center: F32 | None = None  # its centre, in the frame of the tracks
+    steps: int = 0  # frames with an innovation
+    spread: float = 0.0  # square metres, mean squared distance from the expected position
+    length: float = 0.0  # metres, longer side of the last cluster
+    center: F32 | None = None  # centre of the last cluster, in the frame of the tracks
 
 
 @dataclass(frozen=True, slots=True)
 class _Sight:
-    """The tracks as they should be seen. Rows are those of the tracks."""
+    """Expected visibility of the tracks. One row per track."""
 
     boxes: Boxes3D  # in the frame of the points
-    open: F32  # (T,) share that nothing nearer hides
-    whole: Bool  # (T,) in the image of some camera, not cut off by its border
-    detected: Bool  # (T,) a kept detection is there, or one of its class, however weak
+    open: F32  # (T,) share that no nearer object hides
+    whole: Bool  # (T,) whether it is in a camera image and not cut off by the border
+    detected: Bool  # (T,) whether a kept detection, or any one of its class, overlaps it
 
 
 class ObjectWatch:
-    """Looks at the tracks of consecutive frames."""
+    """Detector of object anomalies in the tracks of consecutive frames."""
 
     def __init__(self) -> None:
         self._known: dict[int, _Known] = {}
 
     def clear(self) -> None:
-        """A drive that starts anew."""
+        """Forget all tracks, for a drive that starts again."""
         self._known.clear()
 
     def update(self, result: FrameResult, tracks: Tracks, config: AnomaliesConfig) -> Iterator[Anomaly]:
-        """What is strange in this frame, given those before it."""
+        """Yield the anomalies of this frame, given the frames before it."""
         count = 0 if result.clusters is None else len(result.clusters)
         looked_at = np.append(in_view(result.cameras, count), False)[tracks.cluster]
         sight, measured = _sight(result, tracks), _clusters(result, tracks)
@@ -140,9 +141,9 @@ def _jump(
     measured: Boxes3D,
     config: AnomaliesConfig,
 ) -> Iterator[Anomaly]:
-    """Elsewhere at once: as the same track, or as a new one where its own has nothing any more.
+    """Yield a jump: the same track far from its expected position, or a new track while its box is empty.
 
-    A box whose centre moves because more, or less, of the object was measured has not jumped.
+    A centre that moves because more or less of the object was measured is no jump.
     """
     if known.steps < PAST or known.center is None or sight.open[row] < config.visible:
         return
@@ -172,7 +173,7 @@ def _jump(
 
 
 def _others_there(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> int:
-    """Obstacle points where a track should be, of clusters that were tracked before."""
+    """Count the obstacle points in the box of a track that belong to clusters with older tracks."""
     assert result.obstacles is not None
     assert result.clusters is not None
     old = tracks.cluster[(tracks.hits > 2) & (tracks.cluster >= 0)]
@@ -181,13 +182,13 @@ def _others_there(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) 
 
 
 def _measured(measured: Boxes3D, tracks: Tracks, row: int) -> tuple[float, F32]:
-    """Longer side and centre of a track's cluster."""
+    """Return the longer side and the centre of a track's cluster."""
     k = int(tracks.cluster[row])
     return float(measured.size[k, :2].max()), measured.center[k]
 
 
 def _clusters(result: FrameResult, tracks: Tracks) -> Boxes3D:
-    """Boxes of the clusters in the frame of the tracks."""
+    """Return the boxes of the clusters in the frame of the tracks."""
     clusters = result.clusters
     if clusters is None:
         return Boxes3D.empty()
@@ -205,7 +206,7 @@ def _missing(
     others: bool,
     config: AnomaliesConfig,
 ) -> Iterator[Anomaly]:
-    """Clusters in plain view whose detections are gone: all of a class, or single ones."""
+    """Yield clusters in plain view that lost their detections: a whole class, or single objects."""
     past = [p for _, p in rows if p.found >= PAST]
     together = sum(p.surprise for p in past)
     if len(past) > 1 and not others and together >= config.surprise and min(p.missed for p in past) >= 2:
@@ -222,6 +223,7 @@ def _missing(
 
 
 def _lost(tracks: Tracks, sight: _Sight, row: int, past: Past) -> Anomaly:
+    """Return the anomaly of a track whose cluster is gone although nothing hides it."""
     who, frames = label(tracks, row), _frames(past.missed)
     if sight.detected[row]:
         text = f"{who}: detected where the LiDAR sees nothing, and nothing that hides it, for {frames}"
@@ -231,7 +233,7 @@ def _lost(tracks: Tracks, sight: _Sight, row: int, past: Past) -> Anomaly:
 
 
 def _empty(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> bool:
-    """Whether nothing is where a track should be, nor another track that has taken its object over."""
+    """Return whether the box of a track is empty and no other track has taken the object over."""
     if result.obstacles is None or geometry.inside(result.obstacles, sight.boxes, row).sum() > EMPTY:
         return False
     others = np.flatnonzero(tracks.cluster >= 0)
@@ -239,15 +241,16 @@ def _empty(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> bool
 
 
 def _rank(sight: _Sight, row: int, strange: float) -> float:
-    """0 to 1: what is near and very strange first."""
+    """Return a rank from 0 to 1. Near and very surprising objects rank highest."""
     away = float(np.hypot(*sight.boxes.center[row, :2]))
     return min(strange, 1.0) / (1 + away / 20)
 
 
-# --- what should be seen -----------------------------------------------------------------------
+# --- expected visibility -----------------------------------------------------------------------
 
 
 def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
+    """Compute the expected visibility of the tracks. Only confirmed tracks are examined."""
     boxes = tracks.boxes
     if tracks.absolute:
         boxes = geometry.moved(boxes, geometry.inverse(result.frame.pose))
@@ -273,7 +276,12 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
 
 
 def _in_image(camera: CameraResult, boxes: Boxes3D) -> tuple[F32, F32] | None:
-    """(K, 4) around each projected box, NaN behind the camera, and (K,) how much of that is in the image."""
+    """Project boxes into a camera. Return None without image, intrinsics or transform.
+
+    Returns:
+        (K, 4) bounding rectangle of each box, clipped to the image, NaN behind the camera, and (K,) share of
+        the rectangle that is in the image.
+    """
     about = camera.camera
     if about.image is None or about.intrinsics is None or about.camera_from_points is None:
         return None
@@ -290,9 +298,10 @@ def _in_image(camera: CameraResult, boxes: Boxes3D) -> tuple[F32, F32] | None:
 
 
 def label(tracks: Tracks, row: int) -> str:
-    """``person #12``."""
+    """Return the name of a track for texts, such as ``person #12``."""
     return f"{tracks.names[row] or 'object'} #{tracks.id[row]}"
 
 
 def _frames(count: int) -> str:
+    """Return the count with its noun, such as ``2 frames``."""
     return "1 frame" if count == 1 else f"{count} frames"

@@ -1,4 +1,4 @@
-"""What is new in the anomalies of each frame, and how many a drive had."""
+"""Summaries of a drive: anomalies that began, and stages that failed."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from bevviz.model.results import Anomaly, FrameResult
 
 
 class Onsets:
-    """Tells what is new in the anomalies of each frame, even where frames are left out."""
+    """Filter for the anomalies that begin in a frame. It works even where frames are left out."""
 
     def __init__(self) -> None:
         self._known: set[tuple[str, str, int]] = set()
 
     def of(self, anomalies: Sequence[Anomaly]) -> list[Anomaly]:
+        """Return the anomalies that the previous call did not have."""
         known, self._known = self._known, {(a.kind, a.subject, a.since) for a in anomalies}
         return [a for a in anomalies if (a.kind, a.subject, a.since) not in known]
 
 
 class AnomalySummary(Observer[FrameResult]):
-    """How many anomalies of each kind a drive had, and when the first began."""
+    """Counter of the anomalies of each kind in a drive, with the time of the first."""
 
     def __init__(self) -> None:
         self._onsets = Onsets()
@@ -30,13 +31,14 @@ class AnomalySummary(Observer[FrameResult]):
         self._first: dict[str, int] = {}
 
     def see(self, result: FrameResult) -> None:
+        """Count the anomalies that begin in this frame."""
         self._start = result.frame.stamp if self._start is None else self._start
         for anomaly in self._onsets.of(result.anomalies):
             self._count[anomaly.kind] += 1
             self._first.setdefault(anomaly.kind, anomaly.since - self._start)
 
     def __str__(self) -> str:
-        """One line, most frequent first; times in seconds from the first frame."""
+        """Return one line, most frequent kind first. Times are in seconds from the first frame."""
         kinds = [
             f"{count} {kind.replace('_', ' ')} (first at {self._first[kind] * 1e-9:.1f} s)"
             for kind, count in self._count.most_common()
@@ -45,7 +47,7 @@ class AnomalySummary(Observer[FrameResult]):
 
 
 class FailureSummary(Observer[FrameResult]):
-    """Which stages failed, how often, and the reason that each gave first."""
+    """Counter of the failures of each stage in a drive, with the reason of the first."""
 
     def __init__(self) -> None:
         self._frames = 0
@@ -53,6 +55,7 @@ class FailureSummary(Observer[FrameResult]):
         self._first: dict[str, str] = {}
 
     def see(self, result: FrameResult) -> None:
+        """Count the failures of this frame."""
         self._frames += 1
         for failure in result.failures:
             self._count[failure.stage] += 1
@@ -60,7 +63,7 @@ class FailureSummary(Observer[FrameResult]):
 
     @property
     def warnings(self) -> list[str]:
-        """One sentence for each stage."""
+        """One sentence for each stage that failed."""
         return [
             f"{stage} failed in {count} of {self._frames} frames, first: {self._first[stage]}"
             for stage, count in self._count.items()
