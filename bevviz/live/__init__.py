@@ -1,1 +1,1 @@
-"""Live runs beside a robot, and everything that imports rclpy. Imports `compare` and below."""
+"""Live runs beside a robot. Every module that imports rclpy is here. Imports `compare` and below."""

@@ -1,4 +1,4 @@
-"""What does not arrive as it should: told at once, and told again when it is over."""
+"""Watch over the messages that arrive. Each problem is reported when it begins and when it ends."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from typing import Literal
 
 from bevviz.sync.unusable_messages import Damage
 
-SILENCE = 2.0  # seconds without a message that are told, or five usual steps
-STREAM = 5  # messages after which a topic is taken for a stream that should go on
-AGAIN = 10  # unusable messages in a row that are told again, after usable ones
+SILENCE = 2.0  # seconds without a message that are reported, unless five usual steps are longer
+STREAM = 5  # messages after which a topic counts as a stream that should continue
+AGAIN = 10  # unusable messages in a row that are reported once more
 
 TopicState = Literal["ok", "silent", "unusable", "no publisher"]
 
 
 @dataclass(slots=True)
 class _Arrivals:
-    """Of one topic."""
+    """Arrivals of one topic."""
 
     count: int = 0
     bytes: int = 0
     times: deque[float] = field(default_factory=lambda: deque(maxlen=20))  # seconds, monotonic
-    row: int = 0  # unusable ones since the last that could be used
+    row: int = 0  # unusable messages since the last usable one
 
 
 class Watch:
-    """Keeps account of what was received, and of what holds now and should be known.
+    """Counter of received messages and record of the current problems.
 
     Args:
-        tell: called with one sentence each time something begins or ends to hold.
-        clock: seconds, for tests.
+        tell: called with one sentence each time a problem begins or ends.
+        clock: returns seconds, for tests.
     """
 
     def __init__(self, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -41,22 +41,22 @@ class Watch:
         self._told: set[str] = set()
         self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self._damage = Damage()
-        self._notes: dict[str, str] = {}  # what a sentence is about -> the sentence, while it holds
+        self._notes: dict[str, str] = {}  # subject -> its sentence, while it holds
 
     # --- messages ------------------------------------------------------------------------------
 
     @property
     def received(self) -> Counter[str]:
-        """Topic -> messages, since the start."""
+        """Messages since the start, by topic."""
         return Counter({name: topic.count for name, topic in self._topics.items()})
 
     @property
     def volume(self) -> Counter[str]:
-        """Topic -> bytes, since the start."""
+        """Bytes since the start, by topic."""
         return Counter({name: topic.bytes for name, topic in self._topics.items()})
 
     def add(self, topic: str, size: int) -> bool:
-        """A message has come. True: the first one."""
+        """Count a message. Return whether it is the first of its topic."""
         arrivals = self._topics[topic]
         arrivals.count += 1
         arrivals.bytes += size
@@ -64,19 +64,20 @@ class Watch:
         return arrivals.count == 1
 
     def usable(self, topic: str) -> None:
+        """Record that a message of a topic could be used."""
         arrivals = self._topics[topic]
         arrivals.row = 0
         self.note(f"{topic} unusable", "", f"{topic}: its messages can be used again")
 
     def unusable(self, topic: str, reason: str) -> None:
-        """What cannot be used, and the reason, which names the topic."""
+        """Record a message that cannot be used. The reason names the topic."""
         arrivals = self._topics[topic]
         arrivals.row += 1
         if self._damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
             self.note(f"{topic} unusable", f"a message cannot be used: {reason}")
 
     def silent_for(self, topic: str) -> float:
-        """Seconds since the last message of a stream, where that is longer than usual; else 0."""
+        """Return the seconds since the last message of a stream, or 0 if that is a usual time."""
         if topic not in self._topics or len(self._topics[topic].times) < STREAM:
             return 0.0
         times = self._topics[topic].times
@@ -85,17 +86,17 @@ class Watch:
         return silent if silent > max(SILENCE, 5 * median(steps)) else 0.0
 
     def state(self, topic: str, published: bool) -> TopicState:
-        """How a topic does; ``published``: whether anybody still does."""
+        """Return the state of a topic. ``published``: whether it has a publisher."""
         if not published:
             return "no publisher"
         if self.silent_for(topic):
             return "silent"
         return "unusable" if topic in self._topics and self._topics[topic].row else "ok"
 
-    # --- what holds ----------------------------------------------------------------------------
+    # --- current problems ----------------------------------------------------------------------
 
     def note(self, about: str, text: str, over: str = "") -> None:
-        """Tell ``text`` when it begins to hold, and ``over`` when it is empty again."""
+        """Report ``text`` when it begins to hold, and ``over`` when ``text`` is empty again."""
         before = self._notes.pop(about, "")
         if text:
             self._notes[about] = text
@@ -103,17 +104,17 @@ class Watch:
             self.tell(text or over)
 
     def once(self, text: str) -> None:
-        """Tell it when it is found out, and not again."""
+        """Report a sentence the first time, and never again."""
         if text not in self._told:
             self._told.add(text)
             self.tell(text)
 
     @property
     def warnings(self) -> list[str]:
-        """What holds now, and how much could not be used."""
+        """Sentences that hold now, followed by the counts of unusable messages."""
         holds = [text for about, text in self._notes.items() if not about.endswith(" unusable")]
         return [*holds, *self._damage.sentences]
 
     def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
-        """Of each topic, given whether anybody publishes it."""
+        """Return the state of each topic, given whether it has a publisher."""
         return {name: self.state(name, there) for name, there in published.items()}

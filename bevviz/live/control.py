@@ -1,4 +1,4 @@
-"""How ``bevviz snap`` asks a running ``bevviz live`` to save: a socket of the user, one for each process."""
+"""Requests of ``bevviz snap`` to a running ``bevviz live``, through one Unix socket for each process."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from bevviz.errors import UserError
 from bevviz.support.contexts import Closing
 from bevviz.support.files import check_owned
 
-ANSWER = 5.0  # seconds until a process that is well has said that it heard
+ANSWER = 5.0  # seconds that a healthy process needs at most to acknowledge a request
 PATIENCE = 120.0  # seconds that saving may take
-LONGEST = 1 << 16  # bytes of a request or an answer
-_CREDENTIALS = struct.Struct("3i")  # of a socket's peer: process, user, group
+LONGEST = 1 << 16  # bytes, longest request or answer
+_CREDENTIALS = struct.Struct("3i")  # SO_PEERCRED of a socket: process, user, group
 
 
 class Control(Closing):
-    """Answers requests to save until it is closed.
+    """Server that answers requests to save until it is closed.
 
-    A request is a line of JSON, ``{"path": "FILE.rrd"}``. The first line of the answer comes at once, the
-    second, ``{"saved": ...}`` or ``{"error": ...}``, when it is done.
+    A request is a line of JSON, ``{"path": "FILE.rrd"}``. The first line of the answer comes at once. The
+    second, ``{"saved": ...}`` or ``{"error": ...}``, comes when the saving is done.
 
     Args:
-        save: writes the recording to a path, or to one of its own choice, and returns it.
-        warn: called with one sentence where no socket can be had, so that ``snap`` will not find the process.
+        save: writes the recording to a path, or to a path of its own choice, and returns the path.
+        warn: called with one sentence if no socket can be opened. ``snap`` does not find the process then.
     """
 
     def __init__(self, save: Callable[[Path | None], Path], warn: Callable[[str], None]) -> None:
-        self.save = save  # may be another one later
+        self.save = save  # public, because it may be replaced later
         self._path: Path | None = None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -54,6 +54,7 @@ class Control(Closing):
         self._thread.start()
 
     def close(self) -> None:
+        """Remove the socket and wait for a save in progress."""
         if self._path is None:
             self._socket.close()
             return
@@ -61,9 +62,10 @@ class Control(Closing):
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._socket.close()
-        self._thread.join(PATIENCE)  # it may be saving
+        self._thread.join(PATIENCE)  # a save may be in progress
 
     def _listen(self, folder: Path) -> None:
+        """Open the socket in a folder."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_owned(folder)
         path = folder / f"{os.getpid()}.sock"
@@ -73,6 +75,7 @@ class Control(Closing):
         self._path = path
 
     def _serve(self) -> None:
+        """Answer one request after another until the socket is closed."""
         while True:
             try:
                 connection, _ = self._socket.accept()
@@ -81,13 +84,14 @@ class Control(Closing):
             with connection, suppress(OSError), connection.makefile("rb") as lines:
                 connection.settimeout(ANSWER)
                 request = _line(lines)
-                if request is None:  # somebody only looked who is there
+                if request is None:  # the client only tested whether a process listens
                     continue
                 connection.sendall(b'{"heard": true}\n')
                 connection.settimeout(PATIENCE)
                 connection.sendall(json.dumps(self._answer(request)).encode() + b"\n")
 
     def _answer(self, request: bytes) -> dict[str, str]:
+        """Carry out a request and return the answer."""
         try:
             content = json.loads(request)
             path = content.get("path") if isinstance(content, dict) else 0
@@ -100,13 +104,13 @@ class Control(Closing):
             return {"saved": str(saved.absolute())}
         except UserError as error:
             return {"error": str(error)}
-        except Exception as error:  # it must not end the thread that answers the next one
+        except Exception as error:  # an error must not end the thread that answers the next request
             return {"error": f"{type(error).__name__}: {error}"}
 
 
 @contextmanager
 def unasked(say: Callable[[], None]) -> Iterator[None]:
-    """Until somebody takes SIGUSR1 for an order, it is only answered: it would end the process."""
+    """Answer SIGUSR1 with ``say`` until the run handles it. The default action would end the process."""
     before = signal.signal(signal.SIGUSR1, lambda number, stack: say())
     try:
         yield
@@ -115,14 +119,14 @@ def unasked(say: Callable[[], None]) -> Iterator[None]:
 
 
 def snap(path: Path | None = None, pid: int | None = None) -> Path:
-    """Have the running process save its flight recorder.
+    """Make the running process save its flight recorder.
 
     Args:
-        path: .rrd file; None: named by the time, where that process was told to put it.
-        pid: which process, where several run.
+        path: .rrd file. None: the process names it by the time, in its own folder.
+        pid: process to ask, if several run.
 
     Raises:
-        UserError: none runs, or several do, or it does not answer, or cannot save.
+        UserError: no process runs, several run, the process does not answer, or it cannot save.
     """
     running = _running()
     if pid is not None and pid not in running:
@@ -154,7 +158,7 @@ def snap(path: Path | None = None, pid: int | None = None) -> Path:
 
 
 def folders() -> Iterator[Path]:
-    """Where sockets may be, the best place first."""
+    """Yield the folders that may hold the sockets, the best one first."""
     given = os.environ.get("XDG_RUNTIME_DIR")
     if given:
         yield Path(given, "bevviz")
@@ -165,18 +169,19 @@ def folders() -> Iterator[Path]:
 
 
 def _temporary() -> Path:
+    """Return this user's folder in the folder for temporary files."""
     return Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
 
 
 def _running() -> dict[int, socket.socket]:
-    """A connection to each process of this user that listens; what ended ones left behind is removed."""
+    """Return a connection to each listening process of this user. Remove the sockets of ended processes."""
     found: dict[int, socket.socket] = {}
     for folder in dict.fromkeys(folders()):
         try:
             check_owned(folder)
             paths = sorted(folder.glob("*.sock"))
         except (OSError, UserError):
-            continue  # nobody's who could be trusted
+            continue  # the folder is not safely this user's
         for path in paths:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             connection.settimeout(ANSWER)
@@ -195,6 +200,6 @@ def _running() -> dict[int, socket.socket]:
 
 
 def _line(lines: BinaryIO) -> bytes | None:
-    """The next one; None where the other side has closed, or says more than is sane."""
+    """Read the next line. Return None if the other side has closed or the line is too long."""
     line = lines.readline(LONGEST)
     return line if line.endswith(b"\n") else None

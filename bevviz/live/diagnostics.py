@@ -1,4 +1,4 @@
-"""How bevviz does, for the robot's own monitor: diagnostic_msgs/DiagnosticArray on /diagnostics."""
+"""State of bevviz for the robot's monitor: diagnostic_msgs/DiagnosticArray on /diagnostics."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from bevviz.model.results import FrameResult
 
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
-PERIOD = 1.0  # seconds, as diagnostic_updater has it
+PERIOD = 1.0  # seconds, the usual period of diagnostic_updater
 OK, WARN, ERROR = range(3)
 
 
 class Diagnostics:
-    """Publishes the state of the run each second, whether or not there are frames.
+    """Publisher of the state of the run, each second, with or without frames.
 
-    ``NAME: pipeline`` has latencies, drops and stages that fail, ``NAME: anomalies`` what is worth a look,
-    and ``NAME: sources`` what is said of what is received.
+    ``NAME: pipeline`` has latencies, drops and failed stages. ``NAME: anomalies`` has the anomalies of the
+    newest frame. ``NAME: sources`` has the warnings of the source.
 
     Args:
-        node: an rclpy node, whose remaps hold.
+        node: an rclpy node, whose remaps apply.
 
     Raises:
-        UserError: the type is not known here.
+        UserError: the message type is unknown.
     """
 
     def __init__(self, node: Any) -> None:
@@ -37,23 +37,23 @@ class Diagnostics:
         self._at = 0.0
 
     def every_second(self, publish: Callable[[], None]) -> None:
-        """Have the node's thread call something that calls ``publish``."""
+        """Make a timer of the node call ``publish``. That function calls the method ``publish``."""
         from rclpy.clock import Clock
         from rclpy.clock_type import ClockType
 
-        # Not the node's clock, which stands still where a simulation is paused.
+        # A steady clock. The node's clock stands still while a simulation is paused.
         self._node.create_timer(PERIOD, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def see(self, result: FrameResult) -> None:
-        """The newest one; from any thread."""
+        """Store the newest result. Any thread may call it."""
         self._result, self._at = result, time.monotonic()
 
     def publish(self, numbers: Mapping[str, float], warnings: Sequence[str]) -> None:
-        """Send what holds now.
+        """Publish the current state.
 
         Args:
-            numbers: of the run, by name.
-            warnings: of the source, one sentence each.
+            numbers: numbers of the run, by name.
+            warnings: warnings of the source, one sentence each.
         """
         more = f" (and {len(warnings) - 1} more)" if warnings[1:] else ""
         text = f"{warnings[0]}{more}" if warnings else ""
@@ -68,6 +68,7 @@ class Diagnostics:
         self._publisher.publish(bytes(typestore().serialize_cdr(message, TYPE)))
 
     def _pipeline(self, numbers: Mapping[str, float]) -> Any:
+        """Return the status of the pipeline."""
         result = self._result
         values = {name: f"{value:.1f}".removesuffix(".0") for name, value in numbers.items()}
         if result is None:
@@ -82,12 +83,14 @@ class Diagnostics:
         return self._status("pipeline", WARN if problems else OK, problems[0] if problems else "", values)
 
     def _anomalies(self) -> Any:
+        """Return the status of the anomalies."""
         found = self._result.anomalies if self._result is not None else ()
         text = found[0].text if found else ""
         level = ERROR if any(a.severity == "ERROR" for a in found) else WARN if found else OK
         return self._status("anomalies", level, text, {f"{a.kind} {a.subject}": a.text for a in found})
 
     def _status(self, part: str, level: int, text: str, values: Mapping[str, str]) -> Any:
+        """Return a DiagnosticStatus."""
         types = typestore().types
         pairs = [types["diagnostic_msgs/msg/KeyValue"](key=k, value=v) for k, v in values.items()]
         return types["diagnostic_msgs/msg/DiagnosticStatus"](

@@ -1,6 +1,6 @@
-"""Encodes each frame once, into bytes that every output shares: files, viewers and the flight recorder.
+"""Encoder that turns each frame into bytes once. Files, viewers and the flight recorder share the bytes.
 
-The bytes of consecutive frames, put behind a prelude, are a complete recording.
+A prelude followed by the bytes of consecutive frames is a complete recording.
 """
 
 from __future__ import annotations
@@ -26,46 +26,50 @@ from bevviz.recording.frame_logger import Context, Logger
 from bevviz.recording.sinks import APPLICATION
 from bevviz.support.contexts import Closing
 
-WHOLE = 1.0  # seconds from one frame that needs none before it to the next
+WHOLE = 1.0  # seconds from one whole packet to the next
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One encoded frame. A recording may begin with a ``whole`` one, after the prelude of its context."""
+    """One encoded frame.
+
+    A ``whole`` packet needs none before it: a recording may begin with it, after the prelude of its context.
+    """
 
     data: bytes
     whole: bool
     context: Context
     time: float  # seconds, monotonic
-    thinned: bytes | None = None  # with fewer points, for viewers; None: they get the same
+    thinned: bytes | None = None  # the same frame with fewer points, for viewers; None: viewers get ``data``
 
     @property
     def shown(self) -> bytes:
-        """For viewers."""
+        """Bytes for viewers."""
         return self.data if self.thinned is None else self.thinned
 
 
 class _Stream(Closing):
-    """A recording whose bytes are read back as they are written, through a file in memory."""
+    """Recording in a memory file whose bytes are read back as they are written."""
 
     def __init__(self, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None) -> None:
         self._file = os.memfd_create("recording")
         self._end = 0
         self.recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
         self.recording.set_log_time_enabled(False)
-        # A footer would list every chunk that was ever logged, in memory.
+        # A footer would keep a list of every logged chunk in memory.
         sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)
         self.recording.set_sinks(sink, default_blueprint=blueprint)
 
     def close(self) -> None:
+        """Close the recording and its memory file."""
         self.recording.disconnect()
         os.close(self._file)
 
     def read(self) -> bytes:
-        """What was logged since the last call. Its memory is given back: the file only looks long."""
+        """Return the bytes logged since the last call and free their memory. The file only looks long."""
         self.recording.flush()
         start, end = self._end, os.fstat(self._file).st_size
-        if end <= start:  # the file was cut last time, and nothing came since
+        if end <= start:  # the file was truncated last time and nothing was logged since
             return b""
         self._end = end
         data = os.pread(self._file, end - start, start)
@@ -74,14 +78,15 @@ class _Stream(Closing):
 
 
 class _FrameLogger(Logger):
-    """Sets clouds that viewers shall not have whole aside, to be written once so and once thinned."""
+    """Logger that sets large clouds aside. The encoder writes each once in full and once thinned."""
 
     def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, network: str) -> None:
         super().__init__(recording, config, scene, network=network)
         self.limit: int | None = None  # points
-        self.clouds: list[tuple[str, rr.AsComponents]] = []  # by path, set aside
+        self.clouds: list[tuple[str, rr.AsComponents]] = []  # path and cloud, set aside
 
     def write(self, path: str, *archetypes: rr.AsComponents) -> None:
+        """Log archetypes, or set them aside if they are larger than ``limit``."""
         if self.limit is not None:
             clouds = [one for one in archetypes if is_cloud(one, self.limit)]
             self.clouds += [(path, one) for one in clouds]
@@ -91,19 +96,19 @@ class _FrameLogger(Logger):
 
 
 class Encoder:
-    """Turns results into packets. From any thread.
+    """Converter of results to packets. Any thread may use it.
 
     Args:
-        config: how the results are made.
+        config: configuration of the results.
         scene: names of the sensors.
         blueprint: name of a layout, or a .py or .rbl file.
-        whole: seconds from one whole packet to the next, at most.
-        against: compares with the robot; None: nobody does.
-        clock: seconds, for tests.
-        network: what the detector's runs on; stored in recordings.
+        whole: most seconds from one whole packet to the next.
+        against: comparison with the robot. None: nothing is compared.
+        clock: returns seconds, for tests.
+        network: execution provider of the detector's network, stored in recordings.
 
     Raises:
-        UserError: no such blueprint.
+        UserError: there is no such blueprint.
     """
 
     def __init__(
@@ -120,20 +125,22 @@ class Encoder:
         self._differences: DifferenceLogger | None = None
         self._blueprint = blueprint
         self._step = whole
-        blueprints.load(blueprint, scene)  # what is wrong with it is said at the start
+        blueprints.load(blueprint, scene)  # reports a wrong blueprint at the start
         self._config, self._scene = config, scene
         self._stream = _Stream()
         self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
         self._whole = float("-inf")
         self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
-        self.header = self._stream.read()  # behind it, packets alone are readable, without static data
+        self.header = self._stream.read()  # packets after it can be read, without static data
 
     def close(self) -> None:
+        """Close the recording stream."""
         self._stream.close()
 
     @property
     def context(self) -> Context:
+        """Static context that the prelude of the next packet needs."""
         return self._logger.context
 
     def encode(
@@ -146,9 +153,9 @@ class Encoder:
         states: Mapping[str, str] = MappingProxyType({}),
         compared: Sequence[Compared] = (),
     ) -> Packet:
-        """One frame, and with it whatever is new in the configuration or the scene; see ``Logger.log``.
+        """Encode one frame, with changes of the configuration or scene since the last. See ``Logger.log``.
 
-        ``compared``: how frames so far differ from what the robot made of them.
+        ``compared``: differences from the robot's results, for this frame and earlier ones.
         """
         with self._lock:
             self._follow(result.config, scene)
@@ -168,7 +175,7 @@ class Encoder:
             return Packet(data, whole, self._logger.context, now, thinned)
 
     def _encode_clouds(self, result: FrameResult) -> tuple[bytes, bytes]:
-        """Those of the frame that were set aside: as they are, and thinned."""
+        """Encode the clouds set aside for this frame. Return their bytes in full and thinned."""
         frame, points = result.frame, result.config.live.viewer_points
         assert points is not None
         clouds, self._logger.clouds = self._logger.clouds, []
@@ -183,13 +190,13 @@ class Encoder:
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
     ) -> Packet:
-        """What is to be said while no frame comes; see ``Logger.log_meanwhile``."""
+        """Encode notes and states while no frame comes. See ``Logger.log_meanwhile``."""
         with self._lock:
             self._logger.log_meanwhile(seconds, notes, states)
             return Packet(self._stream.read(), False, self._logger.context, self.clock())
 
     def _follow(self, config: Config, scene: Scene) -> None:
-        """Log whatever is new in them."""
+        """Log what changed in the configuration or the scene."""
         if (config, scene) == (self._config, self._scene):
             return
         if scene != self._scene:
@@ -198,6 +205,7 @@ class Encoder:
         self._logger.reconfigure(config, scene)
 
     def _log_differences(self, compared: Sequence[Compared], whole: bool) -> None:
+        """Log differences from the robot's results."""
         if self._against is None or not (compared or self._differences):
             return
         if self._differences is None:
@@ -208,7 +216,7 @@ class Encoder:
             self._differences.log(one.found, one.received, one.world_from_points)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
-        """The beginning of a recording whose first packet has this context. From any thread."""
+        """Return the beginning of a recording whose first packet has this context. Any thread may call it."""
         layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
             logger = Logger(stream.recording, context.config, context.scene, network=self._network)

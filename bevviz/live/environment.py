@@ -1,4 +1,4 @@
-"""Is there an rclpy that works here? If not, why, and what to do."""
+"""Check of the rclpy installation: whether it works, why not, and what to do about it."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ MEETING = (
     "run in an environment that has that middleware"
 )
 
-# Set by the wheels when they have restarted the interpreter with their library path; a child process of
-# another environment inherits it, but needs another path.
+# The wheels set it after they have restarted the interpreter with their library path. A child process of
+# another environment inherits the variable, but needs another path.
 BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 
 def load_rclpy() -> ModuleType:
-    """Import rclpy, with the message packages that a node needs.
+    """Import rclpy and the message packages that a node needs.
 
     Raises:
-        UserError: none is installed, or the one that is found does not work with this Python and numpy.
+        UserError: rclpy is not installed, or does not work with this Python and numpy.
     """
     sourced = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)[0]
     if int(np.__version__.partition(".")[0]) < 2:
@@ -47,16 +47,18 @@ def load_rclpy() -> ModuleType:
         if error.name == "rclpy":
             raise UserError(f"a live robot needs rclpy, which is not installed; {WHEELS}") from None
         raise UserError(_explain(error, sourced)) from None
-    except (ImportError, AttributeError) as error:  # numpy's own words for an extension of another ABI
+    except (ImportError, AttributeError) as error:  # numpy raises these for an extension of another ABI
         raise UserError(_explain(error, sourced)) from None
     return rclpy
 
 
 def _check_middleware() -> None:
-    """A middleware whose library is missing ends the process from within rclpy, without an exception.
+    """Check that the library of the selected middleware exists.
+
+    Without the library rclpy ends the process, without an exception.
 
     Raises:
-        UserError: RMW_IMPLEMENTATION names one that is not installed.
+        UserError: RMW_IMPLEMENTATION names a middleware that is not installed.
     """
     asked = os.environ.get("RMW_IMPLEMENTATION", "")
     if not asked:
@@ -70,7 +72,7 @@ def _check_middleware() -> None:
 
 
 def middlewares() -> set[str]:
-    """The middlewares whose libraries are installed, by the names that RMW_IMPLEMENTATION takes."""
+    """Return the installed middlewares, by their names for RMW_IMPLEMENTATION."""
     folders = [Path(sys.prefix, "lib"), *(Path(p, "lib") for p in _paths("AMENT_PREFIX_PATH"))]
     folders += map(Path, _paths("LD_LIBRARY_PATH"))
     names = {path.name[3:-3] for folder in folders for path in folder.glob("librmw_*_cpp.so")}
@@ -80,10 +82,12 @@ def middlewares() -> set[str]:
 
 
 def _paths(variable: str) -> list[str]:
+    """Return the paths in an environment variable."""
     return [path for path in os.environ.get(variable, "").split(os.pathsep) if path]
 
 
 def _explain(error: Exception, sourced: str) -> str:
+    """Return the sentence that explains an import error."""
     reason = " ".join(str(error).split())
     if "shared object" in reason and BOOTSTRAPPED in os.environ:
         return f"the wheels do not find their libraries ({reason}): start bevviz in a new shell"

@@ -1,4 +1,4 @@
-"""Recordings on disk: written as they come, in parts that each open on their own, until the disk is full."""
+"""Recordings on disk. Frames are written as they come, in parts that open on their own."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from bevviz.recording import rerun_cli
 from bevviz.support.files import create, is_locked, lock, rename_new, write_all
 
 MEGABYTE = 1_000_000
-INDEX = ".bevviz-index-"  # and eight digits: how a file ends while its index is made
-INDEXED = 1000 * MEGABYTE  # the index is made in memory; a larger file stays without
+INDEX = ".bevviz-index-"  # followed by eight hex digits: suffix of a file while its index is made
+INDEXED = 1000 * MEGABYTE  # bytes; the index is made in memory, so a larger file gets none
 
 
 class Indexer:
-    """Gives finished recordings their index and merges their many small chunks, in the background.
+    """Worker that gives finished recordings an index and merges their small chunks, in the background.
 
-    Without it they open as well, but slowly. Where it cannot be done, the file stays as it is. The work ends
-    with this process; what one that was killed has left is removed by the next one beside it.
+    A recording without an index opens too, but slowly. If the work fails, the file stays as it is. The work
+    ends with this process. The next process removes the leftovers of a killed one in the same folder.
     """
 
     def __init__(self) -> None:
@@ -38,20 +38,22 @@ class Indexer:
 
     @property
     def waiting(self) -> int:
-        """Files that are not done."""
+        """Number of files that are not done."""
         return self._waiting
 
     def add(self, path: Path) -> None:
+        """Queue a file, unless it is too large."""
         if path.stat().st_size <= INDEXED:
-            with suppress(RuntimeError):  # closed already: it stays as it is
+            with suppress(RuntimeError):  # the indexer is closed, so the file stays as it is
                 self._worker.submit(self._index, path)
                 self._waiting += 1
 
     def close(self) -> None:
-        """Finish what is waiting."""
+        """Finish the queued files."""
         self._worker.shutdown()
 
     def _index(self, path: Path) -> None:
+        """Write an indexed copy and replace the file with it."""
         indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
         optimize = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
         handle = create(indexed)
@@ -74,7 +76,11 @@ class Indexer:
 
 
 def check_name(path: Path, *suffixes: str) -> None:
-    """Raises UserError where nothing is to be written: a slip must not overwrite something else."""
+    """Check the name of a file to write. A slip must not overwrite another file.
+
+    Raises:
+        UserError: the suffix is wrong, or the folder does not exist.
+    """
     if path.suffix not in suffixes:
         raise UserError(f"--save {path}: expected a file name that ends in {' or '.join(suffixes)}")
     if not path.absolute().parent.is_dir():
@@ -82,7 +88,7 @@ def check_name(path: Path, *suffixes: str) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete indexes that no process is making any more. Their recordings are there without them."""
+    """Delete unfinished index files of ended processes. Their recordings are complete without them."""
     for path in folder.glob(f"*{INDEX}????????"):
         with suppress(OSError, UserError):
             handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -94,17 +100,17 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def unused_names(*paths: Path) -> list[Path]:
-    """Return free names for the files of a run: those asked for, or all with the same number.
+    """Return free names for the files of a run. All get the same number, or none.
 
     A name is taken by a recording, a bag, a part or an unfinished file. So drive-2.rrd and drive-2.mcap
-    belong to one run, and no run writes over another one's files.
+    belong to one run, and no run overwrites the files of another.
     """
     number = max((_runs(path) for path in paths), default=0) + 1
     return [path if number == 1 else path.with_stem(f"{path.stem}-{number}") for path in paths]
 
 
 def _runs(path: Path) -> int:
-    """Return the number of the last run that has files of this name, 0 where the name is free."""
+    """Return the number of the last run with files of this name, or 0 if the name is free."""
     if path.exists() and not path.is_file():
         return 0  # a device
     name = re.compile(
@@ -116,9 +122,9 @@ def _runs(path: Path) -> int:
 
 
 def complete_leftovers(path: Path, notes: Notes) -> None:
-    """Complete the bags that killed runs with the same ``--save FILE.mcap`` have left, and say so.
+    """Complete the bags that killed runs with the same ``--save FILE.mcap`` left, and report each.
 
-    Each gets the name that it would have had, or its unfinished name without ".partial" where that is taken.
+    Each gets its final name. If that is taken, it gets its unfinished name without ".partial".
     """
     name = re.compile(re.escape(path.stem) + r"(?:-[1-9]\d{0,5})?(?:_\d{3,})?\.partial-[0-9a-f]{8}\.mcap")
     for left in sorted(path.parent.iterdir()):
@@ -134,6 +140,7 @@ def complete_leftovers(path: Path, notes: Notes) -> None:
 
 
 def _give_name(left: Path) -> Path:
+    """Rename a completed bag and return its new path."""
     stem, _, key = left.stem.rpartition(".partial-")
     for whole in (left.with_stem(stem), left.with_stem(f"{stem}-{key}")):
         with suppress(FileExistsError):
@@ -143,11 +150,10 @@ def _give_name(left: Path) -> Path:
 
 
 class Saver(Output):
-    """Writes every packet to ``path``, or with a limit of size or time to ``path`` numbered.
+    """Output that writes every packet to ``path``. With a limit of size or time, ``path`` is numbered.
 
-    No existing file is overwritten; ``unused_names`` gives names that are free.
-
-    A full disk is said once and ends the saving, nothing else; what is on it is cut to whole frames.
+    No existing file is overwritten. ``unused_names`` gives free names. A full disk is reported once and ends
+    the saving only. The file is then truncated to whole frames.
 
     Raises:
         UserError: the name does not end in .rrd, or the file cannot be written.
@@ -160,7 +166,7 @@ class Saver(Output):
         check_name(path, ".rrd")
         remove_leftovers(path.parent)
         self.paths: list[Path] = []
-        self.on_part: Callable[[], None] = lambda: None  # called when a further one begins
+        self.on_part: Callable[[], None] = lambda: None  # called when a further part begins
         self._path = path
         self._size = config.split_size and config.split_size * MEGABYTE
         self._time = config.split_time
@@ -177,12 +183,14 @@ class Saver(Output):
         self._thread.start()
 
     def close(self) -> None:
+        """Write the waiting packets and finish the last part."""
         self._packets.close()
         self._thread.join()
         if not self._ended.is_set():
             self._finish()
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
+        """Write a packet. Begin a new part first if the current one is complete."""
         try:
             if packet.whole and self._is_complete(packet):
                 self._finish()
@@ -201,18 +209,21 @@ class Saver(Output):
 
     @property
     def _next(self) -> Path:
+        """Path of the next part."""
         if self._size is None and self._time is None:
             return self._path
         return self._path.with_stem(f"{self._path.stem}_{len(self.paths):03d}")
 
     def _is_complete(self, packet: Packet) -> bool:
+        """Return whether the part has reached its limit of size or time."""
         if not self._written:
             return False
-        # As much again will come before the next chance to end the part.
+        # The part can end next after about as many bytes again.
         large = self._size is not None and 2 * self._written - self._whole > self._size
         return large or (self._time is not None and packet.time - self._started >= self._time)
 
     def _open(self) -> None:
+        """Create the file of the next part."""
         path = self._next
         if path.exists() and not path.is_file():
             self._file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)  # a device
@@ -222,21 +233,23 @@ class Saver(Output):
         self._written = self._whole = 0
 
     def _write(self, data: bytes) -> None:
+        """Write bytes. On an error, truncate the file to its last complete write."""
         try:
             write_all(self._file, data)
         except OSError:
-            with suppress(OSError):  # no file but a device
+            with suppress(OSError):  # a device cannot be truncated
                 os.ftruncate(self._file, self._written)
             os.close(self._file)
             raise
         self._written += len(data)
 
     def _finish(self) -> None:
+        """Close the part and queue its index. Delete the file if it is empty."""
         if self._written:
             os.close(self._file)
             self._indexer.add(self.paths[-1])
             return
-        if self.paths[-1].is_file():  # and no device
+        if self.paths[-1].is_file():  # a device is not removed
             path = self.paths.pop()
             with suppress(OSError):
                 path.unlink()

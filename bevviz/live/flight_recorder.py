@@ -1,4 +1,4 @@
-"""The flight recorder: the last seconds stay in memory, to be saved when something has gone wrong."""
+"""Flight recorder: buffer of the last seconds in memory, saved on request."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from bevviz.support.files import write_all
 
 
 class FlightRecorder:
-    """Holds the packets of the last ``live.flight_time``, within ``live.flight_size``; ``save`` writes them.
+    """Buffer of the packets of the last ``live.flight_time``, limited by ``live.flight_size``.
 
-    Saving takes no packet away and holds nothing up.
+    ``save`` writes the packets. It removes none and does not delay the run.
     """
 
     def __init__(self, config: LiveConfig, encoder: Encoder, indexer: Indexer) -> None:
@@ -32,11 +32,12 @@ class FlightRecorder:
 
     @property
     def size(self) -> int:
-        """Bytes held."""
+        """Bytes in the buffer."""
         with self._held:
             return self._size
 
     def put(self, packet: Packet) -> None:
+        """Add a packet and drop old ones."""
         with self._held:
             if self.config.flight_time == 0 or not (self._packets or packet.whole):
                 return
@@ -45,7 +46,7 @@ class FlightRecorder:
             self._forget(packet.time - self.config.flight_time)
 
     def _forget(self, before: float) -> None:
-        """Drop what is too old or too much, up to a packet that needs none before it."""
+        """Drop packets that are too old or too many. The first one left is a whole packet."""
         limit = self.config.flight_size * MEGABYTE
         while self._packets and (
             self._packets[0].time < before or self._size > limit or not self._packets[0].whole
@@ -53,19 +54,19 @@ class FlightRecorder:
             self._size -= len(self._packets.popleft().data)
 
     def held(self) -> list[Packet]:
-        """The packets, oldest first."""
+        """Return the packets, oldest first."""
         with self._held:
             return list(self._packets)
 
     def save(self, path: Path | None = None, packets: list[Packet] | None = None) -> Path:
-        """Write what is held as a complete recording; from any thread.
+        """Write the packets as a complete recording. Any thread may call it.
 
         Args:
-            path: .rrd file, not overwritten; None: named by the time, in ``live.flight_folder``.
-            packets: that ``held`` gave earlier; None: now.
+            path: .rrd file, not overwritten. None: named by the time, in ``live.flight_folder``.
+            packets: earlier result of ``held``. None: the packets held now.
 
         Raises:
-            UserError: nothing is held yet, or the file cannot be written.
+            UserError: there is no packet yet, or the file cannot be written.
         """
         packets = self.held() if packets is None else packets
         if not packets:
@@ -86,6 +87,7 @@ class FlightRecorder:
         return target
 
     def _write(self, target: Path, packets: list[Packet]) -> None:
+        """Write a prelude and the packets."""
         file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
             write_all(file, self._encoder.prelude(packets[0].context))
@@ -99,7 +101,7 @@ class FlightRecorder:
 
 
 def _unused(folder: Path) -> Path:
-    """Named by the time; with a number where that is taken."""
+    """Return a free path in a folder, named by the time. If that name is taken, it gets a number."""
     stem = time.strftime("flight_%Y%m%dT%H%M%S")
     names = (folder / f"{stem}{suffix}.rrd" for suffix in ("", *(f"_{n}" for n in range(1, 1000))))
     return next(path for path in names if not (path.exists() or path.with_suffix(".mcap").exists()))

@@ -1,4 +1,4 @@
-"""What is published on the graph, by whom and with which quality of service."""
+"""Topics of the ROS graph: their publishers and quality of service."""
 
 from __future__ import annotations
 
@@ -8,24 +8,27 @@ from typing import Any
 
 from bevviz.live.node import Node
 
-UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's name of a node whose publishers were met before itself
-LATCHED_DEPTH = 100  # one message of each node that states static transforms
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's node name for a publisher that is discovered before its node
+LATCHED_DEPTH = 100  # one message of each node that publishes static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
-PACKET_DEPTH = (
-    512  # single packets of a LiDAR, some thousand a second: those of the time that a scan is decoded
-)
+PACKET_DEPTH = 512  # LiDAR packets, about 1000 a second: those that arrive while a scan is decoded
 
 
 @dataclass(frozen=True, slots=True)
 class PublishedTopic:
+    """Topic that at least one other node publishes."""
+
     name: str
     type: str
     publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo of other nodes
 
 
 def published_topics(session: Node) -> dict[str, PublishedTopic]:
-    """Every topic that somebody else publishes; in a namespace, its own topics and those it lacks."""
+    """Return every topic that another node publishes.
+
+    In a namespace these are its own topics. Topics outside are added for types that it lacks.
+    """
     found = {}
     for name, _ in session.input.get_topic_names_and_types():
         publishers = session.input.get_publishers_info_by_topic(name)
@@ -38,11 +41,11 @@ def published_topics(session: Node) -> dict[str, PublishedTopic]:
 
 
 def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
-    """The strongest quality of service that every publisher offers.
+    """Return the strongest quality of service that every publisher offers.
 
-    Reliable where all are; with one best-effort publisher, best effort serves them all. Latched messages
-    are asked for where anybody latches: a volatile publisher beside is then told by ``mismatches``, while
-    the other way round static transforms would be missed in silence.
+    The subscription is reliable if all publishers are. One best-effort publisher makes it best effort. It
+    asks for latched messages if any publisher latches. ``mismatches`` then reports a volatile publisher of
+    the same topic. The other choice would lose static transforms silently.
     """
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
@@ -59,7 +62,7 @@ def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
 
 
 def describe_qos(topic: PublishedTopic) -> str:
-    """Who publishes a topic, and how."""
+    """Return a text with the publishers of a topic and their quality of service."""
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
     lines = []
@@ -73,14 +76,14 @@ def describe_qos(topic: PublishedTopic) -> str:
 
 
 def full_name(publisher: Any) -> str:
-    """Of the node that a publisher belongs to."""
+    """Return the full name of a publisher's node."""
     if publisher.node_name == UNKNOWN:
         return "a node that does not say its name"
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
 def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
-    """The publishers that a subscription with ``qos`` cannot hear, and why, one sentence each."""
+    """Yield one sentence for each publisher that a subscription with ``qos`` cannot receive."""
     from rclpy.qos import QoSCompatibility, qos_check_compatible
 
     for publisher in topic.publishers:

@@ -1,4 +1,4 @@
-"""What is on a running graph: topics, sensors, transforms, and what is missing for a full run."""
+"""Description of a running graph: topics, sensors, transforms, and gaps for a full run."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from bevviz.pipeline.bag_info import (
 )
 
 LISTEN = 3.0  # seconds
-PATIENCE = 10.0  # seconds until what is there so far is shown
+PATIENCE = 10.0  # seconds until the topics found so far are shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveInfo(Contents):
-    """What ``bevviz info --live`` prints."""
+    """Content of ``bevviz info --live``."""
 
     domain: int
     middleware: str
-    seconds: float  # that were listened for
+    seconds: float  # listening time
 
 
 def describe(
@@ -42,12 +42,12 @@ def describe(
 ) -> LiveInfo:
     """Listen to the graph for ``seconds``, counted from when the topics have their roles. Ctrl-C ends it.
 
-    After ``patience`` seconds what is there by then is shown.
+    After ``patience`` seconds without all roles, the topics found so far are described.
 
     Raises:
-        UserError: no working rclpy, or arguments that it refuses.
+        UserError: rclpy does not work, or refuses the arguments.
     """
-    # Under a name of its own: what another bevviz publishes is shown, too.
+    # A separate node name, so that the topics of another bevviz are shown too.
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         with suppress(KeyboardInterrupt):
             source.wait(patience)
@@ -82,6 +82,7 @@ def describe(
 
 
 def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
+    """Receive frames for ``seconds`` and return the last one."""
     timer = threading.Timer(seconds, source.stop)
     timer.start()
     last: deque[Frame] = deque(maxlen=1)
@@ -95,6 +96,7 @@ def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
 
 
 def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, seconds: float) -> TopicInfo:
+    """Return the description of one topic."""
     heard = topic.name in source.received
     stream = heard and topic.name not in source.roles.tf_static
     role = source.roles.notes.get(topic.name, "")
@@ -111,7 +113,7 @@ def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, s
 
 
 def render(info: LiveInfo) -> str:
-    """The description as text for a terminal of 100 columns."""
+    """Return the description as text for a terminal of 100 columns."""
     about = {
         "graph": f"ROS_DOMAIN_ID {info.domain}, {info.middleware}",
         "time": f"{info.seconds:.1f} s listened, {sum(t.count or 0 for t in info.topics)} messages",
