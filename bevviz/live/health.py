@@ -1,4 +1,4 @@
-"""How the process itself does: latencies, drops, CPU and memory."""
+"""Health of the process: latencies, CPU and memory."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from bevviz.recording import entities
 
 RECENT = 100  # frames that percentiles are taken over
 SAMPLE = 1.0  # seconds between two looks at CPU and memory
-LONGEST = 60.0  # seconds; a latency beyond it, or below zero, is a clock that jumped
-JUMP = 0.5  # seconds that the clock may be off its course
+LONGEST = 60.0  # seconds; a latency beyond it, or below zero, comes from a clock that jumped
+JUMP = 0.5  # seconds of drift against the monotonic clock that count as a jump
 
 
 class Health:
-    """Call ``logged`` for each frame; ``scalars`` are for the next one."""
+    """Meter of latencies, CPU and memory.
+
+    Call ``logged`` for each frame. Log ``scalars`` with the next frame.
+    """
 
     def __init__(self) -> None:
         self.latencies: deque[float] = deque(maxlen=RECENT)  # seconds
-        self.histogram = np.zeros(1001, np.int64)  # of all latencies, in ms; the last holds what is longer
+        self.histogram = np.zeros(1001, np.int64)  # all latencies, bins of 1 ms; the last is open
         self.cpu = 0.0  # percent of one core
         self.memory = 0.0  # MB
         self._sampled = time.monotonic()
@@ -31,17 +34,22 @@ class Health:
         self._course = time.time() - time.monotonic()
 
     def logged(self, received: int) -> None:
-        """A frame whose cloud was received at this time (nanoseconds since 1970) is with every output."""
+        """Record the latency of a frame that every output has.
+
+        Args:
+            received: time of receipt of its cloud, nanoseconds since 1970.
+        """
         latency = time.time() - received * 1e-9
         if 0 <= latency < LONGEST:
             self.latencies.append(latency)
             self.histogram[min(int(1e3 * latency), 1000)] += 1
 
     def percentile(self, percent: float) -> float:
-        """Seconds from arrival to logged; NaN before the first frame."""
+        """Return a percentile of the seconds from arrival to logged. It is NaN before the first frame."""
         return float(np.percentile(self.latencies, percent)) if self.latencies else float("nan")
 
     def scalars(self) -> dict[str, float]:
+        """Return the values to log, by entity path. Latencies are in ms."""
         self._sample()
         return {
             entities.latency("p50"): 1e3 * self.percentile(50),
@@ -51,12 +59,13 @@ class Health:
         }
 
     def clock_jump(self) -> float:
-        """Seconds that the clock has jumped since the last call; 0 where it has not."""
+        """Return the seconds that the clock has jumped since the last call, or 0."""
         course = time.time() - time.monotonic()
         jump, self._course = course - self._course, course
         return jump if abs(jump) > JUMP else 0.0
 
     def _sample(self) -> None:
+        """Measure CPU and memory, at most once in ``SAMPLE``."""
         now, busy = time.monotonic(), time.process_time()
         if now - self._sampled < SAMPLE and self.memory:
             return
@@ -66,21 +75,21 @@ class Health:
 
 
 def memory() -> float:
-    """MB of this process that are in memory."""
+    """Return the resident memory of this process in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def give_way() -> None:
-    """This thread does what has time: everything else on this machine goes first."""
+    """Give the current thread the lowest priority."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
 
 
 def set_nice(nice: int) -> None:
-    """Of every thread: on Linux each has its own.
+    """Set the priority of every thread of this process. On Linux each thread has its own.
 
     Raises:
-        PermissionError: only root may take priority back.
+        PermissionError: only root may raise the priority again.
     """
     for task in Path("/proc/self/task").iterdir():
         os.setpriority(os.PRIO_PROCESS, int(task.name), nice)

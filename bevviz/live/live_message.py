@@ -1,4 +1,4 @@
-"""A message of a running ROS 2 graph, as it came."""
+"""Serialised message of a running ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -18,20 +18,24 @@ from bevviz.messages.vision_msgs import deserialize
 
 @dataclass(frozen=True, slots=True)
 class LiveMessage:
+    """Message as received, or the packets of one Ouster scan."""
+
     topic: str
     type: str
-    received: int  # nanoseconds, when the middleware had it
+    received: int  # nanoseconds, time of receipt by the middleware
     data: bytes  # CDR
-    sensor: ouster.Sensor | None = None  # an Ouster, whose packets make a scan
+    sensor: ouster.Sensor | None = None  # the Ouster whose packets make a scan
     packets: tuple[ouster.Packet, ...] = ()
 
     def header(self) -> tuple[int, str]:
+        """Return the stamp in nanoseconds and the frame id of the header."""
         return read_header(self.data, "<" if self.data[1:2] != b"\0" else ">", self.topic)
 
     def decode(self, calibration: Mapping[str, str] = MappingProxyType({})) -> Any:
-        """The message as an object with the fields of its definition.
+        """Return the message as an object with the fields of its definition.
 
-        ``calibration`` is that of the LiDARs, by topic, as ``source.lidar_calibration`` has it.
+        ``calibration`` holds the calibration files of the LiDARs by topic, as in
+        ``source.lidar_calibration``.
 
         Raises:
             MessageError: the data does not fit the definition.
@@ -42,5 +46,5 @@ class LiveMessage:
         return decode_message(self, self.data, self._deserialized, serialization)
 
     def _deserialized(self, data: bytes | memoryview) -> Any:
-        """Return the message as its definition has it."""
+        """Return the message as an object of its definition."""
         return deserialize(store_of(self.type), data, self.type)

@@ -1,4 +1,4 @@
-"""What has to be said while a robot is watched: on the terminal, and in the recording beside the frames."""
+"""Messages to the user during a live run: on the terminal and in the recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Notes:
-    """One sentence each, from any thread.
+    """Collector of messages to the user, one sentence each. Any thread may use it.
 
     Args:
         say: prints a line.
@@ -19,13 +19,15 @@ class Notes:
         self._waiting: list[tuple[str, str]] = []
 
     def info(self, text: str) -> None:
+        """Print and record a sentence."""
         self._add("INFO", text, text)
 
     def warn(self, text: str) -> None:
+        """Print and record a warning."""
         self._add("WARN", text, f"warning: {text}")
 
     def take(self) -> list[tuple[str, str]]:
-        """Level and text of what was said since the last call."""
+        """Return level and text of the messages since the last call."""
         with self._lock:
             taken, self._waiting = self._waiting, []
         return taken
@@ -33,5 +35,5 @@ class Notes:
     def _add(self, level: str, text: str, line: str) -> None:
         with self._lock:
             self._waiting.append((level, text))
-            del self._waiting[:-100]  # nobody takes them while no frame comes
+            del self._waiting[:-100]  # keeps the list short while no frame takes the messages
         self._say(line)

@@ -1,4 +1,4 @@
-"""The Ousters of a graph: what their metadata say, and the scans that their packets make."""
+"""Ouster sensors of a graph: their metadata, and the scans made of their packets."""
 
 from __future__ import annotations
 
@@ -14,40 +14,42 @@ from bevviz.messages.topics import NOT_LIDAR, Topic
 
 
 class Ousters:
-    """For one thread, which receives.
+    """Ouster sensors by topic of packets. Only the receiving thread may use it.
 
-    A topic of packets is a LiDAR's once its metadata are known: those of a file, else of the topic beside it.
+    A topic of packets belongs to a LiDAR once its metadata are known. They come from a file, or else from the
+    metadata topic beside it.
     """
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}  # topic of packets -> its metadata
         self._scans: dict[str, ouster.Scans] = {}
-        self._imus: set[str] = set()  # topics whose packets are too small for a LiDAR's
+        self._imus: set[str] = set()  # topics whose packets are too small for a LiDAR
         self._beside: dict[str, set[str]] = {}  # topic of metadata -> topics of packets
 
     @property
     def metadata(self) -> Set[str]:
-        """The topics that metadata are expected on."""
+        """Topics on which metadata are expected."""
         return self._beside.keys()
 
     @property
     def packets(self) -> Set[str]:
-        """The topics whose packets make scans."""
+        """Topics whose packets make scans."""
         return self._scans.keys() - self._imus
 
     def look(self, topics: Iterable[Topic], calibration: Mapping[str, str]) -> list[Topic]:
-        """The same topics, those of packets with what is known of them.
+        """Return the same topics. Topics of packets get the known facts about them.
 
         Args:
-            topics: all that there are.
-            calibration: as ``source.lidar_calibration`` has it.
+            topics: all topics of the graph.
+            calibration: metadata files by topic, as in ``source.lidar_calibration``.
 
         Raises:
-            UserError: a file of metadata cannot be used.
+            UserError: a metadata file cannot be used.
         """
         return [self._look(topic, calibration) for topic in topics]
 
     def _look(self, topic: Topic, calibration: Mapping[str, str]) -> Topic:
+        """Return one topic with the known facts about it."""
         name = topic.name
         if not ouster.is_packet(topic.type):
             return topic
@@ -63,15 +65,16 @@ class Ousters:
         return replace(topic, aside=ouster.waits(name))
 
     def _add(self, topic: str, text: str, where: str) -> None:
+        """Set the metadata of a topic of packets."""
         if self._texts.get(topic) != text:
             self._scans[topic] = ouster.Scans(ouster.read_sensor(text, where))
             self._texts[topic] = text
 
     def add_metadata(self, topic: str, text: str) -> bool:
-        """What came on a topic of metadata; whether it differs from what came before.
+        """Take in a message of a metadata topic. Return whether it differs from the last one.
 
         Raises:
-            MessageError: they are none, or of a sensor that is not decoded here.
+            MessageError: the text is not metadata, or the sensor is not supported.
         """
         names = self._beside[topic]
         changed = any(self._texts.get(name, text) != text for name in names)
@@ -83,13 +86,14 @@ class Ousters:
         return changed
 
     def sensor(self, topic: str) -> ouster.Sensor:
+        """Return the sensor of a topic of packets."""
         return self._scans[topic].sensor
 
     def add_packet(self, topic: str, received: int, data: bytes) -> Iterator[tuple[ouster.Packet, ...]]:
-        """The scans that are whole with this message.
+        """Yield the scans that are complete with this message.
 
         Raises:
-            MessageError: it is no packet of the sensor that the metadata are of.
+            MessageError: the packet does not fit the sensor of the metadata.
         """
         packet, scans = ouster.payload(data, ros1=False), self._scans[topic]
         if len(packet) != scans.sensor.size:

@@ -1,4 +1,4 @@
-"""What takes the packets: each output in a thread of its own, so that a slow one holds nobody up."""
+"""Base class of the outputs. Each has its own thread, so that a slow one delays no other."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from bevviz.support.queues import NewestQueue
 
 
 class Output(ABC):
-    """Packets that it is too slow for are left out and counted; after a gap it goes on at a whole one.
+    """Consumer of packets. Packets that overflow its queue are dropped and counted.
+
+    After a gap it continues at a whole packet.
 
     Args:
-        name: for the health of the run.
-        queue: packets that may wait.
+        name: name in the health of the run.
+        queue: most packets that may wait.
     """
 
     def __init__(self, name: str, queue: int) -> None:
@@ -25,31 +27,36 @@ class Output(ABC):
 
     @property
     def dropped(self) -> int:
+        """Packets dropped so far."""
         return self._packets.dropped
 
     @property
     def lag(self) -> float | None:
-        """Seconds that who watches is behind; None: nobody does, or there is no way to know."""
+        """Seconds that the viewer is behind. None: there is no viewer, or its lag is unknown."""
         return None
 
     def put(self, packet: Packet) -> None:
-        """Never waits."""
+        """Queue a packet. It never waits."""
         self._packets.put(packet)
 
     @abstractmethod
     def close(self) -> None:
-        """Hand over what waits, and end."""
+        """Write the waiting packets and end."""
 
     @abstractmethod
     def _take(self, packet: Packet, fresh: bool) -> bool:
-        """Write a packet, ``fresh`` after a gap. False: that failed, go on at a whole one."""
+        """Write a packet. Return False if that failed; the output then continues at a whole packet.
+
+        ``fresh``: the packet is the first after a gap.
+        """
 
     def _end(self) -> None:
-        """Take nothing more."""
+        """Accept no more packets."""
         self._ended.set()
         self._packets.close()
 
     def _run(self) -> None:
+        """Write the queued packets until the queue is closed."""
         dropped, in_step = 0, False
         for packet in self._packets:
             if self._ended.is_set():

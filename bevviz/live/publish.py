@@ -1,4 +1,4 @@
-"""What the tutorial's four nodes publish, from bevviz's results, and tracks: for RViz, and to stand in."""
+"""Publisher of the results on the topics of the tutorial's four nodes, and of the tracks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DETECTIONS = "/detection/camera_2d"
 FUSED = "/detection/fused_3d"
 TRACKS = "/detection/tracks_3d"
 MARKERS = "/visualization/tracks"
-SPEED = "speed_m_s"  # class of a track's second result, whose score it is
+SPEED = "speed_m_s"  # class of a track's second result; the score of that result is the speed
 TOPICS = {
     BEV: "sensor_msgs/msg/Image",
     OBSTACLES: "sensor_msgs/msg/PointCloud2",
@@ -42,16 +42,16 @@ TOPICS = {
 
 
 class Publisher:
-    """Publishes each result that somebody subscribes to, under the header of its cloud or image.
+    """Publisher of each result that has a subscriber, with the header of its cloud or image.
 
-    Clusters are those that were kept, with ``cluster_<row>`` as their class. Fused boxes are the named
-    ones; the class follows behind ``cluster_<row>``, where the tutorial's nodes look for it. Tracks have
-    their number as ``id`` and behind the class their speed; as markers any RViz shows them.
+    Clusters are the kept ones, with ``cluster_<row>`` as their class. Fused boxes are the objects with a
+    class. Their class is the second result, after ``cluster_<row>``, where the tutorial's nodes look for it.
+    Tracks have their number as ``id``, and their speed as the second result. Any RViz shows them as markers.
 
     Args:
-        node: an rclpy node, whose remaps hold.
-        config: which boxes clusters have.
-        tell: called with one sentence each, for topics that cannot be published.
+        node: an rclpy node, whose remaps apply.
+        config: selects the boxes of the clusters.
+        tell: called with one sentence for each topic that cannot be published.
     """
 
     def __init__(self, node: Any, config: Config, tell: Callable[[str], None] = lambda text: None) -> None:
@@ -64,10 +64,11 @@ class Publisher:
                 tell(f"{topic} is not published: {error}")
 
     def configure(self, config: Config) -> None:
+        """Set the configuration."""
         self._config = config
 
     def publish(self, result: FrameResult) -> None:
-        """Send what there is of a frame. Several cameras take turns on one topic."""
+        """Publish the results of a frame. Several cameras take turns on one topic."""
         frame = result.frame
         stamp, frame_id = frame.stamp, frame.points_frame
         back = None if frame.upright is None else geometry.inverse(frame.upright)
@@ -92,7 +93,7 @@ class Publisher:
             self._send_tracks(result, result.tracks, back)
 
     def _send_tracks(self, result: FrameResult, tracks: Tracks, back: F64 | None) -> None:
-        """Those that have a name, in the fixed frame where there is one."""
+        """Publish the confirmed tracks, in the fixed frame if there is one."""
         stamp, pose = result.frame.stamp, None if tracks.absolute else back
         rows = np.flatnonzero(tracks.confirmed)
         boxes, speed = _rows(tracks.boxes, rows), tracks.speed
@@ -107,6 +108,7 @@ class Publisher:
             self._send(MARKERS, markers)
 
     def _send_detections(self, result: FrameResult) -> None:
+        """Publish the kept detections of each camera."""
         for camera in result.cameras:
             image, found = camera.camera.image, camera.detections
             if image is None or found is None:
@@ -116,16 +118,20 @@ class Publisher:
             self._send(DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, found.xyxy[rows], results))
 
     def _wanted(self, topic: str) -> bool:
+        """Return whether a topic has a subscriber."""
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_subscription_count() > 0
 
     def _send(self, topic: str, message: Any) -> None:
+        """Serialise a message and publish it."""
         self._publishers[topic].publish(bytes(typestore().serialize_cdr(message, TOPICS[topic])))
 
 
 def _moved(points: F32, pose: F64 | None) -> F32:
+    """Return points moved by a pose, or as they are without one."""
     return points if pose is None else geometry.apply(pose, points)
 
 
 def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:
+    """Return the boxes of the given rows."""
     return Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])

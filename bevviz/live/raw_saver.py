@@ -1,4 +1,4 @@
-"""``--save FILE.mcap``: the messages on disk as they come, in parts that each run on their own."""
+"""Output of ``--save FILE.mcap``: writes the messages as they come, in parts that run on their own."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import RawMessage, RawRecorder, define
 from bevviz.support.contexts import Closing
 
-WAITING = 200 * MEGABYTE  # of messages that wait for a slow disk
+WAITING = 200 * MEGABYTE  # bytes of messages that may wait for a slow disk
 
 
 class RawSaver(Closing):
-    """Writes every message, from those that are held already.
+    """Writer of every message to a bag. It begins with the messages that the recorder holds.
 
-    A part that is being written is NAME.partial-XXXXXXXX.mcap. It begins with what holds from before and with
-    the last seconds of the part before it, so that its first scan has what belongs to it. A full disk is
-    said once and ends the saving, nothing else; what is on it is a whole file. Messages that a disk is too
-    slow for are left out and counted. No existing file is overwritten.
+    A part in progress is NAME.partial-XXXXXXXX.mcap. It begins with the earlier messages that are still valid
+    and with the last seconds of the part before, so that its first scan is complete. A full disk is reported
+    once and ends the saving only. The file is then complete. Messages that a slow disk cannot take are
+    dropped and counted. No existing file is overwritten.
 
     Args:
-        path: the .mcap file; with a limit of size or time it is numbered.
+        path: the .mcap file. With a limit of size or time it is numbered.
         config: the limits.
-        raw: where the messages come from.
-        notes: what has to be said.
-        follows: a new part begins with ``next_part`` alone, as where parts of an .rrd file lead.
+        raw: source of the messages.
+        notes: takes messages to the user.
+        follows: a new part begins only with ``next_part``. It is used beside an .rrd file, whose parts lead.
 
     Raises:
         UserError: the file cannot be written.
@@ -60,7 +60,7 @@ class RawSaver(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the waiting messages and end."""
         self._raw.detach(self._put)
         with self._changed:
             self._ended = True
@@ -68,16 +68,18 @@ class RawSaver(Closing):
         self._thread.join()
 
     def next_part(self) -> None:
-        """From any thread."""
+        """Begin a new part. Any thread may call it."""
         if not self._ended:
             self._raw.begin_again(self._begin)
 
     def _begin(self, messages: Sequence[RawMessage]) -> None:
+        """Queue the beginning of a part."""
         with self._changed:
             self._queue.append(messages)
             self._changed.notify()
 
     def _put(self, message: RawMessage) -> None:
+        """Queue a message, or drop it if too many bytes wait."""
         with self._changed:
             if self._ended or self._waiting + len(message.data) > WAITING:
                 self.dropped += not self._ended
@@ -87,8 +89,9 @@ class RawSaver(Closing):
             self._changed.notify()
 
     def _open(self) -> McapWriter:
+        """Open the next part."""
         number = f"_{len(self.paths):03d}" if self._numbered else ""
-        # As `ros2 bag record` does by itself: what is saved must not take the CPU from what it is saved for.
+        # No compression, as with `ros2 bag record`. It would take CPU time from the robot.
         path = self._path.with_stem(f"{self._path.stem}{number}")
         part = McapWriter(path, define, compress=False, replace=False)
         part.__enter__()
@@ -96,6 +99,7 @@ class RawSaver(Closing):
         return part
 
     def _run(self) -> None:
+        """Write until closed. Report an error and end the saving."""
         try:
             self._write()
         except UserError as error:
@@ -110,7 +114,8 @@ class RawSaver(Closing):
             self._notes.warn(str(error))
 
     def _write(self) -> None:
-        begun, asked = 0, False  # when the part began, and whether the next one was asked for
+        """Write the queued messages. Ask for a new part when the current one is complete."""
+        begun, asked = 0, False  # start of the part, and whether the next was requested
         while (item := self._take()) is not None:
             if isinstance(item, RawMessage):
                 self._append(item)
@@ -129,6 +134,7 @@ class RawSaver(Closing):
             begun, asked = item[-1].received if item else 1, False
 
     def _take(self) -> RawMessage | Sequence[RawMessage] | None:
+        """Return the next queue item, or None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._ended)
             if not self._queue:
@@ -139,10 +145,12 @@ class RawSaver(Closing):
             return item
 
     def _append(self, message: RawMessage) -> None:
+        """Write one message to the current part."""
         assert self._part is not None
         self._part.write(message.connection, message.received, message.data, message.sent)
 
     def _finish(self) -> None:
+        """Close the current part."""
         part, self._part = self._part, None
         if part is not None:
             part.__exit__(None, None, None)

@@ -1,4 +1,4 @@
-"""Which topics the raw seconds have: all that play a role, and beside them whatever is small."""
+"""Topics of the raw recording: every topic with a role, and further topics with little data."""
 
 from __future__ import annotations
 
@@ -27,21 +27,19 @@ from bevviz.live.type_sources import TypeSources
 from bevviz.live.typesupport import message_type
 from bevviz.messages.definitions import store_of
 
-SMALL = 1_000_000  # bytes a second of a topic that nobody here needs
-TRIAL = 5.0  # seconds after which that is judged
+SMALL = 1_000_000  # bytes a second, limit for a topic without a role
+TRIAL = 5.0  # seconds over which that rate is measured
 
 
 class RawTopics:
-    """Hands messages to the recorder: those that the source receives, and those of further topics.
+    """Subscriber to further topics. It passes their messages, and those of the source, to the recorder.
 
-    For one thread, which receives.
+    Only the receiving thread may use it.
 
     Args:
-        node: subscribes, as for the source.
-        recorder: gets the messages.
-        sources: asks for types that are not known.
-        known: called with the messages of further topics that something else is made of, before they are
-            recorded: topic, type, time of receipt, data.
+        node: node for the subscriptions. recorder: takes the messages. sources: asks publishers for unknown
+        types. known: called with each message of a further topic before it is recorded: topic, type, time of
+        receipt, data.
     """
 
     def __init__(
@@ -55,11 +53,11 @@ class RawTopics:
         self._sources = sources
         self._connections: dict[str, Connection] = {}
         self._further: dict[str, Any] = {}  # topic -> subscription
-        self._sizes: dict[str, tuple[float, int]] = {}  # topic -> since when, bytes
-        self._refused: dict[str, str] = {}  # topic -> why it is left out, for good
+        self._sizes: dict[str, tuple[float, int]] = {}  # topic -> start of the measurement, bytes
+        self._refused: dict[str, str] = {}  # topic -> reason why it is left out for good
 
     def put(self, topic: PublishedTopic, received: int, info: Mapping[str, Any], data: bytes) -> None:
-        """A message of any topic."""
+        """Record a message of any topic."""
         connection = self._connections.get(topic.name)
         if connection is None or connection.msgtype != topic.type:
             connection = self._connections[topic.name] = connection_of(topic)
@@ -67,7 +65,7 @@ class RawTopics:
         self._recorder.put(RawMessage(connection, received, sent, data))
 
     def look(self, topics: Mapping[str, PublishedTopic], taken: Set[str]) -> None:
-        """Listen to what is published and not ``taken`` by the source, as far as it is small."""
+        """Subscribe to topics that are not ``taken`` by the source, if they have little data."""
         wanted = self._recorder.config.raw_topics
         left_out = {}
         for name, topic in topics.items():
@@ -92,6 +90,7 @@ class RawTopics:
         self._recorder.left_out = left_out
 
     def _judge(self) -> None:
+        """Leave topics whose data rate is above the limit."""
         now = time.monotonic()
         for name, (since, size) in list(self._sizes.items()):
             if now - since < TRIAL:
@@ -103,11 +102,13 @@ class RawTopics:
                 self._leave(name)
 
     def _leave(self, name: str) -> None:
+        """Unsubscribe from a topic."""
         if (subscription := self._further.pop(name, None)) is not None:
             self._node.input.destroy_subscription(subscription)
             del self._sizes[name]
 
     def _listen(self, topic: PublishedTopic) -> None:
+        """Subscribe to a topic, if its type is known."""
         try:
             kind = message_type(topic.type)
         except UserError as error:
@@ -131,7 +132,7 @@ class RawTopics:
 
 
 def connection_of(topic: PublishedTopic) -> Connection:
-    """As rosbags describes a topic of a bag."""
+    """Return the rosbags connection of a topic, as of a bag."""
     try:
         digest = store_of(topic.type).hash_rihs01(topic.type)
     except UserError:
@@ -142,7 +143,7 @@ def connection_of(topic: PublishedTopic) -> Connection:
 
 
 def _qos(profile: Any) -> Qos:
-    """What a publisher offers; who publishes does not say its history and depth."""
+    """Return the quality of service of a publisher. The graph does not report history and depth."""
 
     def duration(value: Any) -> QosTime:
         return QosTime(*divmod(value.nanoseconds, 10**9))

@@ -1,4 +1,4 @@
-"""What other nodes may ask of a running bevviz: parameters to change, and the recording to be saved."""
+"""Requests of other nodes to a running bevviz: change parameters, save the recording."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 from bevviz.config import TUTORIAL_NAMES, Config, keys, values
 from bevviz.errors import UserError
 
-NO_LIMIT = 0  # a parameter cannot be empty
+NO_LIMIT = 0  # a ROS parameter cannot be empty
 
 
 class Orders:
-    """Every key of the configuration as a parameter (``clustering.eps``), the tutorial's names (``range_x``,
-    ``voxel_size`` ...) beside them, and the service ``~/save_recording``.
+    """ROS parameters for every key of the configuration, and the service ``~/save_recording``.
 
-    Values given with ``--ros-args -p`` are ordered before the constructor returns. ``config``, ``change`` and
-    ``save`` may be replaced later.
+    Each key is a parameter (``clustering.eps``). The tutorial's names (``range_x``, ``voxel_size`` ...) exist
+    too. Values given with ``--ros-args -p`` are applied before the constructor returns. ``config``,
+    ``change`` and ``save`` may be replaced later.
 
     Args:
-        node: an rclpy node that somebody spins.
-        config: with the values that the parameters begin with.
-        change: takes settings as ``key=value``; a UserError refuses them, with its reason.
-        save: writes the recording of the last seconds and says where; a UserError says why not.
+        node: an rclpy node that another thread spins.
+        config: initial values of the parameters.
+        change: applies settings ``key=value``, or raises a UserError with the reason.
+        save: writes the recording of the last seconds and returns its path, or raises a UserError.
 
     Raises:
         UserError: a value given with ``-p`` is refused.
@@ -41,7 +41,7 @@ class Orders:
         self.config = config
         self.change = change
         self.save = save
-        self._keys = {**{key: key for key in keys(config)}, **TUTORIAL_NAMES}  # by name of the parameter
+        self._keys = {**{key: key for key in keys(config)}, **TUTORIAL_NAMES}  # parameter name -> key
         about = keys(config)
         given = [
             node.declare_parameter(name, _value(config, name, key), _descriptor(about[key]))
@@ -56,7 +56,7 @@ class Orders:
             node.create_service(Trigger, "~/save_recording", self._trigger)
 
     def show(self, config: Config) -> None:
-        """Let the parameters say what holds now, wherever it was changed."""
+        """Set the parameters to a configuration that was changed elsewhere."""
         from rclpy.parameter import Parameter
 
         self.config = config
@@ -66,7 +66,7 @@ class Orders:
         )
 
     def _settings(self, parameters: Sequence[Any]) -> list[str]:
-        """What differs from the configuration, in its words."""
+        """Return the parameters that differ from the configuration, as settings ``key=value``."""
         current = values(self.config)
         ordered = []
         for parameter in parameters:
@@ -80,6 +80,7 @@ class Orders:
         return ordered
 
     def _set(self, parameters: Sequence[Any]) -> Any:
+        """Apply changed parameters. Return whether they were accepted."""
         from rcl_interfaces.msg import SetParametersResult
 
         try:
@@ -90,6 +91,7 @@ class Orders:
         return SetParametersResult(successful=True)
 
     def _trigger(self, request: Any, response: Any) -> Any:
+        """Answer a call of the service."""
         assert self.save is not None
         try:
             response.success, response.message = True, str(self.save())
@@ -99,7 +101,7 @@ class Orders:
 
 
 def _value(config: Config, name: str, key: str) -> Any:
-    """As ROS has it: what is no number, word or switch is YAML, what is empty an empty word."""
+    """Return a value as a ROS parameter. Lists and the like become YAML, and None an empty text."""
     value = values(config)[key]
     if value is None:
         return NO_LIMIT if name == "max_cluster_size" else ""
@@ -107,16 +109,18 @@ def _value(config: Config, name: str, key: str) -> Any:
 
 
 def _text(value: Any) -> str:
+    """Return a value as text for a setting."""
     return _yaml(value) if isinstance(value, bool | list | tuple) or hasattr(value, "tolist") else str(value)
 
 
 def _yaml(value: Any) -> str:
-    """On one line; JSON is YAML."""
+    """Return a value as YAML on one line. JSON is YAML."""
     return json.dumps(value, default=lambda other: other.tolist() if hasattr(other, "tolist") else str(other))
 
 
 def _descriptor(about: str) -> Any:
+    """Return the descriptor of a parameter."""
     from rcl_interfaces.msg import ParameterDescriptor
 
-    # Typed by the configuration: `ros2 param set` takes 20 for an integer where 20.0 is meant.
+    # The configuration checks the type. `ros2 param set` takes 20 for an integer where 20.0 is meant.
     return ParameterDescriptor(description=about, dynamic_typing=True)

@@ -1,4 +1,4 @@
-"""Frames played in real time, over and over: a robot to try the live mode on, and to measure it with."""
+"""Playback of frames in real time, as a simulated robot for tests and measurements of the live mode."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from bevviz.model.frame import Frame, Scene
 
 
 class Replay:
-    """Plays the frames forth and back, so that nothing jumps, at a steady rate: a source without end.
+    """Endless source that plays frames forward and backward at a steady rate, so that nothing jumps.
 
-    Stamps and times of receipt are those of a sensor that works now.
+    Stamps and times of receipt are shifted to the current time.
 
     Args:
-        frames: in order of time.
-        scene: what they show.
+        frames: frames in order of time.
+        scene: names of the sensors.
         rate: frames a second.
-        total: frames after which it ends; None: never.
+        total: frames until it ends. None: it does not end.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Replay:
         self._stopped = threading.Event()
 
     def stop(self) -> None:
-        """End the iteration, from any thread."""
+        """End the iteration. Any thread may call it."""
         self._stopped.set()
 
     def __iter__(self) -> Iterator[Frame]:
@@ -47,7 +47,7 @@ class Replay:
 
 
 def _at(frame: Frame, index: int, now: int) -> Frame:
-    """The frame as if its cloud were received now."""
+    """Return the frame with its times shifted, so that its cloud is received now."""
     shift = now - frame.received
     stamp = frame.stamp + shift
     cameras = [

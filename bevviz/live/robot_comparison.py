@@ -1,4 +1,4 @@
-"""Ours against the robot's, while both run: what ``bevviz compare --robot`` tells of a bag."""
+"""Comparison of the results with the robot's during a live run, like ``bevviz compare --robot`` for a bag."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from bevviz.model.results import FrameResult
 
 SECOND = 1_000_000_000
 T = TypeVar("T")
-WAITING = 50  # frames that the robot may still say something of
+WAITING = 50  # frames that may wait for the robot's boxes
 
 
 @dataclass(frozen=True, slots=True)
 class Ours:
-    """What is remembered of a frame: small."""
+    """Our result of one frame, reduced to the data for the comparison."""
 
     index: int
     stamp: int
     received: int
     world_from_points: F64
     seen: Seen
-    images: Mapping[str, ImageBoxes]  # by camera, what the robot has said of them with the frame
+    images: Mapping[str, ImageBoxes]  # by camera, the robot's image boxes that came with the frame
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """How both differ in a frame."""
+    """Differences in one frame."""
 
     found: FrameDifferences
     received: int
@@ -54,38 +54,38 @@ class Compared:
 
 
 class AgainstRobot:
-    """Compares each frame with what the robot published of it, when it did.
+    """Comparison of each frame with the robot's boxes of the same stamp, when they come.
 
-    A frame that the robot says nothing of is left out, and so is one that a failed stage of ours made no
-    objects of: that says nothing of what is there. The robot's boxes in the images are compared where they
-    come before its boxes in space do, else counted. For one thread, but for ``reason``.
+    Frames without boxes of the robot are left out. So are frames in which a failed stage left no objects of
+    ours. The robot's image boxes are compared if they come before its 3D boxes. Later ones are counted. Only
+    one thread may use it, except for ``reason``.
 
     Args:
-        asked: the robot's Detection3DArray topic; empty: the one whose name says so.
-        config: from what on both differ.
+        asked: the robot's Detection3DArray topic. Empty: the topic is recognised by its name.
+        config: limits from which both differ.
     """
 
     def __init__(self, asked: str, config: LiveConfig) -> None:
         self.config = config
-        self.topic = ""  # known when the robot has said something
+        self.topic = ""  # empty until the robot has published boxes
         self.frames = self.differing = 0
-        self.without_ours = 0  # frames that are left out as there are no objects of ours
-        self.problem = ""  # why nothing is compared
-        self.late_images = 0  # of the robot's image boxes that came when their frame was compared already
+        self.without_ours = 0  # frames left out because there are no objects of ours
+        self.problem = ""  # reason why nothing is compared
+        self.late_images = 0  # image boxes of the robot that came after the comparison of their frame
         self._asked = asked
         self._topics: set[str] = set()
-        self._waiting: dict[int, Ours] = {}  # by stamp: frames that the robot has said nothing of yet
-        self._late: dict[int, LabelledBoxes3D] = {}  # by stamp of their frame, whose result is yet to come
-        self._images: dict[int, dict[str, ImageBoxes]] = {}  # the same of its image boxes, by camera
+        self._waiting: dict[int, Ours] = {}  # stamp -> frame that waits for the robot's boxes
+        self._late: dict[int, LabelledBoxes3D] = {}  # stamp of the frame -> boxes that wait for our result
+        self._images: dict[int, dict[str, ImageBoxes]] = {}  # stamp -> camera -> boxes
         self._compared: deque[int] = deque(maxlen=WAITING)  # stamps
-        self._since: int | None = None  # stamp from which on both differ in every frame
+        self._since: int | None = None  # stamp since which both differ in every frame
         self._fired = False
         self._reason = ""
         self._lock = threading.Lock()
 
     @property
     def names(self) -> tuple[str, str]:
-        """Of the two sides."""
+        """Names of the two sides."""
         return "bevviz", f"the robot's {self.topic or self._asked or 'fused boxes'}"
 
     def see(
@@ -94,11 +94,11 @@ class AgainstRobot:
         """Take in a frame.
 
         Args:
-            result: of it.
-            late: the robot's boxes that came too late for their frame, with the stamp of that frame.
+            result: result of the frame.
+            late: boxes of the robot that came after their frame was complete, with the stamp of that frame.
 
         Returns:
-            What can be compared now.
+            The comparisons that are possible now.
         """
         frame = result.frame
         in_space = {stamp: boxes for stamp, boxes in late if isinstance(boxes, LabelledBoxes3D)}
@@ -127,18 +127,23 @@ class AgainstRobot:
         return sorted(compared, key=lambda one: one.found.stamp)
 
     def reason(self) -> str | None:
-        """Why the flight recorder should save: both have differed for ``live.robot_time``; once each time."""
+        """Return the reason to save the flight recorder, or None.
+
+        There is one if both have differed for ``live.robot_time``. It is returned once.
+        """
         with self._lock:
             reason, self._reason = self._reason, ""
         return reason or None
 
     def _add_images(self, stamp: int, found: LabelledBoxes2D) -> None:
+        """Keep late image boxes, or count them if their frame is compared already."""
         if stamp in self._compared or not found.camera:
             self.late_images += 1
         else:
             self._images.setdefault(stamp, {})[found.camera] = _image_boxes(found)
 
     def _choose(self, topic: str) -> None:
+        """Choose the topic to compare with, after a new topic has appeared."""
         if topic in self._topics:
             return
         self._topics.add(topic)
@@ -148,6 +153,7 @@ class AgainstRobot:
             self.topic, self.problem = "", str(error)
 
     def _compare(self, ours: Ours, theirs: Seen) -> Compared:
+        """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
         found = differences(ours.index, ours.stamp, ours.seen, replace(theirs, images=images))
@@ -169,17 +175,20 @@ class AgainstRobot:
         return Compared(found, ours.received, ours.world_from_points)
 
     def _differs(self, difference: Difference) -> bool:
+        """Return whether a difference is large enough to count."""
         if difference.change is Change.MOVED:
             return difference.distance > self.config.robot_tolerance
         return difference.change is not Change.SAME
 
 
 def _forget(waiting: dict[int, T]) -> None:
+    """Drop the oldest items beyond ``WAITING``."""
     while len(waiting) > WAITING:
         del waiting[next(iter(waiting))]
 
 
 def _words(difference: Difference) -> str:
+    """Return a difference in words."""
     if difference.change is Change.ONLY_A:
         return f"{difference.name_a} of ours alone"
     if difference.change is Change.ONLY_B:
@@ -190,11 +199,12 @@ def _words(difference: Difference) -> str:
 
 
 def _image_boxes(found: LabelledBoxes2D) -> ImageBoxes:
+    """Return the robot's image boxes for the comparison."""
     return ImageBoxes(found.xyxy, found.labels)
 
 
 def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> Seen:
-    """The robot's boxes in the frame of the points of a former frame."""
+    """Move the robot's boxes to the points frame of an earlier frame."""
     world = np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
     boxes = geometry.moved(labelled.boxes, geometry.inverse(world_from_points) @ world)
     return Seen(boxes, labelled.labels, labelled.scores)
