@@ -37,9 +37,11 @@ class RawTopics:
     Only the receiving thread may use it.
 
     Args:
-        node: node for the subscriptions. recorder: takes the messages. sources: asks publishers for unknown
-        types. known: called with each message of a further topic before it is recorded: topic, type, time of
-        receipt, data.
+        node: node for the subscriptions.
+        recorder: takes the messages.
+        sources: asks publishers for unknown types.
+        known: called with each message of a further topic before it is recorded: topic, type, time of
+            receipt, data.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The live run: the newest frame wins, drops are counted, and no output holds another one up."""
+"""Live run: processes the newest frame, counts dropped frames, and feeds independent outputs."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording import entities
 
-BEHIND = 3.0  # seconds that a viewer lags when it is told
-LOOK = 1.0  # seconds between two looks at the configuration file and the clock
+BEHIND = 3.0  # seconds of lag at which the user is warned
+LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Where the results go, any number at once: files, window, web viewer at a port, viewers elsewhere."""
+    """Outputs of a run, any number at once: files, window, web viewer at a port, remote viewers."""
 
     save: Path | None = None
     window: bool = False
@@ -64,10 +64,10 @@ class Outputs:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How it goes. ``drops``: frames left out so far, by place; those thinned on purpose are ``thinned``."""
+    """Statistics of a run. ``drops`` counts dropped frames by cause, without those thinned on purpose."""
 
     frames: int
-    p50: float  # seconds from arrival to logged, over the last frames
+    p50: float  # seconds from arrival to logged, over the recent frames
     p99: float
     cpu: float  # percent of one core
     memory: float  # MB
@@ -75,19 +75,19 @@ class Status:
 
 
 class Live:
-    """Runs the pipeline beside a robot until the source ends, ``stop`` is called, or Ctrl-C.
+    """Run of the pipeline beside a robot, until the source ends, ``stop`` is called, or Ctrl-C.
 
     Args:
-        source: its iteration may block; with a method ``stop`` it is told when to end.
-        settings: the configuration, and where it comes from.
-        outputs: where to.
-        notes: what has to be said.
-        observe: leave the pipeline off; only what the robot publishes is logged.
-        on_result: called with each result in a thread of its own; when it is too slow the newest wins.
-        loader: has the detector's network already.
-        control: takes orders to save; None: one of its own.
-        raw: the messages that the source makes the frames of.
-        robot: topic of the robot's boxes that ours are compared with, empty: that which is fused; None: none.
+        source: source of frames. Its iteration may block. If it has a method ``stop``, that ends it.
+        settings: the configuration and its origin.
+        outputs: outputs of the run.
+        notes: takes messages to the user.
+        observe: skip the pipeline and log only the robot's topics.
+        on_result: called with each result in its own thread. If it is too slow, it gets the newest.
+        loader: loader that has the detector's network already.
+        control: server for requests to save. None: the run opens its own.
+        raw: recorder of the messages from which the source makes frames.
+        robot: topic of the robot's boxes to compare with. Empty: its fused boxes. None: no comparison.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -111,16 +111,16 @@ class Live:
         self._control = control
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
-        self.frames = 0  # logged
+        self.frames = 0  # frames logged so far
         self._source, self._settings = Thinned(source, lambda: self.config), settings
         self._on_result = on_result
-        self._shown = settings.config  # the configuration that ``on_change`` has
+        self._shown = settings.config  # the configuration last passed to ``on_change``
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = 0.0  # seconds, monotonic
-        self._behind: set[str] = set()  # viewers of which it was told
-        self._states: dict[str, str] = {}  # of the topics, as logged while no frame came
+        self._behind: set[str] = set()  # viewers about which the user was warned
+        self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
 
         self._nice(live.nice)
@@ -169,15 +169,17 @@ class Live:
 
     @property
     def config(self) -> Config:
+        """Current configuration."""
         return self._session.config
 
     @property
     def thinned(self) -> int:
-        """Frames left out on purpose: live.every and live.max_rate."""
+        """Frames left out on purpose, by live.every and live.max_rate."""
         return self._source.thinned
 
     @property
     def status(self) -> Status:
+        """Current statistics."""
         health = self.health
         return Status(
             self.frames,
@@ -190,7 +192,7 @@ class Live:
 
     @property
     def session(self) -> Session:
-        """That every frame is run in."""
+        """Session that processes every frame."""
         return self._session
 
     @property
@@ -199,18 +201,18 @@ class Live:
         return self._source.scene
 
     def attach(self, output: Output, watcher: Callable[[FrameResult], None]) -> None:
-        """One more output, before the run; it is closed at its end.
+        """Add an output before the run. It is closed at the end of the run.
 
         Args:
             output: takes the packets.
-            watcher: called with each result that was logged, in the thread that logs.
+            watcher: called with each logged result, in the logging thread.
         """
         self._outputs.append(output)
         self._watchers.append(watcher)
 
     @property
     def numbers(self) -> dict[str, float]:
-        """How it goes, by name: for a monitor."""
+        """Statistics by name, for a monitor."""
         status = self.status
         numbers = {
             "frames": float(status.frames),
@@ -224,20 +226,20 @@ class Live:
         return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
-        """The last seconds, as ``Snapshots.save``; from any thread."""
+        """Save the last seconds, see ``Snapshots.save``. Any thread may call it."""
         return self._snapshots.save(path)
 
     def stop(self) -> None:
-        """End ``run``, from any thread."""
+        """End ``run``. Any thread may call it."""
         self._over.set()
 
     # --- the run -------------------------------------------------------------------------------
 
     def run(self, on_tick: Callable[[Status], None] = lambda status: None) -> None:
-        """From the main thread, until the end; everything is closed then.
+        """Run until the end and close everything. Call it from the main thread.
 
         Raises:
-            UserError: of the source, or a failure of the runtime, when all outputs are closed.
+            UserError: the source or the runtime failed. All outputs are closed then.
         """
 
         def tick() -> None:
@@ -258,7 +260,7 @@ class Live:
             if self._control is None:
                 stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(self._signal())
-            # A second Ctrl-C must not leave half a file or a viewer behind. Closing takes bounded time.
+            # A second Ctrl-C must not leave half a file or a viewer. Closing takes a limited time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
             try:
                 run(
@@ -276,7 +278,10 @@ class Live:
 
     @contextmanager
     def _signal(self) -> Iterator[None]:
-        """SIGUSR1 saves the flight recorder. The handler takes no lock: it may interrupt one that is held."""
+        """Save the flight recorder on SIGUSR1.
+
+        The handler takes no lock, because it may interrupt code that holds that lock.
+        """
 
         def ask(number: int, stack: object) -> None:
             self._asked_to_save = True
@@ -288,6 +293,7 @@ class Live:
             signal.signal(signal.SIGUSR1, before)
 
     def _look(self) -> None:
+        """Check the configuration file, the clock, the topics and the viewers."""
         if self._settings.changed():
             self._reload()
         if jump := self.health.clock_jump():
@@ -299,6 +305,7 @@ class Live:
             self.on_change(self._shown)
 
     def _close(self) -> None:
+        """Close all outputs and finish the recordings."""
         for output in self._outputs:
             output.close()
         if self.raw_saver is not None:
@@ -310,7 +317,7 @@ class Live:
         self.encoder.close()
 
     def warm_up(self) -> None:
-        """Compile and load what the first frame needs; scans that come meanwhile were not asked for."""
+        """Compile and load everything that the first frame needs. Scans that come meanwhile are dropped."""
         if not self._observes:
             warm_up(self.config, self._session.loader)
 
@@ -336,7 +343,7 @@ class Live:
             self._watch_robot(self.against)
 
     def _with_marks(self, result: FrameResult) -> FrameResult:
-        """Together with the marks of frames before it that were left out, each with its time."""
+        """Return the result with the marks of earlier frames that were dropped. Each states its age."""
         frame = result.frame
         lost = [mark for mark in self._source.marks(frame.index) if mark.index < frame.index]
         if not lost:
@@ -349,6 +356,7 @@ class Live:
         return replace(result, frame=replace(frame, around=around))
 
     def _watch_robot(self, against: AgainstRobot) -> None:
+        """Report problems of the comparison, and save when robot and ours differ for long."""
         if against.problem != self._robot_problem:
             self._robot_problem = against.problem
             if against.problem:
@@ -358,10 +366,11 @@ class Live:
 
     @property
     def _lags(self) -> dict[str, tuple[Output, float]]:
-        """Viewers by name, and how many seconds each is behind."""
+        """Viewers by name, with the seconds that each is behind."""
         return {output.name: (output, lag) for output in self._outputs if (lag := output.lag) is not None}
 
     def _watch_viewers(self) -> None:
+        """Report viewers that fall behind or catch up."""
         for name, (viewer, lag) in self._lags.items():
             if lag > BEHIND and name not in self._behind:
                 self._behind.add(name)
@@ -375,7 +384,7 @@ class Live:
                 self.notes.info(f"the {name} viewer keeps up again; it has missed {missed} so far")
 
     def _log_meanwhile(self) -> None:
-        """What is said while no frame comes is in the log and in the lanes all the same."""
+        """Log messages and topic states while no frame comes."""
         since, states = time.monotonic() - self._logged, self._topic_states()
         if not self.frames or since < LOOK:
             return
@@ -384,14 +393,17 @@ class Live:
             self._hand_out(self.encoder.encode_meanwhile(since, notes, states))
 
     def _hand_out(self, packet: Packet) -> None:
+        """Pass a packet to every output and the flight recorder."""
         for output in self._outputs:
             output.put(packet)
         self.flight.put(packet)
 
     def _topic_states(self) -> dict[str, str]:
+        """Return the states of the topics, by entity path."""
         return {entities.topic_state(topic): state for topic, state in self._source.states.items()}
 
     def _drops(self) -> dict[str, int]:
+        """Return the dropped frames and messages, by cause."""
         drops = {"source": self._source.dropped, **self._dropping.dropped}
         for output in self._outputs:
             drops[output.name] = drops.get(output.name, 0) + output.dropped
@@ -402,20 +414,21 @@ class Live:
     # --- changes -------------------------------------------------------------------------------
 
     def update(self, settings: Sequence[str], without: Sequence[str] = ()) -> None:
-        """Take on settings, ``key=value`` as after ``--set``, from any thread.
+        """Apply settings, ``key=value`` as after ``--set``. Any thread may call it.
 
         Args:
-            settings: win over all before them.
-            without: of an earlier call, are taken back: what they set is as it is stated elsewhere.
+            settings: settings that override all earlier ones.
+            without: settings of an earlier call to revert.
 
         Raises:
-            UserError: one of them is wrong; nothing is changed.
+            UserError: a setting is wrong. Nothing is changed then.
         """
         with self._changing:
             self._apply(self._settings.read(settings, without))
             self._settings.keep(self._settings.config, settings, without)
 
     def _reload(self) -> None:
+        """Read the configuration file again. Keep the old configuration if it is wrong."""
         try:
             with self._changing:
                 self._apply(self._settings.read())
@@ -423,6 +436,7 @@ class Live:
             self.notes.warn(f"{error}; the configuration stays as it was")
 
     def _apply(self, config: Config) -> None:
+        """Apply a configuration and report what changed."""
         nice = self.config.live.nice
         changed = self._session.configure(config)
         self._settings.keep(config)
@@ -435,11 +449,12 @@ class Live:
             self._nice(config.live.nice)
         for key, change in changed.items():
             if ".params." in key and "absent" in (change.before, change.after):
-                continue  # it comes or goes with a method, which is told
+                continue  # the change of the method is reported instead
             late = "; takes effect at the next start" if key.startswith(AT_START) else ""
             self.notes.info(f"configuration: {key} {change}{late}")
 
     def _nice(self, nice: int) -> None:
+        """Set the priority of the process, or warn if that is not permitted."""
         try:
             set_nice(nice)
         except PermissionError:
@@ -447,7 +462,7 @@ class Live:
 
 
 def _with_unused_names(outputs: Outputs, notes: Notes) -> Outputs:
-    """Change the names of files that earlier runs have, and complete what these have left."""
+    """Return the outputs with free file names. Complete the bags that killed runs left."""
     asked = [path for path in (outputs.save, outputs.raw) if path is not None]
     for path in asked:
         check_name(path, ".rrd", ".mcap")
@@ -467,12 +482,13 @@ def _with_unused_names(outputs: Outputs, notes: Notes) -> Outputs:
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
+    """Install signal handlers."""
     for number, handler in handlers.items():
         signal.signal(number, handler)
 
 
 class LiveRecorder(Observer[FrameResult]):
-    """Logs in a thread of its own: neither the stages nor the publisher wait for it."""
+    """Observer that logs in its own thread. The stages and the publisher do not wait for it."""
 
     name = "logging"
 
@@ -481,14 +497,16 @@ class LiveRecorder(Observer[FrameResult]):
         self.beside = live.config.live.log_queue
 
     def begin(self, items: Items[object]) -> None:
+        """Warm up before the first frame."""
         self._live.warm_up()
 
     def see(self, result: FrameResult) -> None:
+        """Log a result."""
         self._live.log(result)
 
 
 class Publishing(Observer[FrameResult]):
-    """Hands results on to the robot, in a thread of its own."""
+    """Observer that publishes results to the robot, in its own thread."""
 
     name = "publishing"
     beside = 1
@@ -498,6 +516,7 @@ class Publishing(Observer[FrameResult]):
         self._failed = False
 
     def see(self, result: FrameResult) -> None:
+        """Publish a result. Warn once if that fails."""
         try:
             self._publish(result)
         except Exception as error:
@@ -507,13 +526,15 @@ class Publishing(Observer[FrameResult]):
 
 
 class Observing(Session):
-    """No stage is run: only what the robot published is shown."""
+    """Session that runs no stage. Only the robot's topics are shown."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config, detect=lambda camera: None)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
+        """Return the frame without results."""
         return FrameResult.unprocessed(frame, self.config)
 
     def finish(self, result: FrameResult) -> FrameResult:
+        """Complete the result without running the later stages."""
         return self.watch(result)

@@ -1,4 +1,4 @@
-"""Saves what the flight recorder holds: NAME.rrd, and the messages that it was made of as NAME.mcap."""
+"""Snapshots of the flight recorder: NAME.rrd, and its messages as NAME.mcap."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from bevviz.support.contexts import Closing
 
 
 class Snapshots(Closing):
-    """``save`` waits for the disk; ``save_soon`` does it in a thread of its own.
+    """Writer of snapshots. ``save`` waits for the disk; ``save_soon`` uses its own thread.
 
     Args:
-        flight: the frames.
-        raw: their messages; None: there are none, as in a synthetic drive.
-        notes: where is said what was saved.
+        flight: recorder of the frames.
+        raw: recorder of their messages. None: there are no messages, as in a synthetic drive.
+        notes: takes a report of each snapshot.
     """
 
     def __init__(self, flight: FlightRecorder, raw: RawRecorder | None, notes: Notes) -> None:
         self._flight, self._raw, self._notes = flight, raw, notes
         self._worker = ThreadPoolExecutor(1, "save", initializer=give_way)
-        self._waiting: list[threading.Thread] = []  # for what comes after a trigger
+        self._waiting: list[threading.Thread] = []  # each saves after the delay of a trigger
         self._closing = threading.Event()
 
     def close(self) -> None:
-        """What waits for its time is saved now."""
+        """Save the delayed snapshots now."""
         self._closing.set()
         for thread in self._waiting:
             thread.join()
@@ -40,7 +40,7 @@ class Snapshots(Closing):
 
     @property
     def scalars(self) -> dict[str, float]:
-        """What is held in memory, for the health."""
+        """Size of the buffers, by entity path, for the health."""
         held = {entities.process("flight_mb"): self._flight.size / 1e6}
         if self._raw is not None:
             held[entities.process("raw_mb")] = self._raw.size / 1e6
@@ -48,28 +48,29 @@ class Snapshots(Closing):
         return held
 
     def save(self, path: Path | None = None, reason: str = "") -> Path:
-        """Save both as they are now, and say so.
+        """Save frames and messages as they are now, and report it.
 
         Args:
-            path: .rrd file; None: named by the time, in ``live.flight_folder``.
-            reason: that it is saved for.
+            path: .rrd file. None: named by the time, in ``live.flight_folder``.
+            reason: reason for the report.
 
         Returns:
-            The .rrd file; the .mcap file is beside it.
+            The .rrd file. The .mcap file is beside it.
 
         Raises:
-            UserError: nothing is held yet, or the .rrd file cannot be written. Of the .mcap file it is told.
+            UserError: there is no frame yet, or the .rrd file cannot be written. A failure of the .mcap
+                file is only reported.
         """
         raw = self._raw
         messages = raw.held() if raw is not None and raw.config.raw_size > 0 else []
         return self._worker.submit(self._write, path, reason, self._flight.held(), messages).result()
 
     def save_soon(self, reason: str, after: float = 0.0) -> None:
-        """Nothing waits for it.
+        """Save in a thread of its own, without waiting.
 
         Args:
-            reason: that it is saved for.
-            after: seconds that still belong to it; less where the run ends.
+            reason: reason for the report.
+            after: seconds to record before saving. The end of the run shortens them.
         """
 
         def save() -> None:
@@ -86,6 +87,7 @@ class Snapshots(Closing):
     def _write(
         self, path: Path | None, reason: str, packets: list[Packet], messages: list[RawMessage]
     ) -> Path:
+        """Write both files and report it."""
         saved = self._flight.save(path, packets)
         about, why = str(saved), f" ({reason})" if reason else ""
         if messages:

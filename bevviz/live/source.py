@@ -1,4 +1,4 @@
-"""Frames from a running ROS 2 graph: topics are found, followed through restarts, and never waited for."""
+"""Source of frames from a running ROS 2 graph. It finds topics, follows restarts, and never blocks."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ from bevviz.sync.surroundings import MARKS
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph
-TICK = 0.05  # seconds between two looks at the clouds that have waited long enough
-SETTLE = 1.0  # seconds without a change of roles after which the scene is taken as complete
-PATIENCE = 3.0  # seconds that what is lacking may delay the scene
-FIRST = 1.0  # seconds of a subscription in which messages are lost as publishers are met
+TICK = 0.05  # seconds between two checks for clouds that have waited long enough
+SETTLE = 1.0  # seconds without a change of roles after which the scene is complete
+PATIENCE = 3.0  # seconds that missing topics may delay the scene
+FIRST = 1.0  # seconds after subscribing in which lost messages are expected and not counted
 CHANGING = "the topics are still changing"
-PIECE = 65_000  # bytes that DDS sends at once; what is larger goes in pieces
+PIECE = 65_000  # bytes, largest message that DDS sends in one piece
 
 KINDS = {
     "sensor_msgs/msg/PointCloud2",
@@ -69,28 +69,30 @@ KINDS = {
 
 @dataclass(slots=True)
 class _Subscription:
+    """Subscription with its type and quality of service."""
+
     handle: Any
     type: str
     qos: Any
 
 
 class LiveSource(Closing):
-    """The frames of a robot, as they become complete, until ``stop``.
+    """Source of a robot's frames as they become complete, until ``stop``.
 
-    Messages are received, decoded and synchronised in a thread of their own. It hands over through a short
-    queue: whoever iterates gets the newest frames, and those that nobody came for are counted in
-    ``dropped``. What has to be said meanwhile (a lost publisher, a new calibration) goes to ``tell``.
+    One thread receives, decodes and synchronises the messages. It passes frames through a short queue. The
+    consumer gets the newest frames, and ``dropped`` counts the others. Events such as a lost publisher or a
+    new calibration go to ``tell``.
 
     Args:
         config: roles and synchronisation.
-        arguments: what follows ``--ros-args``: remaps, namespace, parameters.
-        tell: called with one sentence each, from the receiving thread.
-        name: of the node.
-        raw: gets every message as it came, and those of further topics (``live.raw_topics``).
-        results: the robot's own bird's-eye view and obstacles are received and shown, too.
+        arguments: arguments after ``--ros-args``: remaps, namespace, parameters.
+        tell: called with one sentence for each event, from the receiving thread.
+        name: name of the node.
+        raw: takes every serialised message, also of further topics (``live.raw_topics``).
+        results: also receive the robot's bird's-eye view and obstacles.
 
     Raises:
-        UserError: no working rclpy, or arguments that it refuses.
+        UserError: rclpy does not work, or refuses the arguments.
     """
 
     def __init__(
@@ -106,32 +108,33 @@ class LiveSource(Closing):
         self.config = config
         self._results = results
         self.roles = Roles()
-        self.lost: Counter[str] = Counter()  # topic -> messages that the middleware could not deliver
-        self.frame_ids: dict[str, str] = {}  # of each sensor topic's first message
-        self.topics: dict[str, PublishedTopic] = {}  # all that others publish
+        self.lost: Counter[str] = Counter()  # topic -> messages that the middleware lost
+        self.frame_ids: dict[str, str] = {}  # topic -> frame id of its first message
+        self.topics: dict[str, PublishedTopic] = {}  # topics published by other nodes
         self._watch = Watch(tell or (lambda text: None))
-        self._clock_resets = 0  # that were told
-        self._known: dict[str, PublishedTopic] = {}  # that could play a role, or have
+        self._clock_resets = 0  # resets of the stamps that were reported
+        self._known: dict[str, PublishedTopic] = {}  # topics that may have a role, or had one
         self._subscriptions: dict[str, _Subscription] = {}
         self._handlers: dict[str, Handler[LiveMessage]] = {}
         self._sync = Synchronizer(self.roles, config)
         self._ousters = Ousters()
         self._begun = self._changed = self._last_cloud = time.monotonic()
         self._settled = threading.Event()
-        self._complete = False  # the scene is known
-        self._knowledge = threading.RLock()  # of all that the receiving thread changes piece by piece
+        self._complete = False  # whether the scene is known
+        self._knowledge = threading.RLock()  # guards the state that the receiving thread changes
         self._handover: NewestQueue[Frame] = NewestQueue(BURST, catch_up=True)
         self._iterated = False
-        self._unasked = 0  # frames that came before anybody iterated
+        self._unasked = 0  # frames dropped before the first iteration
         self._frames = 0
-        self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of the last frames
-        self._marks: deque[Mark] = deque(maxlen=MARKS)  # that nobody has asked for
+        self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of recent frames
+        self._marks: deque[Mark] = deque(maxlen=MARKS)  # marks that no call of ``marks`` has returned
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
         self._type_sources = TypeSources(self._node)
         self._raw = None if raw is None else RawTopics(self._node, raw, self._type_sources)
-        mark = self._node.resolve(MARK)  # heard before anybody says something: it may be said once
+        # Subscribed before it is published, because a mark may be sent once only.
+        mark = self._node.resolve(MARK)
         self._mark = PublishedTopic(mark, "std_msgs/msg/String", ())
         self._add_timer(LOOK, self._look)
         self._add_timer(TICK, self._tick)
@@ -143,51 +146,56 @@ class LiveSource(Closing):
         self._node.close()
 
     def stop(self) -> None:
-        """End the iteration, from any thread."""
+        """End the iteration. Any thread may call it."""
         self._ended = True
         self._handover.close()
         self._settled.set()
 
     @property
     def node(self) -> Any:
-        """The rclpy node, for what publishes back and takes orders; it has a thread of its own."""
+        """The rclpy node for publishing and services. It has its own thread."""
         return self._node.node
 
     @property
     def domain(self) -> int:
+        """ROS domain id."""
         return self._node.domain
 
     @property
     def middleware(self) -> str:
+        """Name of the middleware."""
         return self._node.middleware
 
     @property
     def dropped(self) -> int:
-        """Frames that were overtaken by newer ones before they were taken, since somebody iterates."""
+        """Frames replaced by newer ones before they were taken, since the iteration began."""
         return self._handover.dropped - self._unasked
 
     @property
     def tree(self) -> Mapping[str, str]:
-        """Child to parent of the transforms met so far."""
+        """Parent of each child frame, of the transforms received so far."""
         with self._knowledge:
             return dict(self._sync.tf.tree())
 
     # --- as a source ---------------------------------------------------------------------------
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Until the scene is known: a LiDAR delivers and the roles have settled. False: not yet."""
+        """Wait until the scene is known: a LiDAR delivers and the roles are stable.
+
+        Return False after the timeout, or if the source was stopped.
+        """
         settled = self._settled.wait(timeout)
         self._check()
         return settled and not self._ended
 
     @property
     def missing(self) -> str:
-        """What ``wait`` waits for, in one sentence; empty once the scene is known."""
+        """One sentence with the conditions that ``wait`` waits for. Empty once the scene is known."""
         with self._knowledge:
             return "" if self._complete else "; ".join(self._lacking())
 
     def _lacking(self) -> list[str]:
-        """What a first frame would lack, the worst first."""
+        """Return the data that a first frame would lack, the worst first."""
         if not self.topics:
             return [
                 f"nothing is published on ROS domain {self._node.domain}: is the robot running, with this "
@@ -203,7 +211,7 @@ class LiveSource(Closing):
         return [*misstated, *none, *self._sync.lacking()] or [CHANGING]
 
     def _misstated(self) -> dict[str, str]:
-        """Topics that the configuration states and that nobody publishes, or with another type."""
+        """Return the topics of the configuration that nobody publishes, or that have another type."""
         found = {}
         stated = resolved(self.config.source, self._node.resolve)
         topics = {topic.name: topic for topic in self._look_up(self.topics.values(), stated)}
@@ -219,15 +227,17 @@ class LiveSource(Closing):
 
     @property
     def scene(self) -> Scene:
-        """Known after ``wait``; another one when sensors come up later."""
+        """Names of the sensors, known after ``wait``. It changes when sensors appear later."""
         return self.roles.scene("live")
 
     @property
     def total(self) -> None:
+        """None, because a live run has no known length."""
         return None
 
     @property
     def warnings(self) -> Sequence[str]:
+        """Sentences about current problems and lost messages."""
         with self._knowledge:
             lost = [
                 f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
@@ -239,30 +249,31 @@ class LiveSource(Closing):
 
     @property
     def received(self) -> Counter[str]:
-        """Messages so far, by topic."""
+        """Messages received so far, by topic."""
         return self._watch.received
 
     @property
     def volume(self) -> Counter[str]:
-        """Bytes so far, by topic."""
+        """Bytes received so far, by topic."""
         return self._watch.volume
 
     def delay(self, topic: str) -> float | None:
-        """Seconds from a stamp to its receipt, the median of the last ones; None: not known."""
+        """Return the median seconds from a stamp to its receipt, or None if unknown."""
         with self._knowledge:
             return self._sync.clocks.lag(topic)
 
     @property
     def states(self) -> Mapping[str, str]:
-        """How each topic that plays a role does."""
+        """State of each topic that has a role."""
         with self._knowledge:
-            shown = {topic for topic, _, _ in self.roles.around} | {self._mark.name}  # such come and go
+            # Topics around the robot and marks are published irregularly.
+            shown = {topic for topic, _, _ in self.roles.around} | {self._mark.name}
             return self._watch.states(
                 {name: name in self.topics for name in self._subscriptions.keys() - shown}
             )
 
     def overtaken(self) -> tuple[LateResult, ...]:
-        """The robot's own results that no frame has taken, since the last call; from any thread."""
+        """Return the robot's results that no frame took, since the last call. Any thread may call it."""
         with self._knowledge:
             numbers = dict(self._numbers)
             return tuple(
@@ -272,7 +283,7 @@ class LiveSource(Closing):
             )
 
     def marks(self, index: int) -> tuple[Mark, ...]:
-        """Of the frames up to this index, also of those that were dropped, since the last call."""
+        """Return the marks of frames up to this index since the last call, including dropped frames."""
         with self._knowledge:
             found = tuple(mark for mark in self._marks if mark.index <= index)
             for _ in found:
@@ -289,13 +300,14 @@ class LiveSource(Closing):
         self._check()
 
     def _check(self) -> None:
-        """Raise here what ended the receiving thread."""
+        """Raise the exception that ended the receiving thread, if any."""
         if self._node.error is not None:
             raise self._node.error
 
     # --- the receiving thread ------------------------------------------------------------------
 
     def _add_timer(self, period: float, callback: Callable[[], None]) -> None:
+        """Call a function regularly in the receiving thread."""
         from rclpy.clock import Clock
         from rclpy.clock_type import ClockType
 
@@ -303,10 +315,11 @@ class LiveSource(Closing):
             with self._knowledge:
                 callback()
 
-        # Not the node's clock, which stands still where a simulation is paused.
+        # A steady clock. The node's clock stands still while a simulation is paused.
         self._node.input.create_timer(period, run, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _receive(self, topic: str, kind: str, data: bytes, info: dict[str, Any]) -> None:
+        """Take in a message and deliver the frames that it completes."""
         message = LiveMessage(topic, kind, info["received_timestamp"] or time.time_ns(), data)
         if self._raw is not None:
             self._raw.put(self._known[topic], message.received, info, data)
@@ -328,14 +341,17 @@ class LiveSource(Closing):
         self._deliver(self._sync.ready(message.received))
 
     def _compare(self, topic: str, before: Intrinsics, after: Intrinsics) -> None:
+        """Report a changed calibration."""
         if (before.K != after.K).any() or before.D.tolist() != after.D.tolist():
             old, new = before.K[0, 0], after.K[0, 0]
             self._watch.tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
 
     def _tick(self) -> None:
+        """Deliver the frames whose clouds have waited long enough."""
         self._deliver(self._sync.ready(time.time_ns()))
 
     def _deliver(self, frames: Iterable[Frame]) -> None:
+        """Queue frames for the consumer, with consecutive indices."""
         for frame in frames:
             if not self._complete:
                 continue
@@ -348,6 +364,7 @@ class LiveSource(Closing):
     # --- the graph -----------------------------------------------------------------------------
 
     def _look(self) -> None:
+        """Look at the graph: assign roles, subscribe, and report changes."""
         self.topics = published_topics(self._node)
         received = self.received
         known = {name: topic for name, topic in self._known.items() if received[name]}
@@ -365,14 +382,14 @@ class LiveSource(Closing):
         self._sync.absent = frozenset(self._handlers.keys() - heard)
         for name, subscription in self._subscriptions.items():
             if name in self.topics or not any(name == shown for shown, _, _ in self.roles.around):
-                self._look_at(name, subscription)  # what is shown around the robot comes and goes
+                self._look_at(name, subscription)  # topics shown around the robot come and go
         self._look_at_frames()
         if not self._complete and self._is_settled():
             self._complete = True
             self._settled.set()
 
     def _look_at(self, name: str, subscription: _Subscription) -> None:
-        """At a topic that plays a role."""
+        """Report problems of one topic that has a role."""
         topic, watch = self.topics.get(name), self._watch
         gone = f"{name} has no publisher any more; waiting for it to come back"
         watch.note(f"{name} gone", gone if topic is None else "", f"{name} is published again")
@@ -391,7 +408,7 @@ class LiveSource(Closing):
             watch.once(f"messages of {name} are lost on the way: {remedy(size)}")
 
     def _look_at_frames(self) -> None:
-        """At what the synchroniser found odd."""
+        """Report problems that the synchroniser found."""
         watch, report = self._watch, self._sync.report
         for name in report.overtaken:
             watch.once(f"{name} comes when its frame has gone on: shown at its own stamp")
@@ -417,6 +434,7 @@ class LiveSource(Closing):
             )
 
     def _is_settled(self) -> bool:
+        """Return whether the roles are stable and every sensor delivers, or the patience is over."""
         calm = time.monotonic() - self._changed
         if calm < SETTLE or not any(self.received[topic] for topic in self.roles.lidars):
             return False
@@ -426,13 +444,13 @@ class LiveSource(Closing):
         return not lacking or calm > PATIENCE
 
     def _assign(self) -> None:
-        """Give the topics their roles, and listen to those that play one."""
+        """Assign roles to the topics and subscribe to those with a role."""
         stated = resolved(self.config.source, self._node.resolve)
         topics = self._look_up(self._known.values(), stated)
-        if stated.lidar_topics:  # packets without their metadata are waited for
+        if stated.lidar_topics:  # packets without metadata do not have a role yet
             topics = [t for t in topics if not (t.aside and t.name in stated.lidar_topics)]
         there = {topic.name for topic in topics}
-        # As with sensors: one that is not there yet is waited for.
+        # An absent topic of a stage is waited for, as an absent sensor is.
         stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
         stages = {key: name for key, name in stages.items() if name in there}
         try:
@@ -462,7 +480,7 @@ class LiveSource(Closing):
             self._listen(self._known[name])
 
     def _look_up(self, topics: Iterable[PublishedTopic], stated: SourceConfig) -> list[Topic]:
-        """What is known of topics, given what the configuration states."""
+        """Return the known facts about topics, given the stated topics of the configuration."""
         boxes = stated.boxes.get("topic", "")
         found = [
             Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
@@ -470,22 +488,24 @@ class LiveSource(Closing):
         return self._ousters.look(found, stated.lidar_calibration)
 
     def _add_metadata(self, message: LiveMessage) -> None:
+        """Take in the metadata of an Ouster."""
         text = guard(message, surroundings.decode_mark, message.decode())
         if self._ousters.add_metadata(message.topic, text):
             self._watch.tell(f"the metadata on {message.topic} have changed")
         self._assign()
 
     def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
-        """Packets go on as scans, each received when its last one was."""
+        """Gather packets to scans and pass these on. A scan has the time of receipt of its last packet."""
         sensor = self._ousters.sensor(message.topic)
         for packets in self._ousters.add_packet(message.topic, message.received, message.data):
             handler(replace(message, received=packets[-1][0], data=b"", sensor=sensor, packets=packets))
 
     def _decode(self, message: LiveMessage) -> Any:
+        """Decode a message with the calibration of the configuration."""
         return message.decode(resolved(self.config.source, self._node.resolve).lidar_calibration)
 
     def _listen(self, topic: PublishedTopic) -> None:
-        """Subscribe, or again where the publishers now offer something else."""
+        """Subscribe to a topic, or again if the offered type or quality of service has changed."""
         from rclpy.event_handler import SubscriptionEventCallbacks
 
         try:
@@ -519,7 +539,7 @@ class LiveSource(Closing):
 
         events = SubscriptionEventCallbacks(
             message_lost=count_lost,
-            incompatible_qos=lambda event: None,  # told by name in ``_look``
+            incompatible_qos=lambda event: None,  # reported by name in ``_look_at``
             use_default_callbacks=False,
         )
         handle = self._node.input.create_subscription(
@@ -529,14 +549,14 @@ class LiveSource(Closing):
 
 
 def remedy(size: float) -> str:
-    """What helps where messages of so many bytes are lost on the way."""
+    """Return advice for lost messages of this size in bytes."""
     if size > PIECE:
         return "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
     return "small ones are where a machine is too busy; a longer queue (depth) of the publisher's helps"
 
 
 def _concerns(topic: PublishedTopic) -> bool:
-    """Whether a topic can play a role, or holds what could, in a form that nothing here reads."""
+    """Return whether a topic may have a role, or may hold sensor data in an unsupported form."""
     return (
         topic.type in KINDS
         or declared_decoder(topic.type) is not None

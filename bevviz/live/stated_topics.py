@@ -1,4 +1,4 @@
-"""The topics that a configuration states: by their names on a running graph, and while they are absent."""
+"""Topics that a configuration states: their names on a running graph, and their absence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from bevviz.messages.topics import Topic
 
 
 def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """The topics that the configuration names: where, and which types they may have; none: any."""
+    """Return the topics of the configuration, each with its key and its permitted types.
+
+    No types means that any type is permitted.
+    """
     source, images = resolved(config.source, resolve), ("Image", "CompressedImage")
     found: dict[str, tuple[str, tuple[str, ...]]] = {}
     for key, names, kinds in (
@@ -28,7 +31,7 @@ def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tu
 
 
 def resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
-    """The configuration with the topics' names on the graph."""
+    """Return the configuration with the topic names on the graph."""
     infos, boxes = config.camera_info_topics, config.boxes
     return config.model_copy(
         update={
@@ -43,7 +46,10 @@ def resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfi
 
 
 def without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
-    """A given topic that is not there yet is waited for; no other one may take its role meanwhile."""
+    """Remove stated topics that are absent, and the topics that could take over their roles.
+
+    A stated topic that is absent is waited for. No other topic may take its role meanwhile.
+    """
     names = {topic.name for topic in topics}
     changes: dict[str, Any] = {}
     for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):

@@ -1,4 +1,4 @@
-"""What is left out on purpose, to make it lighter: scans, and points of scans."""
+"""Thinning of frames and points on purpose, to reduce the load."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from bevviz.recording.color_by import ColoredPoints
 
 
 class Thinned:
-    """A source without what the configuration leaves out on purpose: scans, and points of scans.
+    """Source that leaves out frames and points as the configuration asks.
 
     Args:
-        source: where the frames come from; with a method ``stop`` it is told when to end.
-        config: the one that is in force.
-        clock: seconds, for tests.
+        source: source of the frames. If it has a method ``stop``, that ends it.
+        config: returns the current configuration.
+        clock: returns seconds, for tests.
     """
 
     def __init__(
@@ -32,37 +32,41 @@ class Thinned:
 
     @property
     def scene(self) -> Scene:
+        """Names of the sensors."""
         return self._source.scene
 
     @property
     def total(self) -> int | None:
+        """Number of frames of the source, if known."""
         return self._source.total
 
     @property
     def warnings(self) -> Sequence[str]:
+        """Warnings of the source."""
         return self._source.warnings
 
     @property
     def dropped(self) -> int:
-        """That the source itself has left out."""
+        """Frames that the source itself has dropped."""
         return int(getattr(self._source, "dropped", 0))
 
     @property
     def states(self) -> Mapping[str, str]:
-        """How each topic does, where the source has topics."""
+        """State of each topic, if the source has topics."""
         return getattr(self._source, "states", {})
 
     def overtaken(self) -> tuple[LateResult, ...]:
-        """The robot's own results that came too late for their frames, since the last call."""
+        """Return the robot's results that came too late for their frames, since the last call."""
         overtaken = getattr(self._source, "overtaken", None)
         return () if overtaken is None else tuple(overtaken())
 
     def marks(self, index: int) -> tuple[Mark, ...]:
-        """What people have marked up to the frame of this index, since the last call."""
+        """Return the users' marks up to the frame of this index, since the last call."""
         marks = getattr(self._source, "marks", None)
         return () if marks is None else tuple(marks(index))
 
     def stop(self) -> None:
+        """End the iteration of the source."""
         stop = getattr(self._source, "stop", None)
         if stop is not None:
             stop()
@@ -75,15 +79,15 @@ class Thinned:
                 self.thinned += 1
                 continue
             if live.max_rate is not None:
-                # Frames that come a little early keep their turn; a pause earns no burst.
+                # A frame that comes a little early keeps its turn. A pause permits no burst afterwards.
                 earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
             yield thin(frame, live.points)
 
 
 def thin(frame: Frame, points: int | None) -> Frame:
-    """The frame with so many points: one at random out of each of as many equal runs of its points.
+    """Return the frame with at most ``points`` points, chosen at random as in ``chosen``.
 
-    A fixed step would fall on the same ring of the LiDAR again and again.
+    A fixed step would choose the same ring of the LiDAR again and again.
     """
     count = len(frame.points)
     if points is None or count <= points:
@@ -104,9 +108,10 @@ def thin(frame: Frame, points: int | None) -> Frame:
 
 
 def chosen(count: int, points: int, seed: int) -> I64:
-    """Rows in order, one at random out of each of so many equal runs; all of them where there are no more.
+    """Return the rows of a random sample, in order.
 
-    The same of the same seed.
+    The rows are divided into ``points`` equal runs, and each run gives one row. If there are fewer rows than
+    that, all are returned. The same seed gives the same rows.
     """
     if count <= points:
         return np.arange(count)
@@ -116,12 +121,12 @@ def chosen(count: int, points: int, seed: int) -> I64:
 
 
 def is_cloud(logged: rr.AsComponents, points: int) -> bool:
-    """Whether it has more points than that."""
+    """Return whether an archetype is a cloud with more than ``points`` points."""
     return isinstance(logged, rr.Points3D | rr.Points2D | ColoredPoints) and _count(logged) > points
 
 
 def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.DescribedComponentBatch]:
-    """Its ``chosen`` points, with all that is said of each."""
+    """Return the components of the ``chosen`` points of a cloud."""
     count = _count(cloud)
     rows = pa.array(chosen(count, points, seed))
     thinned = []
@@ -133,14 +138,16 @@ def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.Descri
 
 
 def _count(cloud: rr.AsComponents) -> int:
+    """Return the number of points of a cloud."""
     return max((len(batch.as_arrow_array()) for batch in cloud.as_component_batches()), default=0)
 
 
 class _Values:
-    """What Rerun takes for a component."""
+    """Arrow array in the form of a Rerun component."""
 
     def __init__(self, values: pa.Array) -> None:
         self._values = values
 
     def as_arrow_array(self) -> pa.Array:
+        """Return the array."""
         return self._values

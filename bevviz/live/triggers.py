@@ -1,4 +1,4 @@
-"""When the flight recorder saves by itself."""
+"""Triggers that save the flight recorder automatically."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from bevviz.model.results import FrameResult
 
 
 class Triggers:
-    """Looks at every result for an anomaly of the kinds in ``live.triggers`` that begins.
+    """Trigger on anomalies of the kinds in ``live.triggers``.
 
-    ``check`` gives the reason to save, once in ``live.trigger_pause``.
+    ``check`` returns a reason to save at most once in ``live.trigger_pause``.
     """
 
     def __init__(self, config: LiveConfig) -> None:
@@ -22,7 +22,9 @@ class Triggers:
         self._fired = -math.inf
 
     def check(self, result: FrameResult) -> str | None:
-        onsets = self._onsets.of(result.anomalies)  # whether or not one is reported
+        """Return the reason to save, or None."""
+        # Called for every result, so that old anomalies do not count as new.
+        onsets = self._onsets.of(result.anomalies)
         reasons = [anomaly.text for anomaly in onsets if anomaly.kind in self.config.triggers]
         now = time.monotonic()
         if not reasons or now - self._fired < self.config.trigger_pause:

@@ -1,4 +1,4 @@
-"""What publishers say that their types are made of: ``~/get_type_description`` since ROS 2 Iron."""
+"""Type definitions from publishers, through ``~/get_type_description`` (ROS 2 Iron and later)."""
 
 from __future__ import annotations
 
@@ -11,34 +11,36 @@ from bevviz.live.graph import UNKNOWN, PublishedTopic, full_name
 from bevviz.live.node import Node
 from bevviz.messages.definitions import learn
 
-PATIENCE = 3.0  # seconds until it is said that a node does not answer, and it is asked again
+PATIENCE = 3.0  # seconds until a missing answer is reported and the request is repeated
 
 
 @dataclass(slots=True)
 class _Question:
+    """Request to one node for the definition of one type."""
+
     client: Any
     since: float
     sent: float = 0.0
     future: Any = None
-    why: str = ""  # it is not answered
+    why: str = ""  # reason why there is no answer
 
 
 class TypeSources:
-    """Asks the nodes that publish types which are not known here. For one thread, which receives."""
+    """Client that asks publishing nodes for unknown types. Only the receiving thread may use it."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._met: dict[str, float] = {}  # types nobody could be asked for, and since when
-        self._questions: dict[tuple[str, str], _Question] = {}  # type and node
+        self._met: dict[str, float] = {}  # type without a node to ask -> time it was first met
+        self._questions: dict[tuple[str, str], _Question] = {}  # by type and node
 
     def ask(self, topic: PublishedTopic) -> str | None:
-        """Why a topic's type is not known from its publishers; None: an answer may come yet.
+        """Ask a publisher of a topic for its type. Return why that fails, or None while an answer may come.
 
-        What is answered is known to ``definitions.store_of`` from then on.
+        ``definitions.store_of`` knows the type after an answer.
         """
         now = time.monotonic()
         publisher = next((p for p in topic.publishers if _can_say(p)), None)
-        if publisher is None:  # or its node is not met yet
+        if publisher is None:  # no node can answer, or it is not discovered yet
             waited = now - self._met.setdefault(topic.type, now)
             return "its publishers do not say what it is made of, either" if waited > PATIENCE else None
         whom = full_name(publisher)
@@ -57,6 +59,7 @@ class TypeSources:
         return None
 
     def _send(self, question: _Question, name: str, digest: str) -> None:
+        """Send the request to the node."""
         from type_description_interfaces.srv import GetTypeDescription
 
         def answered(future: Any) -> None:
@@ -78,7 +81,10 @@ class TypeSources:
 
 
 def _can_say(publisher: Any) -> bool:
-    """Whether rclpy's TopicEndpointInfo is of a node that can be asked: older releases give no hash."""
+    """Return whether the node of an rclpy TopicEndpointInfo can be asked.
+
+    Older releases give no type hash.
+    """
     return publisher.node_name != UNKNOWN and str(getattr(publisher, "topic_type_hash", "")).startswith(
         "RIHS"
     )

@@ -1,10 +1,10 @@
-"""Message types for rclpy: the installed ones, and those that no wheel brings made here without a compiler.
+"""Message types for rclpy: the installed ones, and others built here without a compiler.
 
-A raw subscription and a publisher of serialised messages never convert anything: all that the middleware
-asks of a type is its name, its hash and an upper bound of its size. For a package that is not installed
-(vision_msgs, tf2_msgs) these few C structs are filled in from its definition; the bytes are then read and
-written by rosbags' CDR code. The structs are those of ``rosidl_runtime_c/message_type_support_struct.h``
-and ``rosidl_typesupport_fastrtps_cpp/message_type_support.h``.
+A raw subscription and a publisher of serialised messages never convert a message. The middleware needs only
+the name, the hash and an upper bound of the size of a type. For a package that is not installed (vision_msgs,
+tf2_msgs) this module fills in these few C structs from the definition. The CDR code of rosbags reads and
+writes the bytes. The structs are those of ``rosidl_runtime_c/message_type_support_struct.h`` and
+``rosidl_typesupport_fastrtps_cpp/message_type_support.h``.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _UNBOUNDED = b"\x00"
 
 @cache
 def message_type(name: str) -> Any:
-    """The class to give to rclpy for ``package/msg/Name``, for raw subscriptions and publishers only.
+    """Return the rclpy class of ``package/msg/Name``, for raw subscriptions and publishers only.
 
     Raises:
-        UserError: neither installed nor known here, or made here for another middleware than Fast DDS.
+        UserError: the type is unknown, or its package is not installed and the middleware is not Fast DDS.
     """
     package, _, short = name.split("/")
     try:
@@ -40,6 +40,7 @@ def message_type(name: str) -> Any:
 
 
 def _from_definition(name: str) -> Any:
+    """Build the class from the definition of the type."""
     from rclpy.utilities import get_rmw_implementation_identifier
     from std_msgs.msg import Empty
 
@@ -54,7 +55,7 @@ def _from_definition(name: str) -> Any:
     if base._TYPE_SUPPORT is None:
         base.__import_type_support__()
     support = _TypeSupport(name, _pointer(base._TYPE_SUPPORT))
-    unused = object()  # what rclpy would convert with; it only looks that they are there
+    unused = object()  # placeholder for rclpy's converters; rclpy only checks that they exist
     meta = type(
         "Made",
         (type,),
@@ -77,7 +78,7 @@ _MaxSize = ctypes.CFUNCTYPE(ctypes.c_size_t, ctypes.POINTER(ctypes.c_char))
 
 
 class _MessageTypeSupport(ctypes.Structure):
-    """rosidl_message_type_support_t"""
+    """Struct rosidl_message_type_support_t."""
 
     _fields_ = (
         ("typesupport_identifier", ctypes.c_void_p),  # compared by address
@@ -90,7 +91,7 @@ class _MessageTypeSupport(ctypes.Structure):
 
 
 class _Callbacks(ctypes.Structure):
-    """message_type_support_callbacks_t; what converts stays null."""
+    """Struct message_type_support_callbacks_t. The converting functions stay null."""
 
     _fields_ = (
         ("message_namespace", ctypes.c_char_p),
@@ -104,30 +105,30 @@ class _Callbacks(ctypes.Structure):
 
 
 class _Hash(ctypes.Structure):
-    """rosidl_type_hash_t"""
+    """Struct rosidl_type_hash_t."""
 
     _fields_ = (("version", ctypes.c_uint8), ("value", ctypes.c_uint8 * 32))
 
 
 class _Sequence(ctypes.Structure):
-    """Any rosidl_runtime_c sequence, strings included."""
+    """Struct of any rosidl_runtime_c sequence, also of strings."""
 
     _fields_ = (("data", ctypes.c_char_p), ("size", ctypes.c_size_t), ("capacity", ctypes.c_size_t))
 
 
 class _TypeDescription(ctypes.Structure):
-    """rosidl_runtime_c__type_description__TypeDescription"""
+    """Struct rosidl_runtime_c__type_description__TypeDescription."""
 
     _fields_ = (("type_name", _Sequence), ("fields", _Sequence), ("referenced", _Sequence))
 
 
 class _TypeSupport:
-    """A type support whose parts live as long as it does.
+    """Type support that keeps its C structs alive.
 
     Args:
         name: ``package/msg/Name``.
-        base: address of the type support of an installed type. Its introspection is borrowed, which Fast DDS
-            wants to register but does not announce.
+        base: address of the type support of an installed type. Fast DDS registers an introspection but does
+            not announce it, so that of the installed type is used.
     """
 
     def __init__(self, name: str, base: int) -> None:
@@ -168,11 +169,13 @@ class _TypeSupport:
 
     @staticmethod
     def _max_size(bounds: Any) -> int:
+        """Report an unbounded message size."""
         bounds[0] = _UNBOUNDED
         return 0
 
 
 def _pointer(capsule: Any) -> int:
+    """Return the address in a PyCapsule."""
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -183,6 +186,7 @@ def _pointer(capsule: Any) -> int:
 
 
 def _capsule(address: int) -> Any:
+    """Return a PyCapsule of an address."""
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     return new(address, None, None)

@@ -1,9 +1,10 @@
-"""Relay frames to a remote viewer in a process of its own: ``python -m bevviz.live.viewer_relay URL ID``.
+"""Relay frames to a remote viewer in a separate process: ``python -m bevviz.live.viewer_relay URL ID``.
 
-Rerun's connection waits for ever once its peer is gone. Whoever feeds this process only sees it end.
+Rerun's connection waits for ever once its peer is gone. With this process, the run only sees the process end.
 
-Standard input holds pieces of a recording, each after its length (8 bytes, little endian): first the header
-that every file begins with, then preludes, which have it, and packets, which have not.
+Standard input holds pieces of a recording. Each follows its length (8 bytes, little endian). The first piece
+is the header with which every file begins. Then come preludes, which contain the header, and packets, which
+do not.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from bevviz.recording.blueprints import Saved
 from bevviz.recording.ports import answers
 from bevviz.recording.sinks import APPLICATION, check_viewer
 
-PROBE = 2.0  # seconds between two looks whether the viewer is there
-MAGIC = 4  # bytes that tell a recording
+PROBE = 2.0  # seconds between two checks of the viewer
+MAGIC = 4  # bytes at the start that identify a recording
 
 
 def main(url: str, recording_id: str) -> NoReturn:
+    """Relay standard input to a viewer until it ends."""
     host, port = check_viewer(url)
     threading.Thread(target=_watch, args=(host, port), daemon=True).start()
     recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
@@ -40,15 +42,17 @@ def main(url: str, recording_id: str) -> NoReturn:
         _forward(piece if piece[:MAGIC] == header[:MAGIC] else header + piece, recording)
     with suppress(RuntimeError):
         recording.flush(timeout_sec=PROBE)
-    os._exit(0)  # leaving in the usual way would wait for a viewer that hangs
+    os._exit(0)  # a normal exit would wait for a viewer that hangs
 
 
 def _pieces(stream: BinaryIO) -> Iterator[bytes]:
+    """Yield the pieces of the input."""
     while length := stream.read(8):
         yield stream.read(int.from_bytes(length, "little"))
 
 
 def _forward(data: bytes, recording: rr.RecordingStream) -> None:
+    """Send the content of a complete recording to the viewer."""
     file = os.memfd_create("piece")
     try:
         with open(file, "wb", closefd=False) as whole:
@@ -64,6 +68,7 @@ def _forward(data: bytes, recording: rr.RecordingStream) -> None:
 
 
 def _watch(host: str, port: int) -> None:
+    """End this process when the viewer no longer answers."""
     while answers(host, port):
         time.sleep(PROBE)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Viewers, each fed by a thread through a process of its own: one that hangs or dies holds nobody up."""
+"""Viewers as outputs. Each is fed by its own thread and process, so that none delays the run."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from bevviz.recording.ports import (
 )
 from bevviz.recording.sinks import check_viewer
 
-RETRY = 3.0  # seconds until a viewer that is gone is tried again
-LATE = 1.0  # seconds behind from which on nothing old is sent
+RETRY = 3.0  # seconds between two attempts to reach a lost viewer
+LATE = 1.0  # seconds of lag from which on no old packets are sent
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What shows the frames: it reads a recording from its standard input.
+    """Program that shows the frames. It reads a recording from its standard input.
 
-    ``lasting``: it runs as long as we do, and is started again once ``is_ready``; else the user may end it.
-    ``framed``: each piece follows its length (see ``relay``).
+    ``lasting``: it runs until the end, and is restarted once ``is_ready``. Otherwise the user may close it.
+    ``framed``: each piece follows its length (see ``viewer_relay``).
     """
 
     name: str
@@ -46,17 +46,19 @@ class Program:
 
 
 def window() -> Program:
-    """The viewer on this machine."""
+    """Return the program of the viewer window on this machine."""
     command = [rerun_cli.program(), "-", "--bind", LOOPBACK, "--port", "auto"]
     command += ["--memory-limit", "50%", "--hide-welcome-screen"]
     return Program("window", command, lasting=False)
 
 
 def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
-    """A web viewer at ``port`` of the address ``bind``, which keeps ``memory`` MB, and what to open.
+    """Return the program of a web viewer, and the URL to open.
+
+    It listens at ``port`` of the address ``bind`` and keeps ``memory`` MB.
 
     Raises:
-        UserError: the port is in use, or the address is not of this machine.
+        UserError: the port is in use, or the address does not belong to this machine.
     """
     address = own_address(bind)
     check_port(port)
@@ -69,10 +71,10 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
 
 
 def remote(url: str, recording_id: str) -> Program:
-    """A viewer elsewhere.
+    """Return the program that relays to a remote viewer.
 
     Raises:
-        UserError: no such URL, or no viewer answers there.
+        UserError: the URL is wrong, or no viewer answers there.
     """
     host, port = check_viewer(url)
     command = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, recording_id]
@@ -80,9 +82,9 @@ def remote(url: str, recording_id: str) -> Program:
 
 
 class Viewer(Output):
-    """Feeds one program. Who is late gets the newest whole packet next, and nothing of what waited before it.
+    """Output that feeds one program. A late viewer gets the newest whole packet and none of the older ones.
 
-    ``sparse``: with whole packets alone, for whoever is too slow for all of them.
+    ``sparse``: send whole packets only, for a viewer that is too slow for all packets.
     """
 
     def __init__(
@@ -92,16 +94,16 @@ class Viewer(Output):
         self._sparse = sparse
         self._program = program
         self._encoder, self._notes = encoder, notes
-        self._lag = 0.0  # seconds, of the packet that was handed over last
-        self._sending: float | None = encoder.clock()  # time of what is being handed over
+        self._lag = 0.0  # seconds, lag of the last packet that was handed over
+        self._sending: float | None = encoder.clock()  # time of the packet that is being handed over
         self._process = self._start()
         self._thread.start()
 
     @property
     def lag(self) -> float:
-        """Seconds from when a frame was logged until the viewer's process has taken it.
+        """Seconds from the logging of a frame until the viewer's process has read it.
 
-        What that process, and a browser behind it, still have before them is not known.
+        The backlog in that process, and in a browser behind it, is unknown.
         """
         waiting, sending = self._packets.oldest, self._sending
         if sending is None and waiting is not None:
@@ -109,6 +111,7 @@ class Viewer(Output):
         return self._lag if sending is None else self._encoder.clock() - sending
 
     def put(self, packet: Packet) -> None:
+        """Queue a packet. Clear the queue first if the viewer is late."""
         if not packet.whole and self._sparse:
             return
         if packet.whole and self.lag > LATE:
@@ -116,7 +119,7 @@ class Viewer(Output):
         super().put(packet)
 
     def close(self, patience: float = 2.0) -> None:
-        """Hand over what waits, if that is soon done. A window stays open, for the user to close."""
+        """Send the waiting packets, if that takes a short time. A window stays open for the user."""
         self._packets.close()
         self._thread.join(patience)
         self._ended.set()
@@ -124,13 +127,15 @@ class Viewer(Output):
             self._process.terminate()
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            self._process.kill()  # a stopped process does not hear anything else
+            self._process.kill()  # a stopped process reacts to SIGKILL only
         self._thread.join(patience)
 
     def _start(self) -> subprocess.Popen[bytes]:
+        """Start the program."""
         return rerun_cli.spawn(self._program.command)
 
     def _run(self) -> None:
+        """Send the beginning of a recording, then the packets."""
         self._begin(self._encoder.context)
         self._sending = None
         super()._run()
@@ -139,23 +144,26 @@ class Viewer(Output):
             self._process.stdin.close()
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
+        """Send a packet and measure the lag."""
         self._sending = packet.time
         taken = self._show(packet, fresh)
         self._lag, self._sending = (self._encoder.clock() - packet.time if taken else 0.0), None
         return taken
 
     def _show(self, packet: Packet, fresh: bool) -> bool:
+        """Send a packet, after a prelude if it follows a gap."""
         if fresh and not self._send(self._encoder.prelude(packet.context, blueprint=False)):
             return self._recover(packet.context)
         return self._send(packet.shown) or self._recover(packet.context)
 
     def _begin(self, context: Context) -> bool:
+        """Send the beginning of a recording."""
         if self._program.framed and not self._send(self._encoder.header):
             return False
         return self._send(self._encoder.prelude(context))
 
     def _recover(self, context: Context) -> bool:
-        """Wait for the viewer to come back, unless the user has closed it. Always after a gap."""
+        """Wait for the viewer to come back, unless the user has closed it. Return False: a gap follows."""
         if self._ended.is_set():
             return False
         if not self._program.lasting:
@@ -174,6 +182,7 @@ class Viewer(Output):
         return False
 
     def _send(self, data: bytes) -> bool:
+        """Write bytes to the program. Return whether that succeeded."""
         assert self._process.stdin is not None
         try:
             if self._program.framed:

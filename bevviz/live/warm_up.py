@@ -1,4 +1,4 @@
-"""Runs everything once before the first frame: what is compiled and loaded then holds no frame up later."""
+"""Warm-up before the first frame, so that compiling and loading delay no later frame."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ CAMERA_FROM_LIDAR: F64 = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0],
 
 
 def warm_up(config: Config, loader: StageLoader) -> None:
-    """Run the stages, the network and the logging on two small frames, whose results nobody sees.
+    """Run the stages, the network and the logging on small artificial frames. The results are discarded.
 
-    Stages of the user's own are left out: nobody says that they stand to be called with what is not there.
+    User-defined stages are left out, because they may not accept artificial frames.
 
     Args:
-        config: how the frames to come are made.
-        loader: has the network.
+        config: configuration of the run.
+        loader: loader that has the network.
     """
     config = _ours(config)
     network, seen = Session(config, loader=loader), Session(config, lambda camera: _one_car())
@@ -39,7 +39,7 @@ def warm_up(config: Config, loader: StageLoader) -> None:
 
 
 def _ours(config: Config) -> Config:
-    """The configuration without what others have written or publish."""
+    """Return the configuration without user-defined stages and without robot topics."""
     changes: dict[str, Any] = {
         name: getattr(Config(), name)
         for name in ("ground", "clustering", "objects")
@@ -51,7 +51,7 @@ def _ours(config: Config) -> Config:
 
 
 def _frame(index: int) -> Frame:
-    """A level ground, and on it a box of points before the camera."""
+    """Return a frame with level ground and a box of points before the camera."""
     ground = np.mgrid[-20:20:0.5, -20:20:0.5, -1.8:-1.7:1].reshape(3, -1).T
     car = np.mgrid[8:10:0.1, -1:1:0.1, -1.5:0:0.2].reshape(3, -1).T
     points = np.concatenate([ground, car]).astype(np.float32)
@@ -76,6 +76,7 @@ def _frame(index: int) -> Frame:
 
 
 def _one_car() -> Detections:
+    """Return the detection of one car, with a mask."""
     first = np.zeros(1, np.int32)
     box = np.array([[260, 170, 380, 240]], np.float32)
     one = np.ones(1, np.float32)
