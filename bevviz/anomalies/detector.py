@@ -77,23 +77,25 @@ class AnomalyDetector:
         """
         texts = {(e.camera, e.row): e.text for e in result.explanations if e.subject == "detection"}
         for camera in result.cameras:
-            name, found, fusion = camera.camera.name, camera.detections, camera.fusion
+            name, detections, fusion = camera.camera.name, camera.detections, camera.fusion
             before, self._alone[name] = self._alone.get(name, []), []
-            if found is None or fusion is None:
+            if detections is None or fusion is None:
                 continue
-            alone = np.isin(fusion.detection_decision, UNMATCHED) & found.kept & (found.score >= STRONG)
+            alone = (
+                np.isin(fusion.detection_decision, UNMATCHED) & detections.kept & (detections.score >= STRONG)
+            )
             unmatched = np.flatnonzero(alone)
-            boxes = found.xyxy[unmatched]
+            boxes = detections.xyxy[unmatched]
             others = np.array([box for box, _, _ in before], np.float32).reshape(-1, 4)
             same = iou(boxes, others) >= SAME_BOX
             for d, box, near in zip(unmatched.tolist(), boxes, same, strict=True):
-                what = found.names[d]
-                earlier = [before[i][2] for i in np.flatnonzero(near).tolist() if before[i][1] == what]
+                class_name = detections.names[d]
+                earlier = [before[i][2] for i in np.flatnonzero(near).tolist() if before[i][1] == class_name]
                 frames = 1 + max(earlier, default=0)
-                self._alone[name].append((box, what, frames))
+                self._alone[name].append((box, class_name, frames))
                 if frames >= config.alone_frames and _seen_through(result, camera, d):
-                    text = texts.get((name, d), f"{what} {found.score[d]:.2f}")
-                    subject = f"{what} in {name}"
+                    text = texts.get((name, d), f"{class_name} {detections.score[d]:.2f}")
+                    subject = f"{class_name} in {name}"
                     yield Anomaly("one_sensor", subject, f"{name}: {text}, for {frames} frames", rank=0.4)
 
     # --- sensors and stages --------------------------------------------------------------------
@@ -131,23 +133,28 @@ def _seen_through(result: FrameResult, camera: CameraResult, row: int) -> bool:
     The distance of the detection is estimated from the usual height of its class. Most points in its box must
     lie far behind that distance.
     """
-    found, about = camera.detections, camera.camera
-    assert found is not None
-    size = result.config.objects.sizes.get(found.names[row].lower())
-    if size is None or about.intrinsics is None or about.camera_from_points is None:
+    detections, sensor = camera.detections, camera.camera
+    assert detections is not None
+    size = result.config.objects.sizes.get(detections.names[row].lower())
+    if size is None or sensor.intrinsics is None or sensor.camera_from_points is None:
         return False
-    x0, y0, x1, y1 = found.xyxy[row].tolist()
-    away = float(about.intrinsics.K[1, 1]) * size[2] / max(y1 - y0, 1.0)
-    if away > NEAR or min(x0, y0) < 1 or x1 > about.intrinsics.width - 1 or y1 > about.intrinsics.height - 1:
+    x0, y0, x1, y1 = detections.xyxy[row].tolist()
+    distance = float(sensor.intrinsics.K[1, 1]) * size[2] / max(y1 - y0, 1.0)
+    if (
+        distance > NEAR
+        or min(x0, y0) < 1
+        or x1 > sensor.intrinsics.width - 1
+        or y1 > sensor.intrinsics.height - 1
+    ):
         return False
     uv, depth = geometry.project(
-        geometry.apply(about.camera_from_points, result.frame.points), about.intrinsics
+        geometry.apply(sensor.camera_from_points, result.frame.points), sensor.intrinsics
     )
     low = np.array([x0 + (x1 - x0) / 4, y0 + (y1 - y0) / 5])
     high = np.array([x1 - (x1 - x0) / 4, y1 - (y1 - y0) / 5])
     with np.errstate(invalid="ignore"):
-        there = depth[((uv >= low) & (uv <= high)).all(axis=1)]
-    return bool(len(there) >= 3 and (there > BEHIND * away).mean() >= THROUGH)
+        depths = depth[((uv >= low) & (uv <= high)).all(axis=1)]
+    return bool(len(depths) >= 3 and (depths > BEHIND * distance).mean() >= THROUGH)
 
 
 def _stages(result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:

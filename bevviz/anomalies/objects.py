@@ -147,14 +147,14 @@ def _jump(
     """
     if known.steps < PAST or known.center is None or sight.open[row] < config.visible:
         return
-    who, spread = label(tracks, row), math.sqrt(known.spread + NOISE**2)
+    name, spread = label(tracks, row), math.sqrt(known.spread + NOISE**2)
     limit = max(config.jump, SPREADS * spread)
     if tracks.cluster[row] >= 0:
         length, center = _measured(measured, tracks, row)
-        away = min(float(tracks.innovation[row]), float(np.hypot(*(center - known.center)[:2])))
-        if away > limit and tracks.object[row] >= 0 and abs(length - known.length) <= GROWTH:
-            text = f"{who}: {away:.1f} m from where it was expected"
-            yield Anomaly("jump", who, text, rank=_rank(sight, row, away / limit / 3))
+        distance = min(float(tracks.innovation[row]), float(np.hypot(*(center - known.center)[:2])))
+        if distance > limit and tracks.object[row] >= 0 and abs(length - known.length) <= GROWTH:
+            text = f"{name}: {distance:.1f} m from where it was expected"
+            yield Anomaly("jump", name, text, rank=_rank(sight, row, distance / limit / 3))
         return
     if tracks.coasting[row] > LATEST or result.obstacles is None:
         return
@@ -167,8 +167,8 @@ def _jump(
             and abs(length - known.length) <= GROWTH
             and _others_there(result, tracks, sight, row) <= EMPTY
         ):
-            text = f"{who}: {offset[other]:.1f} m from where it was expected, as a new track"
-            yield Anomaly("jump", who, text, rank=_rank(sight, row, float(offset[other]) / limit / 3))
+            text = f"{name}: {offset[other]:.1f} m from where it was expected, as a new track"
+            yield Anomaly("jump", name, text, rank=_rank(sight, row, float(offset[other]) / limit / 3))
             return
 
 
@@ -177,8 +177,8 @@ def _others_there(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) 
     assert result.obstacles is not None
     assert result.clusters is not None
     old = tracks.cluster[(tracks.hits > 2) & (tracks.cluster >= 0)]
-    there = geometry.inside(result.obstacles, sight.boxes, row)
-    return int(np.isin(result.clusters.labels[there], old).sum()) if len(result.clusters.labels) else 0
+    in_box = geometry.inside(result.obstacles, sight.boxes, row)
+    return int(np.isin(result.clusters.labels[in_box], old).sum()) if len(result.clusters.labels) else 0
 
 
 def _measured(measured: Boxes3D, tracks: Tracks, row: int) -> tuple[float, F32]:
@@ -242,8 +242,8 @@ def _empty(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> bool
 
 def _rank(sight: _Sight, row: int, strange: float) -> float:
     """Return a rank from 0 to 1. Near and very surprising objects rank highest."""
-    away = float(np.hypot(*sight.boxes.center[row, :2]))
-    return min(strange, 1.0) / (1 + away / 20)
+    distance = float(np.hypot(*sight.boxes.center[row, :2]))
+    return min(strange, 1.0) / (1 + distance / 20)
 
 
 # --- expected visibility -----------------------------------------------------------------------
@@ -267,11 +267,11 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
             continue
         xyxy, share = places
         whole[asked] |= share >= INSIDE
-        found = camera.detections
-        near = geometry.iou(xyxy, found.xyxy) >= SAME
-        same = np.array([[name == tracks.names[t] for name in found.names] for t in asked], bool)
-        same = same.reshape(len(asked), len(found))
-        detected[asked] |= (near & (same | found.kept)).any(axis=1)
+        detections = camera.detections
+        near = geometry.iou(xyxy, detections.xyxy) >= SAME
+        same = np.array([[name == tracks.names[t] for name in detections.names] for t in asked], bool)
+        same = same.reshape(len(asked), len(detections))
+        detected[asked] |= (near & (same | detections.kept)).any(axis=1)
     return _Sight(boxes, open_, whole, detected)
 
 
@@ -282,14 +282,14 @@ def _in_image(camera: CameraResult, boxes: Boxes3D) -> tuple[F32, F32] | None:
         (K, 4) bounding rectangle of each box, clipped to the image, NaN behind the camera, and (K,) share of
         the rectangle that is in the image.
     """
-    about = camera.camera
-    if about.image is None or about.intrinsics is None or about.camera_from_points is None:
+    sensor = camera.camera
+    if sensor.image is None or sensor.intrinsics is None or sensor.camera_from_points is None:
         return None
     corners = geometry.corners(boxes).reshape(-1, 3)
-    uv, _ = geometry.project(geometry.apply(about.camera_from_points, corners), about.intrinsics)
+    uv, _ = geometry.project(geometry.apply(sensor.camera_from_points, corners), sensor.intrinsics)
     uv = uv.reshape(-1, 8, 2)
     xyxy = np.hstack([uv.min(axis=1), uv.max(axis=1)])
-    size = np.array([about.intrinsics.width, about.intrinsics.height] * 2, np.float32)
+    size = np.array([sensor.intrinsics.width, sensor.intrinsics.height] * 2, np.float32)
     inside = np.clip(xyxy, 0, size)
     area = np.prod(np.maximum(xyxy[:, 2:] - xyxy[:, :2], 1e-3), axis=1)
     with np.errstate(invalid="ignore"):

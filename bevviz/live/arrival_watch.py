@@ -117,4 +117,4 @@ class Watch:
 
     def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
         """Return the state of each topic, given whether it has a publisher."""
-        return {name: self.state(name, there) for name, there in published.items()}
+        return {name: self.state(name, is_published) for name, is_published in published.items()}

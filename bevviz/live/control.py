@@ -159,9 +159,9 @@ def snap(path: Path | None = None, pid: int | None = None) -> Path:
 
 def folders() -> Iterator[Path]:
     """Yield the folders that may hold the sockets, the best one first."""
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    if given:
-        yield Path(given, "bevviz")
+    runtime_folder = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime_folder:
+        yield Path(runtime_folder, "bevviz")
     yield (
         Path(f"/run/user/{os.getuid()}/bevviz") if Path(f"/run/user/{os.getuid()}").is_dir() else _temporary()
     )
@@ -175,7 +175,7 @@ def _temporary() -> Path:
 
 def _running() -> dict[int, socket.socket]:
     """Return a connection to each listening process of this user. Remove the sockets of ended processes."""
-    found: dict[int, socket.socket] = {}
+    connections: dict[int, socket.socket] = {}
     for folder in dict.fromkeys(folders()):
         try:
             check_owned(folder)
@@ -195,8 +195,8 @@ def _running() -> dict[int, socket.socket]:
             except OSError:
                 continue
             if user == os.getuid():
-                found[process] = connection
-    return found
+                connections[process] = connection
+    return connections
 
 
 def _line(lines: BinaryIO) -> bytes | None:

@@ -84,10 +84,10 @@ class Diagnostics:
 
     def _anomalies(self) -> Any:
         """Return the status of the anomalies."""
-        found = self._result.anomalies if self._result is not None else ()
-        text = found[0].text if found else ""
-        level = ERROR if any(a.severity == "ERROR" for a in found) else WARN if found else OK
-        return self._status("anomalies", level, text, {f"{a.kind} {a.subject}": a.text for a in found})
+        anomalies = self._result.anomalies if self._result is not None else ()
+        text = anomalies[0].text if anomalies else ""
+        level = ERROR if any(a.severity == "ERROR" for a in anomalies) else WARN if anomalies else OK
+        return self._status("anomalies", level, text, {f"{a.kind} {a.subject}": a.text for a in anomalies})
 
     def _status(self, part: str, level: int, text: str, values: Mapping[str, str]) -> Any:
         """Return a DiagnosticStatus."""

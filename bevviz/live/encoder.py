@@ -88,9 +88,9 @@ class _FrameLogger(Logger):
     def write(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Log archetypes, or set them aside if they are larger than ``limit``."""
         if self.limit is not None:
-            clouds = [one for one in archetypes if is_cloud(one, self.limit)]
-            self.clouds += [(path, one) for one in clouds]
-            archetypes = tuple(one for one in archetypes if not is_cloud(one, self.limit))
+            clouds = [archetype for archetype in archetypes if is_cloud(archetype, self.limit)]
+            self.clouds += [(path, archetype) for archetype in clouds]
+            archetypes = tuple(archetype for archetype in archetypes if not is_cloud(archetype, self.limit))
         if archetypes:
             super().write(path, *archetypes)
 
@@ -212,8 +212,8 @@ class Encoder:
             self._differences = DifferenceLogger(self._stream.recording, self._against.names, "")
         if whole:
             self._differences.refresh()
-        for one in compared:
-            self._differences.log(one.found, one.received, one.world_from_points)
+        for comparison in compared:
+            self._differences.log(comparison.found, comparison.received, comparison.world_from_points)
 
     def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
         """Return the beginning of a recording whose first packet has this context. Any thread may call it."""

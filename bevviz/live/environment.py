@@ -36,8 +36,10 @@ def load_rclpy() -> ModuleType:
     """
     sourced = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)[0]
     if int(np.__version__.partition(".")[0]) < 2:
-        whose = f"the sourced ROS in {sourced}" if sourced else "this environment"
-        raise UserError(f"numpy {np.__version__} of {whose} is too old for the viewer's SDK; {UNSOURCED}")
+        installation = f"the sourced ROS in {sourced}" if sourced else "this environment"
+        raise UserError(
+            f"numpy {np.__version__} of {installation} is too old for the viewer's SDK; {UNSOURCED}"
+        )
     _check_middleware()
     try:
         rclpy = importlib.import_module("rclpy")
@@ -60,14 +62,14 @@ def _check_middleware() -> None:
     Raises:
         UserError: RMW_IMPLEMENTATION names a middleware that is not installed.
     """
-    asked = os.environ.get("RMW_IMPLEMENTATION", "")
-    if not asked:
+    selected = os.environ.get("RMW_IMPLEMENTATION", "")
+    if not selected:
         return
-    there = middlewares()
-    if there and asked not in there:
+    installed = middlewares()
+    if installed and selected not in installed:
         raise UserError(
-            f"RMW_IMPLEMENTATION={asked} is not installed for this Python, there is "
-            f"{', '.join(sorted(there))}: unset RMW_IMPLEMENTATION where the robot speaks DDS; {MEETING}"
+            f"RMW_IMPLEMENTATION={selected} is not installed for this Python, there is "
+            f"{', '.join(sorted(installed))}: unset RMW_IMPLEMENTATION where the robot speaks DDS; {MEETING}"
         )
 
 

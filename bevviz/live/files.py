@@ -117,7 +117,7 @@ def _runs(path: Path) -> int:
         re.escape(path.stem)
         + r"(?:-(?P<run>[1-9]\d{0,5}))?(?:_\d{3,})?(?:\.partial-[0-9a-f]{8})?\.(?:rrd|mcap)"
     )
-    runs = [found["run"] for file in path.parent.iterdir() if (found := name.fullmatch(file.name))]
+    runs = [match["run"] for file in path.parent.iterdir() if (match := name.fullmatch(file.name))]
     return max(int(run or 1) for run in runs) if None in runs else 0
 
 

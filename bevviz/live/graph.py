@@ -29,15 +29,15 @@ def published_topics(session: Node) -> dict[str, PublishedTopic]:
 
     In a namespace these are its own topics. Topics outside are added for types that it lacks.
     """
-    found = {}
+    topics = {}
     for name, _ in session.input.get_topic_names_and_types():
         publishers = session.input.get_publishers_info_by_topic(name)
         others = tuple(p for p in publishers if not session.owns(p))
         if others:
-            found[name] = PublishedTopic(name, others[0].topic_type, others)
+            topics[name] = PublishedTopic(name, others[0].topic_type, others)
     inside = session.namespace.rstrip("/") + "/"
-    types = {topic.type for topic in found.values() if topic.name.startswith(inside)}
-    return {n: t for n, t in found.items() if n.startswith(inside) or t.type not in types}
+    types = {topic.type for topic in topics.values() if topic.name.startswith(inside)}
+    return {n: t for n, t in topics.items() if n.startswith(inside) or t.type not in types}
 
 
 def matched_qos(publishers: Sequence[Any], kind: str) -> Any:

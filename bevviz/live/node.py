@@ -92,8 +92,8 @@ class Node(Closing):
 
     def owns(self, endpoint: Any) -> bool:
         """Return whether an rclpy TopicEndpointInfo belongs to one of these two nodes."""
-        whose = (endpoint.node_name, endpoint.node_namespace)
-        return any(whose == (node.get_name(), node.get_namespace()) for node in (self.node, self.input))
+        node_name = (endpoint.node_name, endpoint.node_namespace)
+        return any(node_name == (node.get_name(), node.get_namespace()) for node in (self.node, self.input))
 
     @property
     def is_alone(self) -> bool:

@@ -110,12 +110,14 @@ class Publisher:
     def _send_detections(self, result: FrameResult) -> None:
         """Publish the kept detections of each camera."""
         for camera in result.cameras:
-            image, found = camera.camera.image, camera.detections
-            if image is None or found is None:
+            image, detections = camera.camera.image, camera.detections
+            if image is None or detections is None:
                 continue
-            rows = np.flatnonzero(found.kept)
-            results = [[(found.names[row], float(found.score[row]))] for row in rows]
-            self._send(DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, found.xyxy[rows], results))
+            rows = np.flatnonzero(detections.kept)
+            results = [[(detections.names[row], float(detections.score[row]))] for row in rows]
+            self._send(
+                DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, detections.xyxy[rows], results)
+            )
 
     def _wanted(self, topic: str) -> bool:
         """Return whether a topic has a subscriber."""

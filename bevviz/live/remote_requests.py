@@ -43,11 +43,11 @@ class Orders:
         self.save = save
         self._keys = {**{key: key for key in keys(config)}, **TUTORIAL_NAMES}  # parameter name -> key
         about = keys(config)
-        given = [
+        parameters = [
             node.declare_parameter(name, _value(config, name, key), _descriptor(about[key]))
             for name, key in self._keys.items()
         ]
-        if settings := self._settings(given):
+        if settings := self._settings(parameters):
             change(settings)
         node.add_on_set_parameters_callback(self._set)
         if save is not None:

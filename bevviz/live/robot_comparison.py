@@ -104,15 +104,19 @@ class AgainstRobot:
         in_space = {stamp: boxes for stamp, boxes in late if isinstance(boxes, LabelledBoxes3D)}
         for labelled in (*frame.robot_boxes, *in_space.values()):
             self._choose(labelled.topic)
-        images = {found.camera: _image_boxes(found) for found in frame.robot_detections if found.camera}
+        images = {
+            labelled_boxes.camera: _image_boxes(labelled_boxes)
+            for labelled_boxes in frame.robot_detections
+            if labelled_boxes.camera
+        }
         if result.objects is None:
             self.without_ours += 1
         else:
             about = frame.index, frame.stamp, frame.received, frame.pose
             self._waiting[frame.stamp] = Ours(*about, seen(result), images)
-        for stamp, found in late:
-            if isinstance(found, LabelledBoxes2D):
-                self._add_images(stamp, found)
+        for stamp, labelled_boxes in late:
+            if isinstance(labelled_boxes, LabelledBoxes2D):
+                self._add_images(stamp, labelled_boxes)
         self._late |= {stamp: boxes for stamp, boxes in in_space.items() if boxes.topic == self.topic}
         compared = []
         theirs = published(frame, self.topic, result.config) if self.topic else None
@@ -156,8 +160,8 @@ class AgainstRobot:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
-        found = differences(ours.index, ours.stamp, ours.seen, replace(theirs, images=images))
-        different = [d for d in found.objects if self._differs(d)]
+        frame_differences = differences(ours.index, ours.stamp, ours.seen, replace(theirs, images=images))
+        different = [d for d in frame_differences.objects if self._differs(d)]
         self.frames += 1
         self.differing += bool(different)
         if not different:
@@ -168,11 +172,11 @@ class AgainstRobot:
             lasted = (ours.stamp - self._since) / SECOND
             if lasted >= self.config.robot_time:
                 self._fired = True
-                words = ", ".join(f"{_words(d)} {place(d, found)}" for d in different[:3])
+                words = ", ".join(f"{_words(d)} {place(d, frame_differences)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 with self._lock:
                     self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
-        return Compared(found, ours.received, ours.world_from_points)
+        return Compared(frame_differences, ours.received, ours.world_from_points)
 
     def _differs(self, difference: Difference) -> bool:
         """Return whether a difference is large enough to count."""

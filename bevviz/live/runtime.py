@@ -317,7 +317,7 @@ class Live:
         self.encoder.close()
 
     def warm_up(self) -> None:
-        """Compile and load everything that the first frame needs. Scans that come meanwhile are dropped."""
+        """Compile and load everything that the first frame needs. Scans of that time count as no drops."""
         if not self._observes:
             warm_up(self.config, self._session.loader)
 
@@ -328,7 +328,7 @@ class Live:
         health = self.health.scalars() | drops | lags | self._snapshots.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
-        boxes = [(one.frame_stamp, one.boxes) for one in late]
+        boxes = [(late_result.frame_stamp, late_result.boxes) for late_result in late]
         compared = self.against.see(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
         self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
@@ -536,5 +536,5 @@ class Observing(Session):
         return FrameResult.unprocessed(frame, self.config)
 
     def finish(self, result: FrameResult) -> FrameResult:
-        """Complete the result without running the later stages."""
+        """Add the anomalies of the drive, without running the later stages."""
         return self.watch(result)

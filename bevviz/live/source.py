@@ -212,18 +212,18 @@ class LiveSource(Closing):
 
     def _misstated(self) -> dict[str, str]:
         """Return the topics of the configuration that nobody publishes, or that have another type."""
-        found = {}
+        problems = {}
         stated = resolved(self.config.source, self._node.resolve)
         topics = {topic.name: topic for topic in self._look_up(self.topics.values(), stated)}
         for name, (key, kinds) in stated_topics(self.config, self._node.resolve).items():
             topic = topics.get(name)
             if topic is None:
-                found[name] = f"nobody publishes {name}, which {key} states"
+                problems[name] = f"nobody publishes {name}, which {key} states"
             elif topic.aside and "PointCloud2" in kinds:
-                found[name] = f"{name}, which {key} states, holds {topic.aside}"
+                problems[name] = f"{name}, which {key} states, holds {topic.aside}"
             elif kinds and topic.kind not in kinds:
-                found[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
-        return found
+                problems[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
+        return problems
 
     @property
     def scene(self) -> Scene:
@@ -285,10 +285,10 @@ class LiveSource(Closing):
     def marks(self, index: int) -> tuple[Mark, ...]:
         """Return the marks of frames up to this index since the last call, including dropped frames."""
         with self._knowledge:
-            found = tuple(mark for mark in self._marks if mark.index <= index)
-            for _ in found:
+            marks = tuple(mark for mark in self._marks if mark.index <= index)
+            for _ in marks:
                 self._marks.popleft()
-        return found
+        return marks
 
     def __iter__(self) -> Iterator[Frame]:
         if not self._iterated:
@@ -449,10 +449,10 @@ class LiveSource(Closing):
         topics = self._look_up(self._known.values(), stated)
         if stated.lidar_topics:  # packets without metadata do not have a role yet
             topics = [t for t in topics if not (t.aside and t.name in stated.lidar_topics)]
-        there = {topic.name for topic in topics}
+        topic_names = {topic.name for topic in topics}
         # An absent topic of a stage is waited for, as an absent sensor is.
         stages = {key: self._node.resolve(name) for key, name in stage_topics(self.config).items()}
-        stages = {key: name for key, name in stages.items() if name in there}
+        stages = {key: name for key, name in stages.items() if name in topic_names}
         try:
             roles = find_roles(*without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
@@ -472,8 +472,8 @@ class LiveSource(Closing):
             self._handlers = {topic: self._handlers[topic] for topic in others}
             self._handlers |= make_around_handlers(self._sync, roles, LiveMessage.decode)
         self.roles = roles
-        told = [name for name in self._ousters.metadata if name in self._known]
-        self._handlers |= dict.fromkeys(told, self._add_metadata)
+        metadata_topics = [name for name in self._ousters.metadata if name in self._known]
+        self._handlers |= dict.fromkeys(metadata_topics, self._add_metadata)
         for name in self._subscriptions.keys() - self._handlers.keys():
             self._node.input.destroy_subscription(self._subscriptions.pop(name).handle)
         for name in self._handlers:
@@ -482,10 +482,10 @@ class LiveSource(Closing):
     def _look_up(self, topics: Iterable[PublishedTopic], stated: SourceConfig) -> list[Topic]:
         """Return the known facts about topics, given the stated topics of the configuration."""
         boxes = stated.boxes.get("topic", "")
-        found = [
+        known_topics = [
             Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
         ]
-        return self._ousters.look(found, stated.lidar_calibration)
+        return self._ousters.look(known_topics, stated.lidar_calibration)
 
     def _add_metadata(self, message: LiveMessage) -> None:
         """Take in the metadata of an Ouster."""

@@ -16,7 +16,7 @@ def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tu
     No types means that any type is permitted.
     """
     source, images = resolved(config.source, resolve), ("Image", "CompressedImage")
-    found: dict[str, tuple[str, tuple[str, ...]]] = {}
+    stated: dict[str, tuple[str, tuple[str, ...]]] = {}
     for key, names, kinds in (
         ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
         ("source.camera_topics", source.camera_topics, images),
@@ -25,9 +25,9 @@ def stated_topics(config: Config, resolve: Callable[[str], str]) -> dict[str, tu
         ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
         ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
     ):
-        found |= dict.fromkeys(names, (key, kinds))
+        stated |= dict.fromkeys(names, (key, kinds))
     stages = stage_topics(config)
-    return found | {resolve(name): (key, (STAGE_KINDS[key],)) for key, name in stages.items()}
+    return stated | {resolve(name): (key, (STAGE_KINDS[key],)) for key, name in stages.items()}
 
 
 def resolved(config: SourceConfig, resolve: Callable[[str], str]) -> SourceConfig:
@@ -53,9 +53,9 @@ def without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topi
     names = {topic.name for topic in topics}
     changes: dict[str, Any] = {}
     for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
-        given = getattr(config, key)
-        changes[key] = tuple(name for name in given if name in names)
-        if given and not changes[key]:
+        stated_names = getattr(config, key)
+        changes[key] = tuple(name for name in stated_names if name in names)
+        if stated_names and not changes[key]:
             topics = [topic for topic in topics if topic.kind not in kinds]
     changes["camera_info_topics"] = {
         image: info for image, info in config.camera_info_topics.items() if {image, info} <= names

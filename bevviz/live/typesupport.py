@@ -33,10 +33,10 @@ def message_type(name: str) -> Any:
         module = importlib.import_module(f"{package}.msg")
     except ImportError:
         return _from_definition(name)
-    found = getattr(module, short, None)
-    if found is None:
+    message_class = getattr(module, short, None)
+    if message_class is None:
         raise UserError(f"the installed {package} has no message {short}")
-    return found
+    return message_class
 
 
 def _from_definition(name: str) -> Any:

@@ -79,10 +79,10 @@ def _one_car() -> Detections:
     """Return the detection of one car, with a mask."""
     first = np.zeros(1, np.int32)
     box = np.array([[260, 170, 380, 240]], np.float32)
-    one = np.ones(1, np.float32)
+    score = np.ones(1, np.float32)
     cells = Masks(
         np.packbits(np.ones(120 * 70, np.uint8)),
         np.array([[260, 170, 120, 70]], np.int32),
         np.array([1, 1, 0, 0], np.float32),
     )
-    return Detections(box, one, first, ("car",), first + DetectionState.KEPT, first - 1, 0 * one, cells)
+    return Detections(box, score, first, ("car",), first + DetectionState.KEPT, first - 1, 0 * score, cells)
