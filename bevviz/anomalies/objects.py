@@ -63,7 +63,7 @@ class Past:
 
 
 @dataclass(slots=True)
-class _Known:
+class _TrackHistory:
     """State of one track: its history and its last measurement."""
 
     camera: Past
@@ -76,7 +76,7 @@ class _Known:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sight:
+class _Visibility:
     """Expected visibility of the tracks. One row per track."""
 
     boxes: Boxes3D  # in the frame of the points
@@ -89,7 +89,7 @@ class ObjectWatch:
     """Detector of object anomalies in the tracks of consecutive frames."""
 
     def __init__(self) -> None:
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, _TrackHistory] = {}
 
     def clear(self) -> None:
         """Forget all tracks, for a drive that starts again."""
@@ -99,29 +99,40 @@ class ObjectWatch:
         """Yield the anomalies of this frame, given the frames before it."""
         count = 0 if result.clusters is None else len(result.clusters)
         looked_at = np.append(in_view(result.cameras, count), False)[tracks.cluster]
-        sight, measured = _sight(result, tracks), _clusters(result, tracks)
+        visibility, measured = _expected_visibility(result, tracks), _clusters(result, tracks)
         before, self._known = self._known, {}
         missing: dict[str, list[tuple[int, Past]]] = defaultdict(list)
         named: set[str] = set()
         for row, number in enumerate(tracks.id.tolist()):
-            known = self._known[number] = before.get(number) or _Known(Past(), Past())
+            known = self._known[number] = before.get(number) or _TrackHistory(Past(), Past())
             clustered, has_name = tracks.cluster[row] >= 0, tracks.object[row] >= 0
-            plain = sight.open[row] >= config.visible
+            plain = visibility.open[row] >= config.visible
             if has_name:
                 named.add(tracks.names[row])
                 known.camera.add(True)
-            elif clustered and looked_at[row] and plain and sight.whole[row] and not sight.detected[row]:
+            elif (
+                clustered
+                and looked_at[row]
+                and plain
+                and visibility.whole[row]
+                and not visibility.detected[row]
+            ):
                 known.camera.add(False)
                 if tracks.confirmed[row]:
                     missing[tracks.names[row]].append((row, known.camera))
             if clustered:
                 known.lidar.add(True)
-            elif tracks.confirmed[row] and plain and sight.whole[row] and _empty(result, tracks, sight, row):
+            elif (
+                tracks.confirmed[row]
+                and plain
+                and visibility.whole[row]
+                and _empty(result, tracks, visibility, row)
+            ):
                 known.lidar.add(False)
                 if known.lidar.surprise >= config.surprise and known.lidar.missed >= 2:
-                    yield _lost(tracks, sight, row, known.lidar)
+                    yield _lost(tracks, visibility, row, known.lidar)
             if tracks.confirmed[row]:
-                yield from _jump(result, tracks, sight, row, known, measured, config)
+                yield from _jump(result, tracks, visibility, row, known, measured, config)
             if clustered:
                 known.length, known.center = _measured(measured, tracks, row)
             if clustered and np.isfinite(tracks.innovation[row]):
@@ -129,15 +140,15 @@ class ObjectWatch:
                 gain = max(1 / known.steps, 1 / MEMORY)
                 known.spread += gain * (float(tracks.innovation[row]) ** 2 - known.spread)
         for name, rows in missing.items():
-            yield from _missing(tracks, sight, name, rows, name in named, config)
+            yield from _missing(tracks, visibility, name, rows, name in named, config)
 
 
 def _jump(
     result: FrameResult,
     tracks: Tracks,
-    sight: _Sight,
+    visibility: _Visibility,
     row: int,
-    known: _Known,
+    known: _TrackHistory,
     measured: Boxes3D,
     config: AnomaliesConfig,
 ) -> Iterator[Anomaly]:
@@ -145,7 +156,7 @@ def _jump(
 
     A centre that moves because more or less of the object was measured is no jump.
     """
-    if known.steps < PAST or known.center is None or sight.open[row] < config.visible:
+    if known.steps < PAST or known.center is None or visibility.open[row] < config.visible:
         return
     name, spread = label(tracks, row), math.sqrt(known.spread + NOISE**2)
     limit = max(config.jump, SPREADS * spread)
@@ -154,7 +165,7 @@ def _jump(
         distance = min(float(tracks.innovation[row]), float(np.hypot(*(center - known.center)[:2])))
         if distance > limit and tracks.object[row] >= 0 and abs(length - known.length) <= GROWTH:
             text = f"{name}: {distance:.1f} m from where it was expected"
-            yield Anomaly("jump", name, text, rank=_rank(sight, row, distance / limit / 3))
+            yield Anomaly("jump", name, text, rank=_rank(visibility, row, distance / limit / 3))
         return
     if tracks.coasting[row] > LATEST or result.obstacles is None:
         return
@@ -165,19 +176,19 @@ def _jump(
         if (
             tracks.names[other] in ("", tracks.names[row])
             and abs(length - known.length) <= GROWTH
-            and _others_there(result, tracks, sight, row) <= EMPTY
+            and _count_older_points(result, tracks, visibility, row) <= EMPTY
         ):
             text = f"{name}: {offset[other]:.1f} m from where it was expected, as a new track"
-            yield Anomaly("jump", name, text, rank=_rank(sight, row, float(offset[other]) / limit / 3))
+            yield Anomaly("jump", name, text, rank=_rank(visibility, row, float(offset[other]) / limit / 3))
             return
 
 
-def _others_there(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> int:
+def _count_older_points(result: FrameResult, tracks: Tracks, visibility: _Visibility, row: int) -> int:
     """Count the obstacle points in the box of a track that belong to clusters with older tracks."""
     assert result.obstacles is not None
     assert result.clusters is not None
     old = tracks.cluster[(tracks.hits > 2) & (tracks.cluster >= 0)]
-    in_box = geometry.inside(result.obstacles, sight.boxes, row)
+    in_box = geometry.inside(result.obstacles, visibility.boxes, row)
     return int(np.isin(result.clusters.labels[in_box], old).sum()) if len(result.clusters.labels) else 0
 
 
@@ -200,7 +211,7 @@ def _clusters(result: FrameResult, tracks: Tracks) -> Boxes3D:
 
 def _missing(
     tracks: Tracks,
-    sight: _Sight,
+    visibility: _Visibility,
     name: str,
     rows: list[tuple[int, Past]],
     others: bool,
@@ -219,37 +230,39 @@ def _missing(
             who = label(tracks, row)
             size = " x ".join(f"{side:.1f}" for side in tracks.boxes.size[row].tolist())
             text = f"{who}: a cluster in plain view, {size} m, without a detection for {_frames(p.missed)}"
-            yield Anomaly("one_sensor", who, text, rank=_rank(sight, row, p.surprise / config.surprise / 3))
+            yield Anomaly(
+                "one_sensor", who, text, rank=_rank(visibility, row, p.surprise / config.surprise / 3)
+            )
 
 
-def _lost(tracks: Tracks, sight: _Sight, row: int, past: Past) -> Anomaly:
+def _lost(tracks: Tracks, visibility: _Visibility, row: int, past: Past) -> Anomaly:
     """Return the anomaly of a track whose cluster is gone although nothing hides it."""
     who, frames = label(tracks, row), _frames(past.missed)
-    if sight.detected[row]:
+    if visibility.detected[row]:
         text = f"{who}: detected where the LiDAR sees nothing, and nothing that hides it, for {frames}"
-        return Anomaly("one_sensor", who, text, rank=_rank(sight, row, past.surprise / 20))
+        return Anomaly("one_sensor", who, text, rank=_rank(visibility, row, past.surprise / 20))
     text = f"{who}: gone for {frames} from where nothing hides it"
-    return Anomaly("flicker", who, text, rank=_rank(sight, row, past.surprise / 20))
+    return Anomaly("flicker", who, text, rank=_rank(visibility, row, past.surprise / 20))
 
 
-def _empty(result: FrameResult, tracks: Tracks, sight: _Sight, row: int) -> bool:
+def _empty(result: FrameResult, tracks: Tracks, visibility: _Visibility, row: int) -> bool:
     """Return whether the box of a track is empty and no other track has taken the object over."""
-    if result.obstacles is None or geometry.inside(result.obstacles, sight.boxes, row).sum() > EMPTY:
+    if result.obstacles is None or geometry.inside(result.obstacles, visibility.boxes, row).sum() > EMPTY:
         return False
     others = np.flatnonzero(tracks.cluster >= 0)
-    return not geometry.bev_iou(sight.boxes.chosen([row]), sight.boxes.chosen(others)).any()
+    return not geometry.bev_iou(visibility.boxes.chosen([row]), visibility.boxes.chosen(others)).any()
 
 
-def _rank(sight: _Sight, row: int, strange: float) -> float:
+def _rank(visibility: _Visibility, row: int, strange: float) -> float:
     """Return a rank from 0 to 1. Near and very surprising objects rank highest."""
-    distance = float(np.hypot(*sight.boxes.center[row, :2]))
+    distance = float(np.hypot(*visibility.boxes.center[row, :2]))
     return min(strange, 1.0) / (1 + distance / 20)
 
 
 # --- expected visibility -----------------------------------------------------------------------
 
 
-def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
+def _expected_visibility(result: FrameResult, tracks: Tracks) -> _Visibility:
     """Compute the expected visibility of the tracks. Only confirmed tracks are examined."""
     boxes = tracks.boxes
     if tracks.absolute:
@@ -272,7 +285,7 @@ def _sight(result: FrameResult, tracks: Tracks) -> _Sight:
         same = np.array([[name == tracks.names[t] for name in detections.names] for t in asked], bool)
         same = same.reshape(len(asked), len(detections))
         detected[asked] |= (near & (same | detections.kept)).any(axis=1)
-    return _Sight(boxes, open_, whole, detected)
+    return _Visibility(boxes, open_, whole, detected)
 
 
 def _in_image(camera: CameraResult, boxes: Boxes3D) -> tuple[F32, F32] | None:

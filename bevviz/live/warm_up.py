@@ -29,7 +29,7 @@ def warm_up(config: Config, loader: StageLoader) -> None:
         config: configuration of the run.
         loader: loader that has the network.
     """
-    config = _ours(config)
+    config = _without_user_stages(config)
     network, seen = Session(config, loader=loader), Session(config, lambda camera: _one_car())
     network.run(_frame(0))
     results = [seen.run(_frame(index)) for index in range(2)]
@@ -38,7 +38,7 @@ def warm_up(config: Config, loader: StageLoader) -> None:
             encoder.encode(result, SCENE, {}, ())
 
 
-def _ours(config: Config) -> Config:
+def _without_user_stages(config: Config) -> Config:
     """Return the configuration without user-defined stages and without robot topics."""
     changes: dict[str, Any] = {
         name: getattr(Config(), name)
