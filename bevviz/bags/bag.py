@@ -20,18 +20,18 @@ from rosbags.typesys import Stores
 
 from bevviz.bags import mcap
 from bevviz.bags.file_types import open_file
-from bevviz.bags.message import RawMessage, form_of, is_ros1
+from bevviz.bags.message import RawMessage, foxglove_encoding, is_ros1
 from bevviz.bags.reader import BagFile, normalized
-from bevviz.bags.sidecar import bag_beside
+from bevviz.bags.sidecar import find_saved_bag
 from bevviz.bags.type_store import MessageTypes
 from bevviz.config import SourceConfig
-from bevviz.config.files import yaml_value
+from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.reader import DatasetReader
-from bevviz.datasets.unread_files import unread
+from bevviz.datasets.unread_files import describe_unread
 from bevviz.drivers import ouster
 from bevviz.drivers.calibration_file import read_calibration
-from bevviz.drivers.video import Packet, decode_packet, is_video
+from bevviz.drivers.video import VideoPacket, decode_packet, is_video
 from bevviz.errors import UserError
 from bevviz.messages import vision_msgs
 from bevviz.messages.decoders import Serialization, reads_bytes
@@ -41,8 +41,8 @@ from bevviz.messages.surroundings import decode_mark
 from bevviz.messages.topics import NOT_LIDAR, Topic
 from bevviz.model.frame import I64
 from bevviz.support import progress
-from bevviz.support.contexts import Closing
-from bevviz.support.files import Scratch, bag_files, drive_files, full_disk, read_text
+from bevviz.support.contexts import Closable
+from bevviz.support.files import ScratchFolder, bag_files, drive_files, full_disk_error, read_text
 from bevviz.support.text import path_text
 
 ATTACHED = "lidar_calibration"  # name prefix of an attached calibration; the topic and the file name follow
@@ -51,10 +51,10 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # first fields of Foxglove messages whose layout is that of a Header
 REWIND = 2_000_000_000  # nanoseconds of the first search for a key frame; each next one spans four times more
 LONGEST_SCAN = 1_000_000_000  # nanoseconds from the first packet of a scan to the last
-MOST_HEADERS = 16  # messages at the start of a video that may be codec headers
+MAX_HEADERS = 16  # messages at the start of a video that may be codec headers
 
 
-class Recording(Closing):
+class Recording(Closable):
     """Messages of one or several bags or data sets as one stream in order of log time.
 
     Args:
@@ -76,7 +76,7 @@ class Recording(Closing):
     def __init__(self, paths: Sequence[Path], config: SourceConfig | None = None) -> None:
         if not paths:
             raise UserError("no bag given")
-        self.paths = tuple(map(bag_beside, paths))
+        self.paths = tuple(map(find_saved_bag, paths))
         self.single_frames = self.is_dataset = False
         self._config = config or SourceConfig()
         self._aside: dict[str, str] = {}
@@ -84,7 +84,7 @@ class Recording(Closing):
         self.files: list[BagFile] = []
         self._notes: list[str] = []
         self.types = MessageTypes(self._notes.append)
-        self._scratch = Scratch()
+        self._scratch = ScratchFolder()
         try:
             for path in self.paths:
                 self._open(path)
@@ -169,7 +169,7 @@ class Recording(Closing):
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[RawMessage]:
         """Yield messages of ``topics`` with start <= log time < stop in nanoseconds, in order of log time."""
-        sources = [_lazily(f, topics, start, stop) for f in self.files]
+        sources = [_lazy_messages(f, topics, start, stop) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
                 yield message
@@ -190,10 +190,10 @@ class Recording(Closing):
         sensor = self._sensors[topic]
         low = None if start is None else start - LONGEST_SCAN
         high = None if stop is None else stop + LONGEST_SCAN
-        scans = ouster.Scans(sensor)
+        scans = ouster.ScanCollector(sensor)
         message: RawMessage | None = None
 
-        def given(found: Iterator[tuple[ouster.Packet, ...]]) -> Iterator[RawMessage]:
+        def given(found: Iterator[tuple[ouster.ReceivedPacket, ...]]) -> Iterator[RawMessage]:
             for packets in found:
                 received = packets[-1][0]
                 if message and (start is None or start <= received) and (stop is None or received < stop):
@@ -239,7 +239,7 @@ class Recording(Closing):
         """Return the metadata of an Ouster sensor and their origin; None if there are none."""
         if file := self.calibrations.get(topic, ""):
             return read_calibration(Path(file)), f"source.lidar_calibration: {file}"
-        name = ouster.metadata_of(topic)
+        name = ouster.metadata_topic(topic)
         message = self.first(name)
         try:
             return (guard(message, decode_mark, self.decode(message)), name) if message else None
@@ -252,7 +252,7 @@ class Recording(Closing):
             return ""
         message = self.first(connection.topic)
         small = message is not None and len(message.data) <= ouster.SMALLEST
-        return NOT_LIDAR if small else ouster.LACKS
+        return NOT_LIDAR if small else ouster.NO_METADATA
 
     def first(self, topic: str) -> RawMessage | None:
         """Return the first message of a topic; None if it has none."""
@@ -263,28 +263,30 @@ class Recording(Closing):
         parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
         return np.sort(np.concatenate(parts))
 
-    def packets(self, topic: str, received: int) -> list[Packet]:
+    def packets(self, topic: str, received: int) -> list[VideoPacket]:
         """Return the video packets that the picture received at a given time needs, including its own.
 
         The list begins with the codec headers from the start of the stream. The last key frame before the
         picture follows, or the start of the recording if there is no key frame.
         """
-        start, found = received + 1, list[Packet]()
+        start, found = received + 1, list[VideoPacket]()
         back = REWIND
         while start > self.start and not any(packet.is_key for packet in found):
             stop, start, back = start, max(self.start, start - back), 4 * back
             found = [*self._packets(topic, start, stop), *found]
         keys = [row for row, packet in enumerate(found) if packet.is_key]
-        first = islice(self._packets(topic, None, None), MOST_HEADERS)
+        first = islice(self._packets(topic, None, None), MAX_HEADERS)
         return [*(packet for packet in first if packet.is_header), *found[keys[-1] if keys else 0 :]]
 
-    def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[Packet]:
+    def _packets(self, topic: str, start: int | None, stop: int | None) -> Iterator[VideoPacket]:
         for message in self.messages([topic], start, stop):
             with suppress(MessageError):  # The error is counted when the message itself is handled.
                 yield guard(message, decode_packet, self.decode(message), topic, message.received)
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its definition; LiDAR drivers' own as a PointCloud2.
+        """Decode a message into an object with the fields of its definition.
+
+        LiDAR packets and compressed clouds become a PointCloud2.
 
         Raises:
             MessageError: the data does not fit the definition, or there is none.
@@ -293,7 +295,7 @@ class Recording(Closing):
         if message.packets:
             return guard(message, partial(ouster.decode, self._sensors[message.topic]), message.packets)
         data = guard(message, RawMessage.content, message)
-        if form_of(message.connection):
+        if foxglove_encoding(message.connection):
             return decode_message(message, data, message.parsed, Serialization(message.type))
         serialization = Serialization(
             message.type,
@@ -324,7 +326,7 @@ class Recording(Closing):
         return store.serialize_cdr(content, msgtype)
 
     def _has_header(self, connection: Connection) -> bool:
-        if form_of(connection):
+        if foxglove_encoding(connection):
             return True
         try:
             _, fields = self.types.store(connection).fielddefs[normalized(connection.msgtype)]
@@ -363,7 +365,7 @@ class Recording(Closing):
         except PermissionError:
             raise UserError(f"{path}: permission denied: you may not read it") from None
         except OSError as error:
-            if (full := full_disk(error)) is not None:  # Unpacking a file filled the temporary folder.
+            if (full := full_disk_error(error)) is not None:  # Unpacking a file filled the temporary folder.
                 raise full from None
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -395,7 +397,7 @@ class Recording(Closing):
             hint = f"; there are bags in its folders: {', '.join(within[:5])}" if within else ""
             if drives := [] if within else [d.name for d in sorted(folder.iterdir()) if find_loader(d)]:
                 hint = f"; its folders that are one: {', '.join(drives[:5])}{' ...' if drives[5:] else ''}"
-            hint += f"; {others}" if (others := unread(folder)) else ""
+            hint += f"; {others}" if (others := describe_unread(folder)) else ""
             raise UserError(
                 f"{folder}: a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is "
                 f"recognised (--dataset NAME){hint}"
@@ -446,7 +448,7 @@ class Recording(Closing):
                 )
             return {}
         try:
-            content = yaml_value(read_text(path), str(path))["rosbag2_bagfile_information"]
+            content = parse_yaml(read_text(path), str(path))["rosbag2_bagfile_information"]
             distro = content.get("ros_distro")
             if f"ros2_{distro}" in {s.value for s in Stores}:
                 self.types.release = Stores(f"ros2_{distro}")
@@ -456,7 +458,7 @@ class Recording(Closing):
             return {}
 
 
-def _lazily(
+def _lazy_messages(
     file: BagFile, topics: Collection[str], start: int | None, stop: int | None
 ) -> Iterator[tuple[int, RawMessage | None]]:
     """Yield the messages of one file after an empty item.
