@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.calib import AXES, Axis, Calibration, Finding, calibrate, gather
+from bevviz.calib import AXES, Axis, AxisFinding, Calibration, calibrate, gather
 from bevviz.calib.offsets import SCALES, TIME, error_pose
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
@@ -48,7 +48,7 @@ class Case:
 
     def wrong(self, row: int) -> bool:
         """Whether a finding relies on an interval that does not hold the truth."""
-        relied = self.result.axes[row].finding in (Finding.OFF, Finding.FINE)
+        relied = self.result.axes[row].finding in (AxisFinding.OFF, AxisFinding.FINE)
         return relied and not self.held(row)
 
 
@@ -187,12 +187,12 @@ def summary(groups: dict[str, list[Case]]) -> Iterator[str]:
         axes = [(case, row) for case in cases for row in range(case.asked)]
         wrong = sum(any(case.wrong(row) for row in range(len(AXES))) for case in cases)
         large = [(c, row) for c, row in axes if abs(c.planted[row]) >= SIZES[AXES[row].unit][1]]
-        off = sum(_finding(c, row) is Finding.OFF for c, row in large)
+        off = sum(_finding(c, row) is AxisFinding.OFF for c, row in large)
         said = Counter(_finding(c, row) for c, row in axes)
         seconds = np.median([case.seconds for case in cases])
         yield (
             f"| {name} | {len(cases)} | {wrong} | {off} of {len(large)} "
-            f"| {said[Finding.UNKNOWN]} of {len(axes)} | {seconds:.0f} |"
+            f"| {said[AxisFinding.UNKNOWN]} of {len(axes)} | {seconds:.0f} |"
         )
 
 
@@ -226,7 +226,7 @@ def _columns(cases: list[Case], row: int) -> str:
     interval = float(np.median([case.result.axes[row].interval for case in known])) if known else float("nan")
     held = sum(case.held(row) for case in cases)
     said = Counter(str(_finding(case, row)) for case in cases)
-    told = ", ".join(f"{what} {said[what]}" for what in Finding if said[what])
+    told = ", ".join(f"{what} {said[what]}" for what in AxisFinding if said[what])
     n = axis.decimals
     return f"{error:.{n}f} {axis.unit} | {interval:.{n}f} {axis.unit} | {held} of {len(cases)} | {told}"
 
@@ -243,7 +243,7 @@ def sentences(cases: list[Case]) -> Iterator[str]:
         yield f"- {count} times: {what}"
 
 
-def _finding(case: Case, row: int) -> Finding:
+def _finding(case: Case, row: int) -> AxisFinding:
     return case.result.axes[row].finding
 
 

@@ -298,7 +298,7 @@ def _workbench(drive: Sequence[str], folder: Path) -> Hashes:
 
 def _live(folder: Path) -> Hashes:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
-    from bevviz.config.reloading import Settings
+    from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.notes import Notes
     from bevviz.live.replay import Replay
     from bevviz.live.runtime import Live, Outputs
@@ -307,7 +307,7 @@ def _live(folder: Path) -> Hashes:
     path = folder / f"live_{time.time_ns()}.rrd"
     drive = SyntheticSource(frames=FRAMES)
     source = Replay(list(drive), drive.scene, rate=1.0, total=FRAMES)
-    settings = Settings(settings=["detector.model=demo"])
+    settings = ReloadableConfig(settings=["detector.model=demo"])
     Live(source, settings, Outputs(save=path), Notes(lambda line: None)).run()
     return {key: value for key, value in digest(path, ("frame",)).items() if not TRACKED.search(key)}
 

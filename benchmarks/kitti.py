@@ -20,7 +20,7 @@ from bevviz.config import Config, load
 from bevviz.model.frame import Camera, Frame, Image, Intrinsics
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.pipeline.stage_loader import Detect, StageLoader
+from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 RANGE = 40.0  # metres, on the ground, of an object that must be found
@@ -120,7 +120,7 @@ def read(root: Path, name: str) -> Shot:
     return Shot(name, frame, tuple(labels), np.array(ignored).reshape(-1, 4))
 
 
-def oracle(shot: Shot, off: float = 0.0) -> Detect:
+def oracle(shot: Shot, off: float = 0.0) -> DetectFunction:
     """The labels' own boxes as detections, so that only what comes after the detector is judged.
 
     Args:

@@ -27,10 +27,10 @@ from benchmarks.measure import machine
 from benchmarks.pages import write_section
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities, rerun_cli
-from bevviz.recording.frame_logger import Logger
-from bevviz.recording.ports import LOOPBACK, answers, free_port
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.ports import LOOPBACK, free_port, is_listening
 from bevviz.recording.sinks import open_recording
-from bevviz.recording.writer import WAIT
+from bevviz.recording.writer import SCALAR_WAIT
 
 LOOKS = 6  # pictures at most, of which the last is taken: on a busy machine plots go on to move
 PERIOD = 100_000_000  # nanoseconds from one frame to the next
@@ -79,7 +79,7 @@ def make(path: Path, size: float, frames: int = 50) -> Path:
         tqdm(total=round(size * 1e3), unit="MB", desc="make", disable=None) as bar,
     ):
         assert sinks.file is not None
-        logger = Logger(sinks.recording, config, scene, wait=WAIT)
+        logger = FrameLogger(sinks.recording, config, scene, wait=SCALAR_WAIT)
         logger.log_static()
         count = 0
         while sinks.file.stat().st_size < size * 1e9:
@@ -149,20 +149,20 @@ def viewer(recording: Path, limit: str) -> Iterator[Watched]:
         limit,
     ]
     process = subprocess.Popen(
-        [rerun_cli.program(), *arguments, "--hide-welcome-screen"],
+        [rerun_cli.rerun_program(), *arguments, "--hide-welcome-screen"],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=rerun_cli.environment(),
     )
     try:
-        while not answers(LOOPBACK, port):
+        while not is_listening(LOOPBACK, port):
             if process.poll() is not None:
                 raise SystemExit("the viewer does not start: apt-get install mesa-vulkan-drivers")
             time.sleep(0.05)
         yield Watched(ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy"), process)
     finally:
-        rerun_cli.end(process)
+        rerun_cli.stop(process)
 
 
 def opened(recording: Path, limit: str, stops: int, pictures: Path | None) -> str:

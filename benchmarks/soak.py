@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs, Status
@@ -47,7 +47,7 @@ def main() -> int:
     total = round(60 * options.minutes * options.rate)
     source = Replay(drive, simulated.scene, rate=options.rate, total=total)
     split = "live.split_size=500 MB"
-    settings = Settings(settings=[f"detector.model={options.model}", split, *options.set])
+    settings = ReloadableConfig(settings=[f"detector.model={options.model}", split, *options.set])
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
     size = f"{simulated.intrinsics.width} x {simulated.intrinsics.height}"
     print(f"{len(drive[0].points)} points and a {size} image at {options.rate:g} Hz")

@@ -23,7 +23,7 @@ from bevviz.messages.clouds import decode_cloud
 from bevviz.model.frame import F32, I32, Camera, Frame, Scene
 from bevviz.model.results import Detections
 from bevviz.pipeline.session import Session
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import open_recording
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster, dbscan
@@ -109,7 +109,7 @@ def lidar_side(scene: Scene) -> Iterator[Any]:
         TemporaryDirectory() as folder,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
-        session, logger = Session(config), Logger(sinks.recording, config, scene)
+        session, logger = Session(config), FrameLogger(sinks.recording, config, scene)
         logger.log_static()
 
         def process(message: Any, frame: Frame) -> None:
@@ -159,7 +159,7 @@ def profile(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene) -> l
         TemporaryDirectory() as folder,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
-        session, logger = Session(config), Logger(sinks.recording, config, scene)
+        session, logger = Session(config), FrameLogger(sinks.recording, config, scene)
         logger.log_static()
         logger.log(session.run(frames[0]))
         bar = tqdm(frames, unit="frame", desc="stages", disable=None)
@@ -197,7 +197,7 @@ def growth(messages: Sequence[Any], frames: Sequence[Frame], scene: Scene, repet
         TemporaryDirectory() as folder,
         open_recording(scene, config, save=Path(folder, "x.rrd")) as sinks,
     ):
-        logger = Logger(sinks.recording, config, scene)
+        logger = FrameLogger(sinks.recording, config, scene)
         sessions = {n: Session(config, partial(_found, scattered(n, frame))) for n in counts}
 
         def detect(count: int) -> None:

@@ -25,7 +25,7 @@ from bevviz.model.results import (
 from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.synthetic.drive import IMAGE_DELAY, START, TRUTH_RANGE
 from bevviz.synthetic.mesh import Material, Mesh, merge
-from bevviz.synthetic.sensors import Caster, Lidar, View
+from bevviz.synthetic.sensors import Caster, Lidar, RaycastView
 from bevviz.why.verdict import Reason
 
 IN_VIEW = 0.1  # share of an object's surface that lies in the direction of the image
@@ -113,7 +113,7 @@ class _Beams:
     def blocked(self, mesh: Mesh, pose: F64) -> float:
         """Share of the beams that would meet the mesh and have come less far."""
         shining = replace(mesh, material=np.full_like(mesh.material, Material.SIGN))  # no echo is too weak
-        alone = Lidar().scan(View(Caster(shining), merge([])), pose, np.random.default_rng(0))
+        alone = Lidar().scan(RaycastView(Caster(shining), merge([])), pose, np.random.default_rng(0))
         come = self.range[_azimuth(alone.time), alone.ring]
         return float((come < np.linalg.norm(alone.xyz, axis=1) - NEARER).mean()) if len(come) else np.nan
 

@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from benchmarks.pages import write_section
 from benchmarks.truth import Cause, Rule, Scene, scene_of
-from bevviz.config import Config, load, revised
+from bevviz.config import Config, changed_config, load
 from bevviz.evaluate import MIN_HITS, RANGE
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
-from bevviz.why import Answer, Questioner, Selection
+from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.verdict import HOPELESS, Reason
 
 CLASSES = ("person", "cyclist", "car")
@@ -90,7 +90,7 @@ class Bench:
         if result.failures:
             raise SystemExit(f"{where}: {result.failures}")
         unlabelled = replace(result, frame=replace(result.frame, truth=None))
-        known, blind = (Questioner(r, self.loader, CLASSES) for r in (result, unlabelled))
+        known, blind = (FrameExplainer(r, self.loader, CLASSES) for r in (result, unlabelled))
         rule, again = Rule(shot, scene, result), _Again(shot, scene, self.config, self.loader)
         for row in range(len(scene.number)):
             about = f"{where}, row {row}"
@@ -105,7 +105,7 @@ class Bench:
                 if answer.near:
                     self._blind(blind, (x0, y0, x1, y1), cause, about)
 
-    def _asked(self, questioner: Questioner, selection: Selection) -> Answer:
+    def _asked(self, questioner: FrameExplainer, selection: Selection) -> Answer:
         start = time.process_time()
         answer = questioner.ask(selection)[0]
         self.tally.seconds.append(time.process_time() - start)
@@ -121,7 +121,7 @@ class Bench:
         if not right:
             self.tally.wrong.append(f"{about}: {_said(cause)}, not: {answer.verdict.text}")
 
-    def _hint(self, known: Questioner, answer: Answer, again: _Again, row: int, about: str) -> None:
+    def _hint(self, known: FrameExplainer, answer: Answer, again: _Again, row: int, about: str) -> None:
         start = time.process_time()
         hints = known.search(answer).hints
         self.tally.hint_seconds.append(time.process_time() - start)
@@ -134,7 +134,7 @@ class Bench:
         if not holds:
             self.tally.wrong.append(f"{about}: {', '.join(hints[0].settings)} leaves it {_said(after)}")
 
-    def _place(self, known: Questioner, shot: Snapshot, scene: Scene, row: int, about: str) -> None:
+    def _place(self, known: FrameExplainer, shot: Snapshot, scene: Scene, row: int, about: str) -> None:
         """Whether a question about its place in the image is answered for it."""
         ys, xs = np.nonzero(shot.pixel_object == scene.number[row])
         middle = np.argmin((xs - xs.mean()) ** 2 + (ys - ys.mean()) ** 2)
@@ -146,7 +146,7 @@ class Bench:
             if not right:
                 self.tally.wrong.append(f"{about}: the {kind} {box} is answered for {subject.name}")
 
-    def _blind(self, blind: Questioner, box: tuple[float, ...], cause: Cause, about: str) -> None:
+    def _blind(self, blind: FrameExplainer, box: tuple[float, ...], cause: Cause, about: str) -> None:
         """As somebody asks who draws a box around it in a recording that has no ground truth."""
         verdict = self._asked(blind, Selection(box=box)).verdict
         reported = verdict.reported == cause.reported
@@ -173,7 +173,7 @@ class _Again:
 
     def with_settings(self, settings: tuple[str, ...]) -> Rule:
         if settings not in self._rules:
-            session = Session(revised(self._config, settings), loader=self._loader)
+            session = Session(changed_config(self._config, settings), loader=self._loader)
             self._rules[settings] = Rule(self._shot, self._scene, session.run(self._shot.frame))
         return self._rules[settings]
 

@@ -13,11 +13,11 @@ import numpy as np
 from bevviz.config import Config, ParameterChange, Preset, load
 from bevviz.errors import UserError
 from bevviz.model.frame import F64, Frame, Scene
-from bevviz.model.protocols import Frames, Observer
+from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.run import RunEnd, results, run
+from bevviz.pipeline.run import RunEnd, iterate_results, run
 from bevviz.pipeline.session import Session
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.notebook import NotebookViewer, Selected
-    from bevviz.why import Answer, Questioner
+    from bevviz.why import Answer, FrameExplainer
 
 Settings = Mapping[str, Any] | Sequence[str]
 MAX_RESULTS = 8  # number of single frames whose results are kept for further questions
 
 
-class Drive(Closing):
+class Drive(Closable):
     """Open drive: its frames, in order or one by one, and the results of the stages.
 
     Use it as a context manager, or call ``close``.
@@ -49,11 +49,11 @@ class Drive(Closing):
         UserError: the detector's model or a user-defined function cannot be used.
     """
 
-    def __init__(self, frames: Frames, config: Config, notes: Sequence[str] = ()) -> None:
+    def __init__(self, frames: FrameSource, config: Config, notes: Sequence[str] = ()) -> None:
         self.frames, self.session = frames, Session(config)
         self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
-        self._questioner: Questioner | None = None
+        self._questioner: FrameExplainer | None = None
         self._viewer: NotebookViewer | None = None
 
     def close(self) -> None:
@@ -204,7 +204,7 @@ class Drive(Closing):
         session = Session(viewer.config, loader=self.session.loader)
         return viewer.selected(session.alone(self.raw(viewer.clicked)))
 
-    def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> Questioner:
+    def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> FrameExplainer:
         """Return an object that answers questions about one scan. It computes shared results once.
 
         Args:
@@ -219,12 +219,12 @@ class Drive(Closing):
             >>> for answer in questioner.missed():
             ...     print(questioner.with_hints(answer).verdict.text)
         """
-        from bevviz.why import Questioner
+        from bevviz.why import FrameExplainer
 
         result = self.at(frame=self._number(time, frame))
         if self._questioner is None or self._questioner.traces.result is not result:
             names = self.session.stages.class_names
-            self._questioner = Questioner(result, self.session.loader, names)
+            self._questioner = FrameExplainer(result, self.session.loader, names)
         return self._questioner
 
     def configure(self, *settings: str, **more: Any) -> dict[str, ParameterChange]:
@@ -240,10 +240,10 @@ class Drive(Closing):
         Raises:
             UserError: an unknown key or a wrong value. No parameter is changed then.
         """
-        from bevviz.config import revised
+        from bevviz.config import changed_config
         from bevviz.config.trust import USER
 
-        return self.session.configure(revised(self.config, [*settings, *_settings(more)], USER))
+        return self.session.configure(changed_config(self.config, [*settings, *_settings(more)], USER))
 
     def _number(self, time: str | float | None, frame: int | None) -> int:
         if (time is None) == (frame is None):
@@ -257,7 +257,7 @@ class Drive(Closing):
 
     def __iter__(self) -> Iterator[FrameResult]:
         """Yield the result of every frame in order, with tracks and anomalies. Results are computed ahead."""
-        return results(self.frames, self.new_session())
+        return iterate_results(self.frames, self.new_session())
 
     def new_session(self) -> Session:
         """Return a session for a run over the whole drive. It has its own tracks and shares the networks."""
@@ -386,9 +386,9 @@ def open_drive(
     paths = [Path(p) for p in ([path] if isinstance(path, str | PathLike) else path)]
     settings, notes = _all_settings(model, set), tuple[str, ...]()
     if len(paths) == 1 and paths[0].suffix == ".rrd":
-        from bevviz.recording.source_lookup import follow
+        from bevviz.recording.source_lookup import find_source
 
-        recorded = follow(paths[0], [] if bag is None else [Path(bag)], settings)
+        recorded = find_source(paths[0], [] if bag is None else [Path(bag)], settings)
         paths, notes = list(recorded.paths), recorded.warnings
         loaded = recorded.load(_file(config), settings, preset)
     elif bag is not None:

@@ -14,12 +14,12 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.recording import blueprints, entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.recorder import Recorder
 from bevviz.recording.sinks import APPLICATION
 from bevviz.why.log import mark_answers
 from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection
+from bevviz.why.pick_answers import selection_of
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer, ViewerEvent
@@ -69,10 +69,10 @@ class Selected:
         if self.pick is None:
             raise UserError(f"nothing can be asked about {self.path}: click on a box, a point or a pixel")
         if same or not self.place:
-            return selection(self.pick)
+            return selection_of(self.pick)
         if len(self.place) == 2:
-            return selection(Pick("pixel", camera=self.pick.camera, place=self.place))
-        return selection(Pick("point", place=self.place))
+            return selection_of(Pick("pixel", camera=self.pick.camera, place=self.place))
+        return selection_of(Pick("point", place=self.place))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class _FrameTimes:
     def number(self, timeline: str, time: float) -> int | None:
         """Return the number of the frame that a viewer shows at this time. None: there are no frames."""
         values = np.array(self.at.get(timeline, ()), np.float64)
-        earlier = np.flatnonzero(values <= time + entities.SLACK * (timeline != entities.FRAME))
+        earlier = np.flatnonzero(values <= time + entities.TIME_TOLERANCE * (timeline != entities.FRAME))
         if not len(values):
             return None
         row = int(earlier[values[earlier].argmax()]) if len(earlier) else int(values.argmin())
@@ -136,7 +136,7 @@ class NotebookViewer(Recorder):
         super().__init__(recording, config)
         self.config = config
         self.viewer = _viewer(recording, layout)
-        self._marker = Logger(recording, config, scene)
+        self._marker = FrameLogger(recording, config, scene)
         self._frames = _FrameTimes()
         self._tracks: dict[int, Tracks] = {}
         self._timeline, self._time = entities.STAMP, 0.0

@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.notes import Notes
 from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.live_session import LiveBench
+from bevviz.workbench.live_session import LiveSession
 
 
 @contextmanager
-def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveBench]:
+def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveSession]:
     """That of a run over the frames of these results, with ``key=value`` settings."""
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
     live = Live(
-        source, Settings(None, ["detector.model=demo", *settings]), Outputs(), Notes(lambda line: None)
+        source,
+        ReloadableConfig(None, ["detector.model=demo", *settings]),
+        Outputs(),
+        Notes(lambda line: None),
     )
-    with LiveBench(live) as bench:
+    with LiveSession(live) as bench:
         yield bench
         live.encoder.close()

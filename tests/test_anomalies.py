@@ -22,7 +22,7 @@ from bevviz.model.results import (
     Fusion,
     Pairs,
 )
-from bevviz.stages.fusion import in_view
+from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 from tests.test_tracking import CAR, PERSON, scene
 
@@ -87,7 +87,7 @@ class Drive:
         cameras = () if camera is None else (CameraResult(camera, found, fusion),)
         obstacles = np.zeros((0, 3), np.float32)
         result = FrameResult(frame, CONFIG, None, None, obstacles, clusters, cameras, objects, None)
-        looked_at = in_view(cameras, len(clusters))
+        looked_at = clusters_in_view(cameras, len(clusters))
         tracks = self._tracker.update(frame, clusters, looked_at, objects, TRACKING)
         result = replace(result, tracks=tracks, **changes)
         result = replace(result, anomalies=self._detector.update(result, self.config))

@@ -15,13 +15,13 @@ from bevviz.config import SourceConfig, load
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.encode import encode_cloud, encode_image, typestore
 from bevviz.messages.robot_description import mesh_file
-from bevviz.messages.roles import find_roles, kind_of
+from bevviz.messages.roles import find_roles, surroundings_kind
 from bevviz.messages.surroundings import decode_shapes, decode_statuses
 from bevviz.messages.topics import Topic
-from bevviz.model.frame import Frame, Image, Scene, Shape, Status
+from bevviz.model.frame import ComponentStatus, Frame, Image, PlacedShape, Scene
 from bevviz.model.results import FrameResult
-from bevviz.recording.frame_logger import Logger
-from bevviz.sync.surroundings import MANY, SAMPLES, Surroundings
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.sync.surroundings import MANY, SAMPLES, SurroundingsBuffer
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.recordings import Recording
@@ -138,21 +138,21 @@ def test_statuses_and_what_a_topic_tells() -> None:
         "diagnostic_msgs/msg/DiagnosticStatus", level=9, name="fan", message="odd", hardware_id="", values=[]
     )
     array = make("diagnostic_msgs/msg/DiagnosticArray", header=header(), status=[status])
-    assert decode_statuses(array) == [Status("fan", "error", "odd")]
+    assert decode_statuses(array) == [ComponentStatus("fan", "error", "odd")]
     kinds = {
         ("/robot1/bevviz/mark", "String"): "mark",
         ("/chatter", "String"): None,
         ("/scan", "LaserScan"): "shape",
     }
-    assert {topic: kind_of(*topic) for topic in kinds} == kinds
+    assert {topic: surroundings_kind(*topic) for topic in kinds} == kinds
 
 
 def test_what_is_kept_is_bounded_and_marks_are_for_one_frame() -> None:
-    around = Surroundings()
+    around = SurroundingsBuffer()
     assert around.take(lambda name: np.eye(4)) is None
     around.add_mark("here")
-    around.add_statuses([Status(str(k), "ok", "") for k in range(3 * MANY)])
-    around.add_shapes("/m", [Shape("/m", "map", k) for k in range(3 * MANY)])
+    around.add_statuses([ComponentStatus(str(k), "ok", "") for k in range(3 * MANY)])
+    around.add_shapes("/m", [PlacedShape("/m", "map", k) for k in range(3 * MANY)])
     taken = around.take(lambda name: None)
     assert taken is not None and taken.marks == ("here",)
     assert len(taken.statuses) == len(taken.shapes) == MANY and taken.shapes[0].world_from_shape is None
@@ -169,13 +169,13 @@ def frame() -> Frame:
 
 
 def test_shapes_are_logged_once_and_cleared_when_they_are_gone(frame: Frame, tmp_path: Path) -> None:
-    config, around = load(), Surroundings()
+    config, around = load(), SurroundingsBuffer()
     around.add_shapes("/map", decode_shapes(grid([0, 100, -1, 50, 0, 0], 3, 2), "OccupancyGrid", "/map"))
     around.add_shapes("/m", decode_shapes(marker(1), "Marker", "/m"))
     path = tmp_path / "around.rrd"
     with rr.RecordingStream("test") as recording:
         recording.save(path)
-        logger = Logger(recording, config, Scene("test", frame.lidar))
+        logger = FrameLogger(recording, config, Scene("test", frame.lidar))
         logger.log_static()
         for index in range(3):
             if index == 2:
@@ -218,7 +218,10 @@ def test_the_links_of_a_robots_description() -> None:
     np.testing.assert_allclose(base.solids.quaternion, [[0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-6)
     np.testing.assert_allclose(wheel.solids.half, [[0.3, 0.3, 0.1]], rtol=1e-6)
     assert mast.solids.round and mast.topic == "/robot_description/mast"
-    assert kind_of("/robot1/robot_description", "String") == "shape" and kind_of("/chatter", "String") is None
+    assert (
+        surroundings_kind("/robot1/robot_description", "String") == "shape"
+        and surroundings_kind("/chatter", "String") is None
+    )
     for wrong in ("<robot", URDF.replace("4 2 1", "4 2")):
         with pytest.raises(MessageError, match="/robot_description: "):
             decode_shapes(make("std_msgs/msg/String", data=wrong), "String", "/robot_description")
@@ -245,7 +248,7 @@ def test_the_robots_own_picture_and_obstacles_are_shown_where_nothing_of_ours_is
     )
     cloud = encode_cloud(replace(frame.clouds[0], frame_id="map"))
     image = encode_image(Image(7, "rslidar", np.full((4, 6, 3), 9, np.uint8)))
-    around = Surroundings()
+    around = SurroundingsBuffer()
     around.add_shapes("/obstacles", decode_shapes(cloud, "PointCloud2", "/lidar/points_no_ground"))
     around.add_shapes("/bev", decode_shapes(image, "Image", "/visualization/bev_image"))
     frame = replace(frame, around=around.take(lambda name: np.eye(4) if name == "map" else None))
@@ -253,7 +256,7 @@ def test_the_robots_own_picture_and_obstacles_are_shown_where_nothing_of_ours_is
     scene = Scene("s", "rslidar", ("rslidar",), ("zed",))
     with rr.RecordingStream("test") as recording:
         recording.save(path)
-        Logger(recording, load(), scene).log(FrameResult.unprocessed(frame, load()))
+        FrameLogger(recording, load(), scene).log(FrameResult.unprocessed(frame, load()))
         recording.flush()
     shown = Recording(path).at
     points = shown["/robot/lidar/points_no_ground"]["Points3D:positions"][0]
@@ -368,11 +371,11 @@ def test_meshes_that_are_here_are_shown(
     def place(name: str, gone: str) -> Any:
         return None if name == gone else np.eye(4)
 
-    around, path = Surroundings(), tmp_path / "meshes.rrd"
+    around, path = SurroundingsBuffer(), tmp_path / "meshes.rrd"
     around.add_shapes("/robot_description", shapes)
     with rr.RecordingStream("test") as recording:
         recording.save(path)
-        logger = Logger(recording, load(), Scene("test", frame.lidar))
+        logger = FrameLogger(recording, load(), Scene("test", frame.lidar))
         logger.log_static()
         for index in range(3):
             known = around.take(partial(place, gone="mast" if index else ""))
@@ -388,11 +391,11 @@ def test_meshes_that_are_here_are_shown(
 
 
 def test_samples_of_an_imu_go_with_the_frame_that_comes_next(frame: Frame, tmp_path: Path) -> None:
-    around, path = Surroundings(), tmp_path / "imu.rrd"
+    around, path = SurroundingsBuffer(), tmp_path / "imu.rrd"
     none = (np.nan, np.nan, np.nan)
     with rr.RecordingStream("test") as recording:
         recording.save(path)
-        logger = Logger(recording, load(), Scene("test", frame.lidar))
+        logger = FrameLogger(recording, load(), Scene("test", frame.lidar))
         logger.log_static()
         for index in range(2):
             for k in range(3):

@@ -28,7 +28,7 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.fleet.batch import claimed, left_to_do, whole_results
+from bevviz.fleet.batch import intact_results, lock_folder, unfinished_jobs
 from bevviz.fleet.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
 from bevviz.fleet.table import SEVERITIES, row, severity
 from bevviz.fleet.work import run
@@ -129,7 +129,7 @@ def test_a_worker_that_dies_and_a_bad_bag_cost_nothing_else(batch: Batch) -> Non
 
 def test_only_what_is_missing_or_out_of_date_is_left_to_do(batch: Batch, model: str) -> None:
     def left(**settings: Any) -> set[str]:
-        return {job.name for job in left_to_do(jobs_of(batch, model, **settings), force=False)}
+        return {job.name for job in unfinished_jobs(jobs_of(batch, model, **settings), force=False)}
 
     assert left() == {"bad"}
     assert left(**{"live.nice": 5}) == {"bad"}
@@ -151,8 +151,8 @@ def test_without_its_recording_a_table_counts_for_nothing(batch: Batch, model: s
     ]
     (tmp_path / "runs/kitti.rrd").unlink()
     (tmp_path / "runs/one-drive.parquet").write_bytes(b"cut off")
-    assert {job.name for job in left_to_do(jobs, force=False)} == {"bad", "kitti", "one-drive"}
-    assert {job.name for job in left_to_do(jobs, force=True)} == {"bad", *GOOD}
+    assert {job.name for job in unfinished_jobs(jobs, force=False)} == {"bad", "kitti", "one-drive"}
+    assert {job.name for job in unfinished_jobs(jobs, force=True)} == {"bad", *GOOD}
 
 
 def test_an_interrupted_batch_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -445,7 +445,7 @@ def test_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no such file" in error_of(bag, "-o", runs, "--model", "none.onnx")
     assert "nobody answers" in error_of(bag, "-o", runs, "--dask", "tcp://127.0.0.1:1")
     assert "Not a directory" in error_of(bag, "-o", bag / "metadata.yaml" / "runs")
-    with claimed(runs), pytest.raises(UserError, match="another batch is running"), claimed(runs):
+    with lock_folder(runs), pytest.raises(UserError, match="another batch is running"), lock_folder(runs):
         pass
 
 
@@ -492,13 +492,13 @@ DAMAGES = [
 @pytest.mark.parametrize(("damage", "line"), DAMAGES)
 def test_a_damaged_result_is_named_and_made_again(done: Job, damage: Any, line: str) -> None:
     warnings: list[str] = []
-    assert left_to_do([done], False, warnings.append) == [] == warnings
+    assert unfinished_jobs([done], False, warnings.append) == [] == warnings
     damage(done)
-    assert whole_results(done.folder, warnings.append) == []
-    assert left_to_do([done], False, warnings.append) == [done]
+    assert intact_results(done.folder, warnings.append) == []
+    assert unfinished_jobs([done], False, warnings.append) == [done]
     assert len(warnings) == 2 and all(text.startswith(f"drive: {line}") for text in warnings)
     assert not run(done, 1).error
-    assert left_to_do([done], False, warnings.append) == [] and len(warnings) == 2
+    assert unfinished_jobs([done], False, warnings.append) == [] and len(warnings) == 2
 
 
 def test_a_table_without_the_checksum_of_its_recording_is_made_again(done: Job) -> None:
@@ -507,8 +507,8 @@ def test_a_table_without_the_checksum_of_its_recording_is_made_again(done: Job) 
     del about["recording_size"], about["recording_sha256"]
     pq.write_table(table.replace_schema_metadata({"bevviz": json.dumps(about)}), done.table)
     warnings: list[str] = []
-    assert [path for path, _ in whole_results(done.folder, warnings.append)] == [done.table]
-    assert left_to_do([done], False, warnings.append) == [done]
+    assert [path for path, _ in intact_results(done.folder, warnings.append)] == [done.table]
+    assert unfinished_jobs([done], False, warnings.append) == [done]
     assert ["1 tables of an older version hold no checksum" in text for text in warnings] == [True, True]
 
 

@@ -12,10 +12,10 @@ import pytest
 
 from benchmarks.calib import Drive, stated_wrongly
 from bevviz.bags.source import BagSource
-from bevviz.calib import AXES, Calibration, Finding, Shots, calibrate, gather
+from bevviz.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
 from bevviz.calib.edges import cloud_edges
 from bevviz.calib.offsets import SCALES, TIME, error_pose
-from bevviz.calib.result import configuration
+from bevviz.calib.result import correction_yaml
 from bevviz.calib.score import Scorer
 from bevviz.cli import main
 from bevviz.config import Config, load
@@ -71,7 +71,7 @@ def test_what_was_planted_is_found(drive: Drive, planted: dict[str, float]) -> N
         near = {"deg": 0.2, "cm": 2.0, "ms": 10.0}[axis.axis.unit]
         assert axis.offset == pytest.approx(planted.get(axis.axis.name, 0.0), abs=near)
         assert abs(axis.offset - planted.get(axis.axis.name, 0.0)) < axis.interval
-    assert {axis.axis.name for axis in result.by(Finding.OFF)} == set(planted)
+    assert {axis.axis.name for axis in result.by(AxisFinding.OFF)} == set(planted)
     assert result.score_corrected >= result.score_stated
 
 
@@ -81,7 +81,7 @@ def test_a_fence_is_not_taken_for_its_neighbour(turn: float) -> None:
     wrong = stated_wrongly([fence(seed) for seed in range(4)], offsets(ry=turn))
     result = calibrate(gather(wrong, ["camera"], lambda frame, stamp: None)["camera"])
     assert covers(result, ry=turn)
-    assert [axis.axis.name for axis in result.by(Finding.OFF)] == ["ry"]
+    assert [axis.axis.name for axis in result.by(AxisFinding.OFF)] == ["ry"]
     assert found(result)["ry"] == pytest.approx(turn, abs=0.1)
 
 
@@ -200,14 +200,14 @@ def of_kitti(frames: Sequence[Frame], **planted: float) -> Calibration:
 
 def covers(result: Calibration, **planted: float) -> bool:
     """Whether every interval that a finding relies on holds the truth."""
-    relied = result.by(Finding.OFF) + result.by(Finding.FINE)
+    relied = result.by(AxisFinding.OFF) + result.by(AxisFinding.FINE)
     return all(abs(axis.offset - planted.get(axis.axis.name, 0.0)) < axis.interval for axis in relied)
 
 
 def test_kitti_is_near_zero(kitti: list[Frame]) -> None:
     """Six frames, no motion: the turns are sure, and what is not sure is said to be so."""
     result = of_kitti(kitti)
-    assert not result.by(Finding.OFF)
+    assert not result.by(AxisFinding.OFF)
     assert covers(result)
     assert max(abs(found(result)[name]) for name in ("rx", "ry", "rz")) < 0.2
     assert max(abs(found(result)[name]) for name in ("tx", "ty")) < 3.0
@@ -227,14 +227,14 @@ def test_kitti_is_near_zero(kitti: list[Frame]) -> None:
 def test_what_was_planted_in_kitti_is_found(kitti: list[Frame], planted: dict[str, float]) -> None:
     result = of_kitti(kitti, **planted)
     assert covers(result, **planted)
-    assert {axis.axis.name for axis in result.by(Finding.OFF)} == set(planted) - {"tz"}
+    assert {axis.axis.name for axis in result.by(AxisFinding.OFF)} == set(planted) - {"tz"}
     if "tz" in planted:  # what lies ahead hardly moves with it
         assert abs(found(result)["tz"] - planted["tz"]) < result.axes[5].interval
 
 
 def test_three_views_eight_times_are_three_views(kitti: list[Frame]) -> None:
     once, often = (calibrate(shots_of(kitti[:3] * times)) for times in (1, 8))
-    assert once.by(Finding.FINE)
+    assert once.by(AxisFinding.FINE)
     assert covers(often)
     for axis, again in zip(once.axes[:TIME], often.axes[:TIME], strict=True):
         assert again.interval > 0.6 * axis.interval
@@ -335,7 +335,7 @@ def test_clouds_without_edges_tell_nothing(drive: Drive) -> None:
 def test_a_robot_at_rest_tells_no_time(drive: Drive) -> None:
     still = gather(drive.frames[:3], ["zed"], lambda frame, stamp: drive.pose(frame, frame.stamp))["zed"]
     time = calibrate(still).axes[TIME]
-    assert time.finding is Finding.UNKNOWN
+    assert time.finding is AxisFinding.UNKNOWN
     assert "hardly moved" in time.reason
 
 
@@ -430,5 +430,5 @@ def test_a_late_clock_is_put_right_by_what_is_written() -> None:
     shots = gather(frames, ["zed"], lambda frame, stamp: None)["zed"]
     result = calibrate(shots, stamps={"/zed2/zed/rgb/image_rect_color": 0.1})
     late = replace(result, correction=np.array([0.0] * 6 + [0.03]))
-    assert "sync:\n  offsets:\n    /zed2/zed/rgb/image_rect_color: 0.0700\n" in configuration([late])
-    assert late.moved and "sync" not in configuration([replace(late, offset=0.0, correction=offsets())])
+    assert "sync:\n  offsets:\n    /zed2/zed/rgb/image_rect_color: 0.0700\n" in correction_yaml([late])
+    assert late.moved and "sync" not in correction_yaml([replace(late, offset=0.0, correction=offsets())])

@@ -19,9 +19,9 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.cli import main
-from bevviz.cli.options import with_negatives
+from bevviz.cli.options import join_negative_numbers
 from bevviz.model.results import FrameResult
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.support.files import unfinished_files
 from tests import bags
 from tests.recordings import Recording
@@ -102,15 +102,15 @@ def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
 
 def test_several_numbers_may_begin_below_zero() -> None:
     """argparse takes lone negative numbers for values, but not -5,1,0."""
-    assert with_negatives(["why", "--point", "-5,1,0", "--at", "-3"]) == [
+    assert join_negative_numbers(["why", "--point", "-5,1,0", "--at", "-3"]) == [
         "why",
         "--point=-5,1,0",
         "--at",
         "-3",
     ]
-    assert with_negatives(["--point", "-.5,-1e-3,0"]) == ["--point=-.5,-1e-3,0"]
+    assert join_negative_numbers(["--point", "-.5,-1e-3,0"]) == ["--point=-.5,-1e-3,0"]
     kept = ["--point=1,2", "-5,1", "-v", "--set", "-x=1,2", "bag", "-1,2"]
-    assert with_negatives(kept) == kept
+    assert join_negative_numbers(kept) == kept
 
 
 def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:
@@ -364,15 +364,15 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
 def test_an_interrupt_that_gets_lost_in_a_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    log = Logger.log
+    log = FrameLogger.log
 
-    def deaf(self: Logger, result: FrameResult) -> None:
+    def deaf(self: FrameLogger, result: FrameResult) -> None:
         if result.frame.index == 3:
             with suppress(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGTERM)
         log(self, result)
 
-    monkeypatch.setattr(Logger, "log", deaf)
+    monkeypatch.setattr(FrameLogger, "log", deaf)
     small_bag(scans=40)
     assert main(["bag", "drive", "--save", "out.rrd"]) == 130
     assert "interrupted after 4 frames" in capsys.readouterr().err
@@ -413,11 +413,11 @@ def test_a_stage_that_fails_is_one_line_and_its_traceback_is_for_who_asks(
 def test_an_error_of_bevviz_itself_is_one_line_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(self: Logger, result: object) -> None:
+    def broken(self: FrameLogger, result: object) -> None:
         raise RuntimeError("planted")
 
     bags.write(tmp_path / "drive", bags.small_items(scans=2))
-    monkeypatch.setattr(Logger, "log", broken)
+    monkeypatch.setattr(FrameLogger, "log", broken)
     assert main(["bag", str(tmp_path / "drive"), "--save", "x.rrd"]) == 3
     said = capsys.readouterr().err.splitlines()
     assert said[-1] == (

@@ -9,11 +9,11 @@ import pytest
 
 from bevviz.model.colors import (
     CLASS_COLORS,
-    FATES,
-    SIDES,
-    TRUTH,
+    FATE_COLORS,
+    SIDE_COLORS,
+    TRUTH_COLORS,
     Color,
-    State,
+    StateColor,
     class_color,
 )
 from bevviz.model.frame import F64
@@ -55,10 +55,10 @@ def lab(rgb: F64) -> F64:
     "names",
     [
         {n: CLASS_COLORS[n] for n in ("person", "bicycle", "motorcycle", "car", "van", "truck", "bus")},
-        {state.name: state.value for state in State},
-        SIDES,
-        TRUTH,
-        FATES,
+        {state.name: state.value for state in StateColor},
+        SIDE_COLORS,
+        TRUTH_COLORS,
+        FATE_COLORS,
     ],
     ids=["classes", "states", "sides", "truth", "fates"],
 )
@@ -73,7 +73,7 @@ def test_states_are_seen_on_either_theme(back: Color) -> None:
     def luminance(color: Color) -> float:
         return float(XYZ[1] @ linear(color))
 
-    for state in State:
+    for state in StateColor:
         one, other = sorted((luminance(state.value), luminance(back)))
         assert (other + 0.05) / (one + 0.05) > 1.3, state
 

@@ -13,8 +13,8 @@ from urllib.request import urlopen
 import pytest
 
 from bevviz.cli import main
-from bevviz.cli.machine import with_json
-from bevviz.cli.outputs import program, speak
+from bevviz.cli.machine import join_json_option
+from bevviz.cli.outputs import program, set_up_notes
 from tests import bags, forms
 from tests.waiting import PATIENCE
 
@@ -93,7 +93,7 @@ def test_quiet_leaves_results_and_warnings(tmp_path: Path, capsys: Capture) -> N
         assert main(run) == 0
         assert {*quiet, "bevviz: 4 frames in out.rrd"} <= {*capsys.readouterr().err.splitlines()}
     finally:
-        speak(quiet=False)
+        set_up_notes(quiet=False)
 
 
 def test_colour_is_asked_for_and_refused(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,9 +172,14 @@ def test_json_on_stdout_or_in_a_file(tmp_path: Path, capsys: Capture) -> None:
 
 
 def test_json_never_takes_the_bag_for_its_file() -> None:
-    assert with_json(["why", "--json", "drive.mcap"]) == ["why", "--json=-", "drive.mcap"]
-    assert with_json(["why", "drive.mcap", "--json", "a.json"]) == ["why", "drive.mcap", "--json", "a.json"]
-    assert with_json(["why", "--json"]) == ["why", "--json"]
+    assert join_json_option(["why", "--json", "drive.mcap"]) == ["why", "--json=-", "drive.mcap"]
+    assert join_json_option(["why", "drive.mcap", "--json", "a.json"]) == [
+        "why",
+        "drive.mcap",
+        "--json",
+        "a.json",
+    ]
+    assert join_json_option(["why", "--json"]) == ["why", "--json"]
 
 
 def completed(line: str) -> list[str]:

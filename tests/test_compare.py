@@ -18,23 +18,23 @@ from bevviz.cli import main
 from bevviz.compare.differences import (
     Change,
     ImageBoxes,
-    Seen,
+    SideResult,
     compare_images,
     compare_objects,
     differences,
     seen,
 )
-from bevviz.compare.sides import published, robot_topic
+from bevviz.compare.sides import published_result, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import transform
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_log import Memo
-from bevviz.pipeline.variants import Variants, check_same_frames, without_motion
+from bevviz.pipeline.variants import Variants, check_same_frames, without_motion_compensation
 from bevviz.recording import entities
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource, write_bag
@@ -58,15 +58,15 @@ def result() -> FrameResult:
     return session.run(frame())
 
 
-def objects(*rows: tuple[str, float, float]) -> Seen:
+def objects(*rows: tuple[str, float, float]) -> SideResult:
     """Objects of 2 x 1 m: class, x, y."""
     centre = np.array([(x, y, 0) for _, x, y in rows], np.float32).reshape(-1, 3)
     size = np.tile(np.array([2, 1, 1.5], np.float32), (len(rows), 1))
     boxes = Boxes3D(centre, size, np.zeros(len(rows), np.float32))
-    return Seen(boxes, tuple(name for name, _, _ in rows), np.ones(len(rows), np.float32))
+    return SideResult(boxes, tuple(name for name, _, _ in rows), np.ones(len(rows), np.float32))
 
 
-def changed(a: Seen, b: Seen) -> list[tuple[Change, int, int]]:
+def changed(a: SideResult, b: SideResult) -> list[tuple[Change, int, int]]:
     return [(d.change, d.row_a, d.row_b) for d in compare_objects(a, b)]
 
 
@@ -107,7 +107,7 @@ def test_planted_differences(a: Any, b: Any, expected: list[tuple[Change, int, i
 def test_each_object_once_and_the_sides_are_alike(seed: int, count_a: int, count_b: int) -> None:
     rng = np.random.default_rng(seed)
 
-    def random(count: int) -> Seen:
+    def random(count: int) -> SideResult:
         names = rng.choice(["car", "person"], count)
         return objects(*zip(names, rng.uniform(-5, 5, count), rng.uniform(-5, 5, count), strict=True))
 
@@ -165,9 +165,9 @@ def test_variants_make_what_a_pipeline_alone_makes() -> None:
     low = load(settings=["detector.model=demo", "detector.conf_threshold=0.1"])
     variants = Variants()
     for config in (REFERENCE, DEFAULT, low, REFERENCE):
-        seen_by = without_motion(frame()) if config is REFERENCE else frame()
+        seen_by = without_motion_compensation(frame()) if config is REFERENCE else frame()
         session = Session(config)
-        same_results(describe(variants.perceive(frame(), config)), session.run(seen_by))
+        same_results(add_explanations(variants.perceive(frame(), config)), session.run(seen_by))
 
 
 def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,7 +210,7 @@ def test_memo_forgets_the_oldest() -> None:
 
 
 def test_cameras_without_motion_are_where_they_are_mounted() -> None:
-    moving, still = frame().cameras[0], without_motion(frame()).cameras[0]
+    moving, still = frame().cameras[0], without_motion_compensation(frame()).cameras[0]
     assert moving.camera_from_points is not None
     assert still.camera_from_points is not None
     away = np.linalg.norm((moving.camera_from_points - still.camera_from_points)[:3, 3])
@@ -234,19 +234,19 @@ def test_the_robots_boxes_are_compared_in_our_frame() -> None:
     stated = LabelledBoxes3D(
         "/detection/fused_3d", 0, "map", ours.boxes, ours.names, ours.score, frame().world_from_points
     )
-    robot = published(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d", DEFAULT)
+    robot = published_result(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
     assert {d.change for d in compare_objects(seen(result()), seen(robot))} == {Change.SAME}
     world = np.asarray(frame().world_from_points)
     shifted = replace(
         stated, world_from_boxes=world @ transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]))
     )
-    robot = published(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d", DEFAULT)
+    robot = published_result(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
     moved = [d for d in compare_objects(seen(result()), seen(robot)) if d.change is Change.MOVED]
     assert len(moved) > len(ours) / 2
     np.testing.assert_allclose(np.median([d.distance for d in moved]), 1.0, atol=1e-3)
-    assert published(frame(), "/detection/fused_3d", DEFAULT) is None
+    assert published_result(frame(), "/detection/fused_3d", DEFAULT) is None
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def test_reference_preset_is_the_tutorial() -> None:
 def test_what_is_printed_is_read_back(tmp_path: Path, preset: config.Preset) -> None:
     made = config.load(settings=["source.extrinsics={'base cam': [1, 2, 3, 0, 0, 0, 1]}"], preset=preset)
     file = tmp_path / "c.yaml"
-    file.write_text(config.dump(made))
+    file.write_text(config.config_yaml(made))
     assert config.load(file) == made
 
 

@@ -19,12 +19,12 @@ from benchmarks.torture.judges import judges, taken
 from benchmarks.torture.samples import FORMATS, items
 from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
-from bevviz.bags.reader import LEAST, Bytes, DamageError, unpack
+from bevviz.bags.reader import LEAST, DamageError, FileBytes, unpack
 from bevviz.bags.rescue.sqlite_pages import checksum_of
 from bevviz.bags.source import BagSource
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.pipeline.bag_info import describe, render
+from bevviz.pipeline.bag_info import describe_bag, render_bag_info
 
 Found = list[tuple[str, int, bytes]]
 
@@ -99,7 +99,7 @@ def test_a_bug_is_not_taken_for_damage(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(TypeError, match="a slip of ours"):
         read(path)
     monkeypatch.undo()
-    monkeypatch.setattr(chunks.SoundChunks, "sums", broken)
+    monkeypatch.setattr(chunks.ChunkReader, "sums", broken)
     with pytest.raises(TypeError, match="a slip of ours"):
         read(path)
 
@@ -312,7 +312,7 @@ def test_no_number_in_a_file_leads_to_a_traceback(tmp_path: Path, name: str, num
         change(path, at, struct.pack("<Q", number))
         try:
             read(path)
-            render(describe([path], Config()))
+            render_bag_info(describe_bag([path], Config()))
         except UserError as error:
             assert "\n" not in str(error)
 
@@ -533,7 +533,7 @@ def test_only_chunks_with_the_first_message_of_a_topic_are_compared(
     path = FORMATS["mcap, zstd, no checksums"](tmp_path)
     chunks_read = Counter[int]()
 
-    def counted(file: Bytes, chunk: chunks.Chunk) -> tuple[bytes, str, bool]:
+    def counted(file: FileBytes, chunk: chunks.Chunk) -> tuple[bytes, str, bool]:
         chunks_read[chunk.data] += 1
         return unpack_chunk(file, chunk)
 

@@ -93,12 +93,12 @@ def test_the_page_of_projects_explains_as_the_command_does(
 
 def test_the_project_file_that_is_shown_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from bevviz.config import load
-    from bevviz.config.project import layers
+    from bevviz.config.project import read_project_layers
 
     monkeypatch.chdir(tmp_path)
     Path("bevviz.toml").write_text(project_on("docs/project.md"))
     Path("robot.yaml").write_text("bev: {range_x: 20}\n")
-    config = load(layers=layers(tmp_path, {}))
+    config = load(layers=read_project_layers(tmp_path, {}))
     assert (config.detector.model, config.clustering.eps) == ("models/yolo11n.onnx", 0.6)
     assert config.bev.range_x == 20
 

@@ -17,10 +17,10 @@ import pytest
 import bevviz
 from bevviz.cli import main
 from bevviz.evaluate import Truth, judge, truth_in, truth_of
-from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, Found
+from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, ScoredObjects
 from bevviz.evaluate.evaluation import Evaluation
-from bevviz.evaluate.matching import Score
-from bevviz.evaluate.tracking_score import Identities
+from bevviz.evaluate.matching import ObjectScore
+from bevviz.evaluate.tracking_score import ClassTracks
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import Boxes3D, ImageLabels
@@ -79,7 +79,7 @@ def average_precision(kitti_case: dict[str, Any]) -> dict[tuple[str, float, str,
             np.prod(np.clip(high - low, 0, None), axis=2)
             / np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1)[:, None]
         )
-        found = Found(
+        found = ScoredObjects(
             tuple(str(name).lower() for name in case["found_name"][mine]),
             case["found_score"][mine],
             xyxy[:, 3] - xyxy[:, 1],
@@ -112,7 +112,7 @@ def test_hota_mota_and_idf1_are_those_of_trackeval() -> None:
     pytest.importorskip("motmetrics", reason="needs the extra 'evaluate'")
     with np.load(REFERENCES / "trackeval.npz") as file:
         case = {name: file[name] for name in file.files}
-    identities = Identities()
+    identities = ClassTracks()
     for index in range(80):
         rows, mine = (case[what][case[what][:, 0] == index] for what in ("truth", "tracks"))
         distance = np.linalg.norm(rows[:, None, 2:] - mine[None, :, 2:], axis=2)
@@ -343,7 +343,7 @@ def named(*rows: tuple[str, float, float]) -> Objects:
 
 def test_what_is_false_counts_for_the_class_that_it_may_be() -> None:
     """Also in frames before the first label of that class."""
-    score = Score()
+    score = ObjectScore()
     score.add(named(("person", 5, 5), ("bench", 7, 7)), labelled(("Cyclist", 30, 0)))
     score.add(
         named(("person", 10, 0), ("person", 20, 0), ("person", 15, 9), ("bicycle", 25, 9)),
@@ -374,7 +374,7 @@ def test_average_precision_falls_by_what_is_false_in_any_frame() -> None:
         for objects, truth in frames:
             above, _ = geometry.box_iou(objects.boxes, truth.boxes)
             height = np.full(len(objects), np.inf, np.float32)
-            precision.add(Found(objects.names, objects.score, height, {"bev": above}, {}), truth)
+            precision.add(ScoredObjects(objects.names, objects.score, height, {"bev": above}, {}), truth)
         return {name: value for (_, overlap, name, _), value in precision.results().items() if overlap == 0.5}
 
     assert averages() == {"pedestrian": 1.0, "cyclist": 1.0}

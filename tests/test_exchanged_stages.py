@@ -20,9 +20,9 @@ from hypothesis.extra import numpy as hnp
 
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
-from bevviz.config import Config, changes, dump, keys, load, plugins
+from bevviz.config import Config, changes, config_yaml, keys, load, plugins
 from bevviz.config.project import named_code
-from bevviz.config.trust import allow
+from bevviz.config.trust import grant_trust
 from bevviz.errors import StageError, UserError
 from bevviz.messages.encode import (
     encode_boxes_2d,
@@ -124,7 +124,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (package / "stages.py").write_text(textwrap.dedent(MODULE))
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    plugins.find.cache_clear()
+    plugins.load_plugin.cache_clear()
     import sys
 
     for name in [name for name in sys.modules if name.split(".")[0] in ("mine", "broken")]:
@@ -167,7 +167,7 @@ def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
     """On the drive's own ground, known exactly, they are close to what our own stage tells."""
     ours = Session(load()).run(frame)
     assert ours.voxels is not None and ours.ground is not None
-    derived = user_stages.heights(ours.voxels.points, ours.ground.mask)
+    derived = user_stages.heights_above_ground(ours.voxels.points, ours.ground.mask)
     near = np.hypot(*ours.voxels.points[:, :2].T) < 30
     away = np.abs(derived - ours.ground.height)[near]
     assert np.median(away) < 0.05
@@ -178,11 +178,11 @@ def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
     hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=st.floats(-300, 300, width=32))
 )
 def test_heights_of_any_points(points: Any) -> None:
-    everywhere = user_stages.heights(points, np.ones(len(points), bool))
+    everywhere = user_stages.heights_above_ground(points, np.ones(len(points), bool))
     assert np.isfinite(everywhere).all()
-    lowest = user_stages.heights(points, points[:, 2] == points[:, 2].min())
+    lowest = user_stages.heights_above_ground(points, points[:, 2] == points[:, 2].min())
     assert (lowest >= -1e-3).all()
-    assert np.isnan(user_stages.heights(points, np.zeros(len(points), bool))).all()
+    assert np.isnan(user_stages.heights_above_ground(points, np.zeros(len(points), bool))).all()
 
 
 def test_nobody_changes_the_points_of_a_frame(here: Path, frame: Frame) -> None:
@@ -222,7 +222,7 @@ def test_somebodys_objects_have_the_clusters_in_their_boxes(here: Path, frame: F
         assert clusters.state[objects.cluster[0]] == ClusterState.KEPT
     car = clusters.centroid[int(np.flatnonzero(clusters.state == ClusterState.KEPT)[0])]
     box = Boxes3D(car[None], np.array([[5, 5, 5]], np.float32), np.zeros(1, np.float32))
-    placed = user_stages.placed(box, ("car",), np.ones(1, np.float32), result.obstacles, clusters)
+    placed = user_stages.make_objects(box, ("car",), np.ones(1, np.float32), result.obstacles, clusters)
     inside = clusters.labels[(np.abs(result.obstacles - car) <= 2.5).all(axis=1)]
     kept = inside[(inside >= 0) & (clusters.state[inside] == ClusterState.KEPT)]
     assert placed.cluster[0] == np.bincount(kept).argmax()
@@ -243,7 +243,7 @@ def test_a_registered_name(here: Path, frame: Frame, monkeypatch: pytest.MonkeyP
         assert config.clustering.params["cell"] == 2.0
         result = Session(config).run(frame)
         assert result.clusters is not None and len(result.clusters) > 3
-        assert plugins.find("mine.stages:cells").version == "mine 1.0"
+        assert plugins.load_plugin("mine.stages:cells").version == "mine 1.0"
         with pytest.raises(UserError, match=r"polar, plane, grid \(registered\), module:function"):
             configured("ground.method=gird")
     finally:
@@ -257,11 +257,11 @@ def test_parameters_become_part_of_the_section(here: Path, monkeypatch: pytest.M
     method = "clustering.method=mine.stages:cells"
     config = configured(method, "clustering.params.cell=2", "clustering.height=0.5")
     assert config.clustering.params == {"height": 0.5, "cell": 2.0, "score": 0.8}
-    text = dump(config)
+    text = config_yaml(config)
     assert "  params:\n    height: 0.5  # metres above the lowest point\n" in text
     Path("c.yaml").write_text(text)
     monkeypatch.setenv("XDG_DATA_HOME", str(here / "data"))
-    allow(named_code(Path("c.yaml")))
+    grant_trust(named_code(Path("c.yaml")))
     assert load("c.yaml") == config
     assert "clustering.params.cell" in keys(config)
     assert {k: str(c) for k, c in changes(configured(method), config).items()} == {

@@ -15,8 +15,8 @@ import bevviz
 from bevviz.cli import main
 from bevviz.datasets.kitti import read_labels
 from bevviz.errors import UserError
-from bevviz.export.folder import rectified
-from bevviz.export.kitti import KittiExport, labels
+from bevviz.export.folder import rectify
+from bevviz.export.kitti import KittiExport, label_lines
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, Intrinsics
@@ -92,7 +92,9 @@ def test_a_label_has_kittis_columns_in_its_terms() -> None:
     numbers = np.zeros(3, np.int32)
     objects = Objects(boxes, ("car", "unicorn", "car"), np.ones(3, np.float32), numbers, ("",) * 3, numbers)
     intrinsics = Intrinsics(1000, 500, np.array([[500.0, 0, 500], [0, 500, 250], [0, 0, 1]]))
-    ahead, across = (line.split() for line in labels(objects, intrinsics, OPTICAL))  # none behind the camera
+    ahead, across = (
+        line.split() for line in label_lines(objects, intrinsics, OPTICAL)
+    )  # none behind the camera
     assert (ahead[0], across[0]) == ("Car", "Misc")
     assert len(ahead) == 16
     assert float(ahead[14]) == pytest.approx(-np.pi / 2, abs=1e-3)
@@ -109,7 +111,7 @@ def test_images_are_rectified() -> None:
     (bent,), _ = geometry.project(point, intrinsics)
     cv2.circle(bgr, tuple(np.rint(bent).astype(int).tolist()), 2, (255, 255, 255), -1)
     (flat,), _ = geometry.project(point, Intrinsics(64, 48, K))
-    rows, columns, _ = np.nonzero(rectified(bgr, intrinsics) > 128)
+    rows, columns, _ = np.nonzero(rectify(bgr, intrinsics) > 128)
     np.testing.assert_allclose([columns.mean(), rows.mean()], flat, atol=1)
 
 
@@ -144,7 +146,7 @@ def test_a_scene_of_nuscenes_has_the_same_frames(exported: tuple[Path, bevviz.Dr
             assert len(truth.labels) == len(objects) > 0
             names = {"person": "pedestrian", "cyclist": "bicycle", "car": "car"}
             assert list(truth.labels) == [names[name] for name in objects.names]
-            boxes = geometry.moved(objects.boxes, result.frame.pose)
+            boxes = geometry.transform_boxes(objects.boxes, result.frame.pose)
             np.testing.assert_allclose(truth.boxes.center, boxes.center, atol=1e-4)
             np.testing.assert_allclose(truth.boxes.size, boxes.size, atol=1e-5)
             assert np.abs(np.sin(truth.boxes.yaw - boxes.yaw)).max() < 1e-3  # the road is not level

@@ -24,8 +24,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.support.files import Scratch, claim, save, unfinished_files, written
-from bevviz.workbench.recording_buffer import Film
+from bevviz.support.files import ScratchFolder, atomic_write, claim_target, save_text, unfinished_files
+from bevviz.workbench.recording_buffer import RecordingBuffer
 from tests import bags
 from tests.recordings import Recording, verify
 from tests.test_cli import Capture, environment, error_of
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 def test_a_file_gets_its_name_at_the_end() -> None:
     target = Path("a.rrd")
     target.write_text("old")
-    with written(target, "recording") as given:
+    with atomic_write(target, "recording") as given:
         assert re.fullmatch(r"a\.partial-[0-9a-f]{8}\.rrd", given.path.name)
         assert unfinished_files(target.resolve()) == [given.path] and not given.leftovers
         given.path.write_text("new")
@@ -52,25 +52,28 @@ def test_an_error_leaves_the_old_and_says_where_the_new_is() -> None:
     target = Path("a.rrd")
     target.write_text("old")
     half = r"^no more; what was made until then is in a\.partial-[0-9a-f]{8}\.rrd$"
-    with pytest.raises(UserError, match=half), written(target, "recording") as given:
+    with pytest.raises(UserError, match=half), atomic_write(target, "recording") as given:
         given.path.write_text("half")
         raise UserError("no more")
     (left,) = unfinished_files(target)
     assert (target.read_text(), left.read_text()) == ("old", "half")
-    with written(target, "recording") as given:
+    with atomic_write(target, "recording") as given:
         assert given.leftovers == (left.resolve(),) and given.path.read_text() == ""
         assert given.warnings == [f"{left.name}: left by a run that did not end; keep or delete it"]
     assert left.read_text() == "half"
     left.unlink()
-    with pytest.raises(UserError, match=r"^nothing$"), written(target, "recording"):
+    with pytest.raises(UserError, match=r"^nothing$"), atomic_write(target, "recording"):
         raise UserError("nothing")
     assert not unfinished_files(target)
 
 
 def test_one_process_at_a_time() -> None:
-    with written(Path("a.rrd"), "recording") as given:
+    with atomic_write(Path("a.rrd"), "recording") as given:
         given.path.write_text("first")
-        with pytest.raises(UserError, match="another process is writing it"), written(Path("a.rrd"), "x"):
+        with (
+            pytest.raises(UserError, match="another process is writing it"),
+            atomic_write(Path("a.rrd"), "x"),
+        ):
             pass
     assert Path("a.rrd").read_text() == "first"
 
@@ -96,17 +99,17 @@ def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
 def test_a_link_and_what_is_no_file() -> None:
     Path("real").mkdir()
     Path("latest.rrd").symlink_to("real/a.rrd")
-    with written(Path("latest.rrd"), "recording") as given:
+    with atomic_write(Path("latest.rrd"), "recording") as given:
         given.path.write_text("x")
     assert Path("latest.rrd").is_symlink() and Path("real/a.rrd").read_text() == "x"
     os.mkfifo("pipe.rrd")
-    with pytest.raises(UserError, match="it is no file"), written(Path("pipe.rrd"), "recording"):
+    with pytest.raises(UserError, match="it is no file"), atomic_write(Path("pipe.rrd"), "recording"):
         pass
 
 
 def test_a_text_is_whole_or_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
     target = Path("a.csv")
-    save(target, "old\r\n", "--csv")
+    save_text(target, "old\r\n", "--csv")
     assert target.read_bytes() == b"old\r\n"
 
     def full(self: Path, text: str, **_: object) -> int:
@@ -117,19 +120,19 @@ def test_a_text_is_whole_or_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_text", full)
         with pytest.raises(UserError, match=r"^--csv a\.csv: cannot write the file: No space left"):
-            save(target, "new", "--csv")
+            save_text(target, "new", "--csv")
     assert target.read_bytes() == b"old\r\n"
-    save(target, "new", "--csv")
+    save_text(target, "new", "--csv")
     assert [path.name for path in Path().iterdir()] == ["a.csv"]
     with pytest.raises(UserError, match=r"^--csv .*none/a\.csv: cannot write the file: No such file"):
-        save(Path("none/a.csv"), "x", "--csv")
+        save_text(Path("none/a.csv"), "x", "--csv")
     Path("folder").mkdir()
     with pytest.raises(UserError, match="--csv folder: cannot write the file: Is a directory"):
-        save(Path("folder"), "x", "--csv")
+        save_text(Path("folder"), "x", "--csv")
 
 
 def test_a_text_goes_into_a_pipe(capfd: Capture) -> None:
-    save(Path("/dev/stdout"), "a,b\n", "--csv")
+    save_text(Path("/dev/stdout"), "a,b\n", "--csv")
     assert capfd.readouterr().out == "a,b\n"
 
 
@@ -247,7 +250,7 @@ def test_a_full_temporary_disk_names_its_folder(
     with small_disk(tmp_path / "small", "64k") as small:
         monkeypatch.setattr("tempfile.tempdir", str(small))
         full = f"{small}: the disk is full: make room there, or name another folder for temporary files"
-        with Film() as film:
+        with RecordingBuffer() as film:
             film.add(b"first")
             with pytest.raises(UserError, match=f"^{re.escape(full)} with TMPDIR$"):
                 film.add(bytes(100_000))
@@ -286,13 +289,13 @@ def test_a_temporary_folder_does_not_outlive_its_process_for_long(
     done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=PATIENCE)
     assert done.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
-    mine = Scratch()
+    mine = ScratchFolder()
     mine.new()
     assert left.exists()  # too young: it might be in the making
     old = time.time() - 1000
     for folder in tmp_path.iterdir():
         os.utime(folder, (old, old))
-    other = Scratch()
+    other = ScratchFolder()
     other.new()
     assert not left.exists()
     assert len(list(tmp_path.iterdir())) == 2  # those that are in use stay
@@ -311,7 +314,7 @@ def test_a_bag_that_needs_no_temporary_folder_makes_none(
 
 def test_unfinished_files_are_known_by_their_names() -> None:
     target = Path("drive.v2.rrd")
-    claimed = claim(target, "recording")
+    claimed = claim_target(target, "recording")
     for name in ("drive.v2.partial.rrd", "drive.partial-0123abcd.rrd", "drive.v2.partial-0123abcd.mcap"):
         Path(name).write_text("of somebody else")
     Path("drive.v2.partial-00000000.rrd").symlink_to("drive.v2.partial.rrd")
@@ -359,8 +362,8 @@ def test_an_unfinished_file_is_never_an_existing_one(monkeypatch: pytest.MonkeyP
     os.link(bag, "o.partial-11111111.rrd")
     for _ in range(2):
         with pytest.raises(UserError, match=r"o\.rrd: cannot write the recording: File exists"):
-            claim(Path("o.rrd"), "recording")
-    claim(Path("o.rrd"), "recording").discard()
+            claim_target(Path("o.rrd"), "recording")
+    claim_target(Path("o.rrd"), "recording").discard()
     assert bag.read_text() == "the bag" and bag.stat().st_nlink == 2
 
 
@@ -371,7 +374,7 @@ def test_a_link_to_a_file_of_another_kind_is_refused() -> None:
     with pytest.raises(
         UserError, match=r"^--csv s\.csv: cannot write the file: it is a link to .*drive\.mcap"
     ):
-        save(Path("s.csv"), "a,b\n", "--csv")
+        save_text(Path("s.csv"), "a,b\n", "--csv")
     assert bag.read_text() == "the bag"
 
 

@@ -14,10 +14,10 @@ import bevviz
 from bevviz import UserError
 from bevviz.datasets.columns import are_doubles, count_columns
 from bevviz.datasets.folder import Folder, read_cloud
-from bevviz.datasets.stamps import sensors_of
+from bevviz.datasets.stamps import group_by_sensor
 from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
-from bevviz.model.geometry import is_bent
+from bevviz.model.geometry import has_distortion
 from bevviz.support.open3d import load
 
 
@@ -102,7 +102,7 @@ def test_a_folder_of_doubles_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_sensors_of_one_folder_are_told_by_the_names(names: list[str], sensors: list[str]) -> None:
-    groups = sensors_of([Path(f"{name}.png") for name in names])
+    groups = group_by_sensor([Path(f"{name}.png") for name in names])
     assert list(groups) == sensors
     assert sum(map(len, groups.values())) == len(names)
 
@@ -316,7 +316,7 @@ def test_stamps_of_names(names: list[str], stamps: list[float], tmp_path: Path) 
 
 def test_sensors_whose_names_end_with_dates() -> None:
     files = [Path(f"{side}_20240131_2359{at}.500.png") for side in ("left", "right") for at in range(10, 60)]
-    assert {name: len(found) for name, found in sensors_of(files).items()} == {"left": 50, "right": 50}
+    assert {name: len(found) for name, found in group_by_sensor(files).items()} == {"left": 50, "right": 50}
 
 
 def test_the_only_lidar_is_placed_by_what_is_stated(tmp_path: Path) -> None:
@@ -384,7 +384,7 @@ def test_images_are_rectified_unless_a_lens_is_stated(lens: str, topic: str, tmp
     streams = {stream.topic: stream for stream in drive_of(tmp_path, ["1"]).streams}
     assert f"/front/{topic}/compressed" in streams
     camera = decode_camera_info(streams["/front/camera_info"].make(0), topic == "image_rect")
-    assert is_bent(camera) == bool(lens)
+    assert has_distortion(camera) == bool(lens)
 
 
 def test_a_folder_of_cameras_has_one_for_each(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.detections import decode_detections_3d
 from bevviz.messages.encode import encode_labels
 from bevviz.model.frame import Boxes3D
-from bevviz.model.geometry import inverse, moved, transform
+from bevviz.model.geometry import inverse, transform, transform_boxes
 from tests.datasets import TR, kitti_odometry, kitti_raw, nuscenes
 
 OLD = """# .PCD v.5 - Point Cloud Data file format
@@ -171,7 +171,7 @@ def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:
     stated = there @ map_from_points[:3, :3].T + map_from_points[:3, 3]
     sizes, turns = np.ones((2, 3), np.float32), np.zeros(2, np.float32)
     msg = encode_labels(0, "map", Boxes3D(stated, sizes, turns), ["car", "car"], ["1", "2"])
-    boxes = moved(decode_detections_3d(msg, "/boxes", 0).boxes, inverse(map_from_points))
+    boxes = transform_boxes(decode_detections_3d(msg, "/boxes", 0).boxes, inverse(map_from_points))
     assert boxes.center.dtype == np.float32
     np.testing.assert_allclose(boxes.center, there, atol=1e-4)
 

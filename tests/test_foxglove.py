@@ -20,7 +20,7 @@ from bevviz.cli import main  # noqa: E402
 from bevviz.config import load  # noqa: E402
 from bevviz.model import geometry  # noqa: E402
 from bevviz.model.frame import F32, F64  # noqa: E402
-from bevviz.report.bag_window import choose_topics, cut, find_window, open_window  # noqa: E402
+from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window  # noqa: E402
 from bevviz.stages.robot_results import in_points_frame  # noqa: E402
 from tests import bags, videos  # noqa: E402
 
@@ -305,7 +305,7 @@ def test_a_part_cut_out_runs_again(tmp_path: Path) -> None:
     with BagSource([path], load()) as source:
         window = find_window(source, int(source.scans[3]), 0.1, 0.1)
         topics = choose_topics(source.recording, source.roles, None)
-        cut(source.recording, window, topics, source.roles.tf_static, target)
+        cut_bag(source.recording, window, topics, source.roles.tf_static, target)
         expected = [frame.points for frame in source][2:5]
     with open_window([target], load(), window.low, window.high) as source:
         for frame, there in zip(source, expected, strict=True):
@@ -354,9 +354,9 @@ def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: obje
 
 @pytest.mark.parametrize("kind", ["PointCloud", "CompressedImage", "RawImage"])
 def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
-    from bevviz.messages.foxglove import as_ros, parse
+    from bevviz.messages.foxglove import parse, to_ros
 
     name = f"foxglove.{kind}"
     message = parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", "")
     with pytest.raises(ValueError, match="the field 'data' is the number 2147483648"):
-        as_ros(message, name)
+        to_ros(message, name)

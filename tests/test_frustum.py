@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import kitti
-from bevviz.config import SIZES, ClusteringConfig, FusionConfig, ObjectsConfig, load
+from bevviz.config import CLASS_SIZES, ClusteringConfig, FusionConfig, ObjectsConfig, load
 from bevviz.errors import UserError
 from bevviz.model.frame import F32, F64, Camera
 from bevviz.model.geometry import apply, project
@@ -27,7 +27,7 @@ from bevviz.model.results import (
 )
 from bevviz.stages.box_fit import MAX_SPREAD, NO_EDGE, fit
 from bevviz.stages.clustering import cluster
-from bevviz.stages.frustum import claim
+from bevviz.stages.frustum import claim_clusters
 from bevviz.stages.fusion import fuse, merge
 from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
 
@@ -48,7 +48,9 @@ def looked(
 def claimed(
     points: F32, clusters: Clusters, *cameras: CameraResult, config: FusionConfig | None = None
 ) -> Claimed:
-    return claim(points, None, clusters, cameras, config or FusionConfig(), ObjectsConfig(), CLUSTERING)
+    return claim_clusters(
+        points, None, clusters, cameras, config or FusionConfig(), ObjectsConfig(), CLUSTERING
+    )
 
 
 def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Splits]:
@@ -125,7 +127,7 @@ def test_a_car_from_behind_goes_on_where_it_was_not_seen() -> None:
     assert np.ptp(rear[:, 0]) < 0.1
     _, claims, _ = outcome(rear, detections_of([silhouette(rear)], names="car"))
     boxes = claims.boxes
-    assert abs(boxes.size[0, 0] - SIZES["car"][0]) < SIZES["car"][3]
+    assert abs(boxes.size[0, 0] - CLASS_SIZES["car"][0]) < CLASS_SIZES["car"][3]
     np.testing.assert_allclose(boxes.center[0, :2], [12.0, 0], atol=0.3)
     assert abs(math.sin(float(boxes.yaw[0]))) < 0.1
     back = 1 if math.cos(float(boxes.yaw[0])) > 0 else 0
@@ -274,7 +276,7 @@ def test_no_box_is_larger_than_its_class_can_be(scene: tuple[F32, Detections]) -
     points, found = scene
     _, claims, _ = outcome_of(points, cluster(points, CLUSTERING), found)
     for d in np.flatnonzero(claims.cluster >= 0).tolist():
-        size = SIZES.get(found.names[d])
+        size = CLASS_SIZES.get(found.names[d])
         box = claims.boxes.size[d]
         assert np.isfinite(claims.boxes.center[d]).all() and (box > 0).all()
         assert -math.pi / 2 < claims.boxes.yaw[d] <= math.pi / 2 + 1e-6
@@ -293,7 +295,7 @@ def test_a_cars_heading_and_place(distance: float, bearing: float, yaw: float, l
     """Both sides seen: the fit finds the car. One seen: it is as far away as its class's size allows."""
     x, y = distance * math.cos(bearing), distance * math.sin(bearing)
     points = car(x, y, yaw, length)[:, :2].astype(np.float64)
-    L, W, _, spread, narrow, _ = SIZES["car"]
+    L, W, _, spread, narrow, _ = CLASS_SIZES["car"]
     normals, edge = np.zeros((2, 2)), np.full(2, NO_EDGE)
     box, _ = fit(points, normals, edge, np.array([L, spread, W, narrow]), 10.0, np.nan)
     turned = (box[4] - yaw + math.pi / 2) % math.pi - math.pi / 2
@@ -308,7 +310,7 @@ def test_sizes_are_stated_class_by_class() -> None:
     config = load(settings=["objects.sizes={kiosk: [2, 2, 2.5, 0.3, 0.3, 0.3], chair: null}"])
     assert config.objects.sizes["kiosk"] == (2, 2, 2.5, 0.3, 0.3, 0.3)
     assert config.objects.sizes["chair"] is None
-    assert config.objects.sizes["car"] == SIZES["car"]
+    assert config.objects.sizes["car"] == CLASS_SIZES["car"]
     with pytest.raises(UserError, match="six: length, width, height and the spread of each"):
         load(settings=["objects.sizes={kiosk: [2, 2]}"])
 
@@ -333,6 +335,6 @@ def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
 
 def test_nothing_named_in_them_is_too_large(tally: kitti.Tally) -> None:
     for box in tally.boxes:
-        size = SIZES.get(box.name.lower())
+        size = CLASS_SIZES.get(box.name.lower())
         limit = 8.0 if size is None else size[0] + MAX_SPREAD * size[3] + 0.01
         assert box.size[:2].max() <= limit, box

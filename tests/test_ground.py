@@ -17,7 +17,7 @@ from bevviz.config import GroundConfig
 from bevviz.model.frame import F32, F64, Bool
 from bevviz.model.results import Ground
 from bevviz.stages.clustering import dbscan
-from bevviz.stages.ground import RING_COUNT, RING_SCALE, _place, segment_ground
+from bevviz.stages.ground import RING_COUNT, RING_SCALE, _sort_into_bins, segment_ground
 from bevviz.support.open3d import load
 
 Terrain = Callable[[F64, F64], F64]
@@ -164,7 +164,7 @@ coordinates = st.floats(-99, 99, width=32)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=coordinates))
 def test_places_in_the_polar_grid(points: F32) -> None:
     rings, sectors = 30, 180
-    ring, sector, order, start = _place(points, rings, sectors)
+    ring, sector, order, start = _sort_into_bins(points, rings, sectors)
     assert ring.dtype == sector.dtype == np.float32
     assert ((sector >= 0) & (sector < sectors)).all()
     for (x, y, _), r, s in zip(points.tolist(), ring.tolist(), sector.tolist(), strict=True):

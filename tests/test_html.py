@@ -13,7 +13,7 @@ from bevviz.fleet.page import BagTotals, page
 from bevviz.fleet.table import RunInfo
 from bevviz.model.frame import Scene
 from bevviz.report.plots import plot
-from bevviz.support.html import environment, render
+from bevviz.support.html import render, template_environment
 from tests.pages import Page
 
 EVIL = "</style></script><script>alert('x')</script>\"'><img src=x onerror=alert(1)> &amp; {{ 7 * 7 }}"
@@ -84,7 +84,7 @@ def test_a_plot() -> None:
     assert drawn is not None
     inside = [(x, y) for line in drawn.lines for x, y in line.points]
     assert all(drawn.left <= x <= drawn.right and drawn.top <= y <= drawn.bottom for x, y in inside)
-    template = environment().from_string('{% from "macros.html" import plot %}{{ plot(drawn) }}')
+    template = template_environment().from_string('{% from "macros.html" import plot %}{{ plot(drawn) }}')
     found = Page(template.render(drawn=drawn))
     tags = [tag for tag, _ in found.tags]
     assert tags.count("polyline") == 2 and tags.count("circle") == 1

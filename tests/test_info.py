@@ -12,7 +12,7 @@ import pytest
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.pipeline.bag_info import WIDTH, describe, render
+from bevviz.pipeline.bag_info import WIDTH, describe_bag, render_bag_info
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import DEMO_MODEL
 from tests import bags
@@ -27,7 +27,7 @@ def write(path: Path, *without: str, form: str = "mcap") -> Path:
 @pytest.mark.parametrize(("form", "name"), [("mcap", "MCAP"), ("sqlite3", "sqlite3"), ("ros1", "ROS 1 bag")])
 def test_a_whole_bag(tmp_path: Path, form: str, name: str) -> None:
     path = write(tmp_path / "drive.bag", form=form)
-    info = describe([path], load(settings=["detector.model=demo"]))
+    info = describe_bag([path], load(settings=["detector.model=demo"]))
     assert info.formats == (name,)
     assert info.messages == 121
     assert info.duration == pytest.approx(2.91)
@@ -46,7 +46,7 @@ def test_a_whole_bag(tmp_path: Path, form: str, name: str) -> None:
     assert info.tree == {"base_link": "odom", "velodyne": "base_link", "camera_optical": "velodyne"}
     assert info.world_frame == "odom"
     assert info.missing == info.warnings == ()
-    text = render(info)
+    text = render_bag_info(info)
     assert "2.91 s from 2023-11-14T22:13:20.000Z, 121 messages" in text
     assert (
         "camera: 64 x 48 uncompressed, fx 60.0 fy 60.0 cx 32.0 cy 24.0, no distortion, placed by TF" in text
@@ -62,17 +62,17 @@ def test_gaps_are_found_in_the_index(tmp_path: Path) -> None:
         if i.topic != bags.CLOUD or not 1.0 <= (i.received - bags.START) / 1e9 < 1.5
     ]
     for form in ("mcap", "sqlite3"):
-        info = describe([bags.write(tmp_path / form, items, form=form)], Config())
+        info = describe_bag([bags.write(tmp_path / form, items, form=form)], Config())
         (cloud,) = (t for t in info.topics if t.name == bags.CLOUD)
         assert cloud.count == 25
         assert cloud.pause == pytest.approx(0.6)
         assert cloud.pause_at == pytest.approx(0.91)
-        assert "0.60 s at 0.9 s" in render(info)
+        assert "0.60 s at 0.9 s" in render_bag_info(info)
 
 
 def test_what_is_missing_and_the_option_that_gives_it(tmp_path: Path) -> None:
     path = write(tmp_path / "drive", "/tf_static", "/tf", bags.INFO)
-    text = render(describe([path], Config()))
+    text = render_bag_info(describe_bag([path], Config()))
     assert "camera 'camera' has no CameraInfo, and there is no topic of that kind: record it" in text
     assert "--set source.extrinsics='{velodyne camera_optical: [x, y, z, qx, qy, qz, qw]}'" in text
     assert "--set source.fixed_frame=name" in text
@@ -83,9 +83,9 @@ def test_what_is_missing_and_the_option_that_gives_it(tmp_path: Path) -> None:
 def test_the_option_that_is_offered_is_accepted(tmp_path: Path) -> None:
     path = write(tmp_path / "drive", "/tf_static")
     config = load(settings=["source.extrinsics={velodyne camera_optical: [0, 0, 0, -0.5, 0.5, -0.5, 0.5]}"])
-    (camera,) = describe([path], config).cameras
+    (camera,) = describe_bag([path], config).cameras
     assert camera.camera_from_points is not None
-    assert "not placed" not in render(describe([path], config))
+    assert "not placed" not in render_bag_info(describe_bag([path], config))
 
 
 def test_the_camera_info_that_is_offered_is_there_and_accepted(tmp_path: Path) -> None:
@@ -97,9 +97,9 @@ def test_the_camera_info_that_is_offered_is_there_and_accepted(tmp_path: Path) -
 
     path = bags.write(tmp_path / "drive", map(moved, bags.small_items()))
     offered = "source.camera_info_topics='{/camera/image_rect_color: /calibration/lens}'"
-    assert f"--set {offered}" in render(describe([path], Config()))
+    assert f"--set {offered}" in render_bag_info(describe_bag([path], Config()))
     config = load(settings=[offered.replace("'", "")])
-    assert describe([path], config).missing == ("no detector: --model FILE.onnx",)
+    assert describe_bag([path], config).missing == ("no detector: --model FILE.onnx",)
 
 
 def test_an_uncalibrated_camera_needs_no_other_topic(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_an_uncalibrated_camera_needs_no_other_topic(tmp_path: Path) -> None:
 
     path = bags.write(tmp_path / "drive", map(zero, bags.small_items(scans=4)))
     said = f"{bags.INFO}: the camera is uncalibrated (K is zero or not finite); calibrate it"
-    info = describe([path], Config())
+    info = describe_bag([path], Config())
     assert info.missing == (f"camera 'camera': {said}", "no detector: --model FILE.onnx")
     with BagSource([path], Config()) as source:
         frames = list(source)
@@ -129,7 +129,7 @@ def test_where_no_frame_id_is_stated_no_extrinsics_are_asked_for(tmp_path: Path)
                 header = replace(item.message.header, frame_id="")
                 item = item._replace(message=replace(item.message, header=header))
             items.append(item)
-        return " ".join(describe([bags.write(tmp_path / topic[1:7], items)], Config()).missing)
+        return " ".join(describe_bag([bags.write(tmp_path / topic[1:7], items)], Config()).missing)
 
     for topic, what in ((bags.CLOUD, "the points state"), (bags.IMAGE, "its images state")):
         missing = nameless(topic)
@@ -138,16 +138,16 @@ def test_where_no_frame_id_is_stated_no_extrinsics_are_asked_for(tmp_path: Path)
 
 
 def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:
-    info = describe([write(tmp_path / "drive", bags.CLOUD)], Config())
+    info = describe_bag([write(tmp_path / "drive", bags.CLOUD)], Config())
     assert [t.name for t in info.topics] == [bags.INFO, bags.IMAGE, "/tf", "/tf_static"]
     assert info.missing[0].startswith("no LiDAR: none of 4 topics is a sensor_msgs/PointCloud2; there")
-    assert "no LiDAR" in render(info)
+    assert "no LiDAR" in render_bag_info(info)
 
 
 def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
     (path,) = write(tmp_path / "drive").glob("*.mcap")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    text = render(describe([path], Config()))
+    text = render_bag_info(describe_bag([path], Config()))
     assert "warnings\n" in text
     assert "the file ends early (no footer): what is there was rescued" in text
     assert re.search(r"read \d+ messages, \d+ of them from the incomplete last", " ".join(text.split()))
@@ -155,14 +155,14 @@ def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
 
 def test_a_bag_that_is_none_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file or folder"):
-        describe([tmp_path / "nowhere"], Config())
+        describe_bag([tmp_path / "nowhere"], Config())
     with pytest.raises(UserError, match=r"source\.lidar_topics: there is no topic /x"):
-        describe([write(tmp_path / "drive")], load(settings=["source.lidar_topics=[/x]"]))
+        describe_bag([write(tmp_path / "drive")], load(settings=["source.lidar_topics=[/x]"]))
 
 
 def test_kitti(shared: Path, tmp_path: Path) -> None:
-    info = describe([bags.write(tmp_path / "kitti", bags.kitti_items(shared))], Config())
-    text = render(info)
+    info = describe_bag([bags.write(tmp_path / "kitti", bags.kitti_items(shared))], Config())
+    text = render_bag_info(info)
     assert "camera: 1242 x 375 image/png, fx 721.5" in text
     assert "velodyne\n    camera_optical" in text
     assert "fixed frame of 'velodyne': none" in text
@@ -175,7 +175,9 @@ def test_networks_that_cannot_be_used_are_missing(tmp_path: Path) -> None:
     params = ["objects.point_range=[0, -8, -3, 24, 8, 1]", "objects.voxel_size=[1, 1, 4]"]
     params += ["objects.features=[x, y, z, intensity]", "objects.classes=[Car]"]
     for file, reason in ((tmp_path / "none.onnx", "o such file"), (text, "onnxruntime cannot load it")):
-        info = describe([path], load(settings=[f"objects.method={file}", *params, f"detector.model={file}"]))
+        info = describe_bag(
+            [path], load(settings=[f"objects.method={file}", *params, f"detector.model={file}"])
+        )
         detector, objects = info.missing
         assert detector.startswith(f"detector.model {file}: ") and objects.startswith(
             f"objects.method {file}: "
@@ -183,10 +185,12 @@ def test_networks_that_cannot_be_used_are_missing(tmp_path: Path) -> None:
         assert reason in objects and info.object_network == objects
         with pytest.raises(UserError, match=re.escape(objects)):  # as a run says before its first frame
             StageLoader().load(load(settings=[f"objects.method={file}", *params]))
-    info = describe([path], load(settings=[f"objects.method={DEMO_MODEL}", *params, "detector.model=demo"]))
+    info = describe_bag(
+        [path], load(settings=[f"objects.method={DEMO_MODEL}", *params, "detector.model=demo"])
+    )
     [foreign] = info.missing
     assert "a network on pillars takes pillars [N, points, features]" in foreign
-    assert "3D detector runs on" in render(info)
+    assert "3D detector runs on" in render_bag_info(info)
 
 
 def test_a_3d_detector_lacks_its_file_before_its_parameters(tmp_path: Path) -> None:

@@ -95,15 +95,15 @@ def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: si
 
 def test_what_remains_is_forgotten_in_time() -> None:
     removed: list[str] = []
-    cleanup.remember("mine", lambda: removed.append("mine"))
-    cleanup.remember("other", lambda: removed.append("other"))
-    cleanup.forget("mine")
-    cleanup.remove()
-    cleanup.forget("other")
+    cleanup.register("mine", lambda: removed.append("mine"))
+    cleanup.register("other", lambda: removed.append("other"))
+    cleanup.unregister("mine")
+    cleanup.remove_all()
+    cleanup.unregister("other")
     assert removed == ["other"]
-    with cleanup.unfinished(), cleanup.unfinished():
-        assert cleanup.any_unfinished()
-    assert not cleanup.any_unfinished()
+    with cleanup.must_finish(), cleanup.must_finish():
+        assert cleanup.is_any_unfinished()
+    assert not cleanup.is_any_unfinished()
 
 
 def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:

@@ -16,7 +16,7 @@ import bevviz
 from bevviz.config import LoggingConfig
 from bevviz.model.frame import F32, U8
 from bevviz.recording import entities
-from bevviz.recording.retention import Around, Held
+from bevviz.recording.retention import RawCloudFrame, RawCloudSelector
 from bevviz.recording.saved_viewer import too_large_for_web
 from bevviz.recording.video import GOP, VideoEncoder, decode
 from tests import bags
@@ -45,10 +45,10 @@ def test_raw_clouds_are_those_around_what_is_strange(
     all, what begins of itself up to a share of the frames, and the first time."""
     stamps = (np.cumsum(steps) * TENTH).tolist()
     config = LoggingConfig(raw_every=every, raw_around=around / 10, raw_share=share)
-    kept, found, at, left_out = Around(), list[int](), list[int](), 0
+    kept, found, at, left_out = RawCloudSelector(), list[int](), list[int](), 0
     for i, stamp in enumerate(stamps):
         for_reason = sum(one % every != 0 for one in found)
-        given = Held((i, stamp, 0), ())
+        given = RawCloudFrame((i, stamp, 0), ())
         more = kept.see(given, config, strange=i in strange, wanted=i in asked_for)
         found += [one.clock[0] for one in more]
         assert kept.held <= around + 1

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import INDEX, Indexer, Saver, remove_leftovers, unused_names
@@ -35,7 +35,7 @@ from bevviz.live.runtime import Live, Outputs
 from bevviz.live.thinning import Thinned, thin
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import RETRY, Program, Viewer
-from bevviz.model.frame import Frame, Mark, Scene
+from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
     CameraResult,
     Decision,
@@ -45,7 +45,7 @@ from bevviz.model.results import (
     Pairs,
 )
 from bevviz.pipeline.session import Session
-from bevviz.support.files import lock
+from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
@@ -130,7 +130,7 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         source = source or Paced(frames, drive.scene, total)
         live = Live(
             source,
-            Settings(config, settings),
+            ReloadableConfig(config, settings),
             Outputs(**outputs),
             Notes(said.append),
             observe=observe,
@@ -423,7 +423,7 @@ def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) 
     download = tmp_path / "a.rrd.part"  # as browsers name what is on its way
     download.write_bytes(b"half")
     with work.open("wb") as file:
-        lock(file.fileno(), "taken")
+        lock_file(file.fileno(), "taken")
         remove_leftovers(tmp_path)
     assert not left.exists() and work.exists() and download.exists()
 
@@ -512,9 +512,13 @@ def test_a_subscriber_that_fails_is_said_once(run: Run) -> None:
 
 def test_a_mark_outlives_its_frame(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
     class Marked(Paced):
-        waiting: Sequence[Mark] = (Mark("a person", 1, 0), Mark("a van", 3, 0), Mark("never", 9, 0))
+        waiting: Sequence[UserMark] = (
+            UserMark("a person", 1, 0),
+            UserMark("a van", 3, 0),
+            UserMark("never", 9, 0),
+        )
 
-        def marks(self, index: int) -> list[Mark]:
+        def marks(self, index: int) -> list[UserMark]:
             """As of a source that has left out the frames 1 to 3 in front of the fourth."""
             found = [mark for mark in self.waiting if mark.index <= index and index >= 4]
             self.waiting = [mark for mark in self.waiting if mark not in found]

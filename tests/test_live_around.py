@@ -26,7 +26,7 @@ from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.diagnostics import TYPE, Diagnostics
 from bevviz.live.node import Node
 from bevviz.live.notes import Notes
@@ -159,7 +159,7 @@ def fly(folder: Path) -> Flight:
     said: list[str] = []
     asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
     asked.append("live.log_queue=50")  # no frame is left out, least of all the one with the mark
-    settings = Settings(None, ["live.flight_time=60 s", *asked])
+    settings = ReloadableConfig(None, ["live.flight_time=60 s", *asked])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)
     with Node(name="robot") as node:

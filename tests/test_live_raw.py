@@ -29,10 +29,10 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.bag_info import describe
+from bevviz.pipeline.bag_info import describe_bag
 from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
-from bevviz.recording.source_lookup import read
+from bevviz.recording.source_lookup import read_origin
 from bevviz.report.fingerprints import compare, digest
 from bevviz.support.files import unfinished_files, write_all
 from bevviz.synthetic import SyntheticSource
@@ -46,7 +46,7 @@ from tests.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.node import Node
 from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import Earlier, RawMessage, RawRecorder, children, define
@@ -86,7 +86,7 @@ def fly(folder: Path) -> Flight:
     said: list[str] = []
     results: dict[int, Any] = {}
     sizes: list[tuple[int, float]] = []
-    settings = Settings(None, [f"live.flight_time={SECONDS} s", *WAIT])
+    settings = ReloadableConfig(None, [f"live.flight_time={SECONDS} s", *WAIT])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)
     with Node(name="robot") as robot:
@@ -185,15 +185,15 @@ def test_other_libraries_read_it(flight: Flight) -> None:
 
 
 def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path) -> None:
-    info = describe([flight.folder / "snap.rrd"], load())
+    info = describe_bag([flight.folder / "snap.rrd"], load())
     assert info.size == (flight.folder / "snap.mcap").stat().st_size
     assert info.missing == ("no detector: --model FILE.onnx",) and info.cameras[0].image is not None
-    how, _ = read(flight.folder / "snap.rrd")
+    how, _ = read_origin(flight.folder / "snap.rrd")
     assert "flight_time" in how
     alone = tmp_path / "snap.rrd"
     alone.write_bytes((flight.folder / "snap.rrd").read_bytes())
     with pytest.raises(UserError, match=r"snap\.mcap, which 'bevviz live' saves with it, is not beside it"):
-        describe([alone], load())
+        describe_bag([alone], load())
 
 
 def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:

@@ -31,9 +31,9 @@ from bevviz.messages.encode import (
     typestore,
 )
 from bevviz.messages.images import decode_image
-from bevviz.model.frame import Boxes3D, Frame, LateResult
+from bevviz.model.frame import Boxes3D, Frame, LateBoxes
 from bevviz.model.results import CameraResult, Detections, FrameResult, Objects
-from bevviz.pipeline.run import Dropping, run
+from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
@@ -151,7 +151,7 @@ def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
             source.overtaken()
             stamps: dict[int, int] = {}
             taken: Counter[str] = Counter()
-            late: list[LateResult] = []
+            late: list[LateBoxes] = []
 
             def come(topic: str) -> int:
                 mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
@@ -294,7 +294,7 @@ def test_clouds_that_come_together_are_all_taken_and_none_is_missed_once_it_is_o
         def work() -> None:
             run(source, Frames(), dropping=dropping, stop=stop, tick=tick)
 
-        dropping, stop = Dropping(), threading.Event()
+        dropping, stop = DropPolicy(), threading.Event()
         thread = threading.Thread(target=work, daemon=True)
         thread.start()
         for clouds in (1, 2, 3, 1, 3, 2, 3):

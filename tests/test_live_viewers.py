@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bevviz
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.notes import Notes
@@ -19,8 +19,8 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.live_buffer import AHEAD, WHOLE
-from bevviz.workbench.live_session import LiveBench
-from bevviz.workbench.routes import Heard
+from bevviz.workbench.live_session import LiveSession
+from bevviz.workbench.routes import PageState
 from tests.live_bench import live_bench
 from tests.recordings import Recording
 
@@ -35,13 +35,13 @@ def results() -> list[FrameResult]:
 
 
 @pytest.fixture
-def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
+def bench(results: list[FrameResult]) -> Iterator[LiveSession]:
     with live_bench(results, f"live.viewer_points={LIMIT}") as bench:
         yield bench
 
 
 def test_viewers_get_fewer_points_and_files_all(
-    bench: LiveBench, results: list[FrameResult], tmp_path: Path
+    bench: LiveSession, results: list[FrameResult], tmp_path: Path
 ) -> None:
     live, result = bench.live, results[0]
     frame = result.frame
@@ -82,7 +82,7 @@ def test_viewers_get_fewer_points_and_files_all(
     assert bench.picked(frame.index, (), path, LIMIT, []) is None
 
 
-def test_what_is_held_to_be_saved_has_all_points(bench: LiveBench, results: list[FrameResult]) -> None:
+def test_what_is_held_to_be_saved_has_all_points(bench: LiveSession, results: list[FrameResult]) -> None:
     live = bench.live
     packet = live.encoder.encode(results[0], live.scene, {}, ())
     flight = FlightRecorder(live.config.live, live.encoder, live._indexer)
@@ -92,13 +92,13 @@ def test_what_is_held_to_be_saved_has_all_points(bench: LiveBench, results: list
 
 
 def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
-    bench: LiveBench, monkeypatch: pytest.MonkeyPatch
+    bench: LiveSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
     monkeypatch.setattr(bench.live.encoder, "clock", lambda: now)
     film = bench.film
     assert film.lag is None, "nobody looks"
-    heard = Heard()
+    heard = PageState()
     with film.shown(heard) as page:
         assert film.lag == 0.0
         for _ in range(AHEAD):
@@ -116,7 +116,7 @@ def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
     assert film.lag is None
 
 
-def test_what_a_page_was_too_slow_for_is_counted(bench: LiveBench, results: list[FrameResult]) -> None:
+def test_what_a_page_was_too_slow_for_is_counted(bench: LiveSession, results: list[FrameResult]) -> None:
     film, encoder = bench.film, bench.live.encoder
     packet = encoder.encode(results[0], bench.live.scene, {}, ())
     film._take(packet, True)
@@ -129,9 +129,9 @@ def test_what_a_page_was_too_slow_for_is_counted(bench: LiveBench, results: list
 
 def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None:
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
-    settings = Settings(None, ["detector.model=demo", "live.viewer_rate=1"])
+    settings = ReloadableConfig(None, ["detector.model=demo", "live.viewer_rate=1"])
     live = Live(source, settings, Outputs(), Notes(lambda line: None))
-    with LiveBench(live) as bench:
+    with LiveSession(live) as bench:
         whole = live.encoder.encode(results[0], live.scene, {}, ())
         for packet in (whole, Packet(b"", False, whole.context, 0.0), whole):
             bench.film._take(packet, False)

@@ -34,7 +34,7 @@ from bevviz.model.frame import (
     Intrinsics,
     LabelledBoxes2D,
     LabelledBoxes3D,
-    LateResult,
+    LateBoxes,
     Scene,
 )
 from bevviz.model.results import (
@@ -53,15 +53,15 @@ from bevviz.model.results import (
     Tracks,
     Voxels,
 )
-from bevviz.recording.cloud import quantised
-from bevviz.recording.decisions import page
+from bevviz.recording.cloud import round_voxels
+from bevviz.recording.decisions import decision_page
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
-from bevviz.recording.frame_logger import Logger
-from bevviz.recording.health import Rates
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.health import FrameRates
 from bevviz.recording.sinks import open_recording
-from bevviz.recording.tracks import LANES, Lanes
+from bevviz.recording.tracks import TRACK_LANES, TrackLanes
 from bevviz.stages.bev import bev
-from bevviz.stages.fusion import in_view
+from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 from bevviz.support.files import unfinished_files
 from tests.recordings import Recording, verify
@@ -175,7 +175,7 @@ def record(tmp_path: Path) -> Callable[..., Recording]:
         path = tmp_path / "test.rrd"
         config = config or load()
         with open_recording(scene, config, save=path) as sinks:
-            logger = Logger(sinks.recording, config, scene)
+            logger = FrameLogger(sinks.recording, config, scene)
             logger.log_static()
             for result in results:
                 logger.log(result)
@@ -190,7 +190,7 @@ def record(tmp_path: Path) -> Callable[..., Recording]:
 def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
     path = tmp_path / "drive.rrd"
     with open_recording(SCENE, load(), save=path) as sinks:
-        logger = Logger(sinks.recording, load(), SCENE)
+        logger = FrameLogger(sinks.recording, load(), SCENE)
         logger.log_static()
         for index in range(10):
             logger.log(nothing(index, Failure("voxel", "out of memory")) if index % 4 == 3 else make(index))
@@ -206,10 +206,10 @@ def test_late_results_of_the_robot_are_at_their_own_stamp(tmp_path: Path) -> Non
     two = LabelledBoxes2D(
         "/seen", START + 15_000_000, "zed", np.ones((1, 4), np.float32), ("car",), row[0, :1], "zed"
     )
-    late = [LateResult(boxes, START, np.eye(4), index=0) for boxes in (three, two)]
+    late = [LateBoxes(boxes, START, np.eye(4), index=0) for boxes in (three, two)]
     path = tmp_path / "drive.rrd"
     with open_recording(SCENE, load(), save=path) as sinks:
-        logger = Logger(sinks.recording, load(), SCENE)
+        logger = FrameLogger(sinks.recording, load(), SCENE)
         logger.log_static()
         for index in range(40):
             logger.log(make(index), late=late if index == 7 else ())
@@ -246,7 +246,7 @@ def test_cloud(record: Callable[..., Recording]) -> None:
 @given(st.floats(0.01, 2), st.integers(0, 2**32 - 1))
 def test_voxelised_points_move_by_an_eighth_of_a_voxel_at_most(size: float, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-100, 100, (50, 3)).astype(np.float32)
-    moved = quantised(points, size)
+    moved = round_voxels(points, size)
     np.testing.assert_allclose(moved, points, rtol=0, atol=size / 8)
     step = next(2.0**n for n in range(-12, 3) if 2.0**n >= size / 8)
     assert step < size / 4
@@ -516,7 +516,7 @@ def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -
 
 
 def test_rates_are_counted_over_a_second() -> None:
-    rates = Rates()
+    rates = FrameRates()
     frame = make().frame
     found = []
     for index in range(40):  # two at a time, 60 ns apart, five times a second
@@ -525,7 +525,7 @@ def test_rates_are_counted_over_a_second() -> None:
         found.append(dict(rates))
     assert found[1] == {}  # nothing is known of two
     assert all(8 <= rate <= 13 for rates in found[4:] for rate in rates.values())
-    slow = Rates()
+    slow = FrameRates()
     for index in range(3):  # every two seconds
         slow.add(dataclasses.replace(frame, stamp=index * 2_000_000_000, received=0))
     assert dict(slow) == {"sensor": 0.5}
@@ -568,7 +568,7 @@ def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
         with (
             pytest.raises(ValueError, match="cut"),
             open_recording(SCENE, load(), save=path) as sinks,
-            Logger(sinks.recording, load(), SCENE, wait=wait) as logger,
+            FrameLogger(sinks.recording, load(), SCENE, wait=wait) as logger,
         ):
             logger.log_static()
             for result in results:
@@ -658,7 +658,7 @@ def tracked(results: Iterable[FrameResult]) -> list[FrameResult]:
     tracker, config, found = Tracker(), load().tracking, []
     for r in results:
         assert r.clusters is not None
-        seen = in_view(r.cameras, len(r.clusters))
+        seen = clusters_in_view(r.cameras, len(r.clusters))
         found.append(
             dataclasses.replace(r, tracks=tracker.update(r.frame, r.clusters, seen, r.objects, config))
         )
@@ -701,10 +701,10 @@ def test_lanes_are_few_and_are_kept() -> None:
         rows = np.zeros(len(ids), np.int64)
         return dataclasses.replace(tracks, id=np.array(ids), confirmed=tracks.confirmed[rows])
 
-    lanes = Lanes()
+    lanes = TrackLanes()
     assert lanes.update(crowd(4, 7)) == {0: 0, 1: 1}
     assert lanes.update(crowd(7, 9)) == {1: 0, 0: 1}
-    assert len(lanes.update(crowd(*range(100, 150)))) == LANES
+    assert len(lanes.update(crowd(*range(100, 150)))) == TRACK_LANES
     assert lanes.update(None) == {}
 
 
@@ -770,7 +770,7 @@ def test_suppressed_detections_are_counted() -> None:
     )
     camera = dataclasses.replace(result.cameras[0], detections=detections, fusion=None)
     explanations = explain([camera], None, load())
-    text = page(dataclasses.replace(result, cameras=(camera,), explanations=explanations))
+    text = decision_page(dataclasses.replace(result, cameras=(camera,), explanations=explanations))
     assert "- 3 (2 car, 1 truck) suppressed by car 0.90\n- car 0.20: below" in text
     assert text.count("suppressed") == 1
 
@@ -809,7 +809,7 @@ def test_several_outputs_at_once(tmp_path: Path) -> None:
         assert url.startswith(f"http://localhost:{port}/?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A")
         with urllib.request.urlopen(url, timeout=PATIENCE) as page:
             assert b"rerun" in page.read().lower()
-        Logger(sinks.recording, load(), SCENE).log(make())
+        FrameLogger(sinks.recording, load(), SCENE).log(make())
     verify(path)
     assert Recording(path).blueprints == 1
 
@@ -817,7 +817,7 @@ def test_several_outputs_at_once(tmp_path: Path) -> None:
 def test_an_error_on_the_way_leaves_a_readable_file(tmp_path: Path) -> None:
     path = tmp_path / "broken.rrd"
     with pytest.raises(KeyboardInterrupt), open_recording(SCENE, load(), save=path) as sinks:
-        logger = Logger(sinks.recording, load(), SCENE)
+        logger = FrameLogger(sinks.recording, load(), SCENE)
         logger.log_static()
         logger.log(make(0))
         logger.log(make(1))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
-from bevviz.model.decisions import in_mask
+from bevviz.model.decisions import mask_evidence
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import Detections, FrameResult, Fusion, Masks
 from bevviz.recording import entities
@@ -21,7 +21,7 @@ from bevviz.report.fingerprints import detections_of as recorded
 from bevviz.report.fingerprints import digest, pack, unpack
 from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
-from bevviz.stages.mask_lookup import cover
+from bevviz.stages.mask_lookup import is_covered
 from bevviz.synthetic import SyntheticSource
 from tests.recordings import Recording
 from tests.test_frustum import CLUSTERING, claimed, looked
@@ -63,7 +63,7 @@ def test_the_points_in_the_mask_are_taken_and_not_those_in_the_box() -> None:
     taken, fusion = outcome(SEGMENTED)
     assert taken[: len(PERSON)].mean() > 0.9
     assert taken[len(PERSON) :].mean() < 0.2  # what is within the margin
-    said = in_mask(fusion, 0, load())
+    said = mask_evidence(fusion, 0, load())
     assert said.startswith(", ") and said.endswith(f" of {len(POINTS)} points in the frustum lie in the mask")
     assert abs(int(said.split()[1]) - len(PERSON)) < 0.2 * len(PERSON)
 
@@ -72,7 +72,7 @@ def test_masks_can_be_switched_off() -> None:
     config = FusionConfig(masks=False)
     taken, fusion = outcome(SEGMENTED, config)
     np.testing.assert_array_equal(taken, outcome(WIDE, config)[0])
-    assert in_mask(fusion, 0, load(settings=["fusion.masks=false"])) == ""
+    assert mask_evidence(fusion, 0, load(settings=["fusion.masks=false"])) == ""
 
 
 def test_a_mask_without_points_is_left_aside() -> None:
@@ -80,7 +80,7 @@ def test_a_mask_without_points_is_left_aside() -> None:
     above = np.array([x0, y0 - 20, x1, y0 - 10], np.float32)
     taken, fusion = outcome(replace(WIDE, masks=masks_of(above)))
     np.testing.assert_array_equal(taken, outcome(WIDE)[0])
-    assert f"only 0 of {len(POINTS)} points in the frustum in the mask, which is left aside" in in_mask(
+    assert f"only 0 of {len(POINTS)} points in the frustum in the mask, which is left aside" in mask_evidence(
         fusion, 0, load()
     )
 
@@ -134,10 +134,10 @@ def test_a_pixel_is_covered_where_its_cell_is(seed: int, margin: float) -> None:
 
         beside = [(0, 0), (margin, 0), (-margin, 0), (0, margin), (0, -margin)]
         expected = [any(at(u + du, v + dv) for du, dv in beside) for u, v in uv[1:].tolist()]
-        assert cover(masks, d, uv, margin).tolist() == [False, *expected]
+        assert is_covered(masks, d, uv, margin).tolist() == [False, *expected]
 
 
 def test_without_masks_nothing_is_said_of_them() -> None:
     _, fusion = outcome(WIDE)
     assert fusion.detection_covered is None
-    assert in_mask(fusion, 0, load()) == ""
+    assert mask_evidence(fusion, 0, load()) == ""

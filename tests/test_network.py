@@ -15,7 +15,7 @@ import pytest
 
 from bevviz.errors import UserError
 from bevviz.recording import rerun_cli
-from bevviz.recording.ports import answers, host_for, origins, own_address
+from bevviz.recording.ports import allowed_origins, host_for, is_listening, own_address
 from tests import bags
 from tests.waiting import PATIENCE, until
 
@@ -102,13 +102,13 @@ def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
         with urllib.request.urlopen(f"http://localhost:{port}/", timeout=PATIENCE) as page:
             assert b"rerun" in page.read().lower()
         for other in found:
-            assert answers("127.0.0.1", other)
-            assert not answers(OTHER, other)
+            assert is_listening("127.0.0.1", other)
+            assert not is_listening(OTHER, other)
         if name == "demo":
             (data,) = set(found) - {port}
             assert is_let_in(data, f"http://localhost:{port}")
             assert not is_let_in(data, f"http://evil.example:{port}")
-    until(lambda: not any(answers("127.0.0.1", p) for p in found))  # nothing outlives a kill
+    until(lambda: not any(is_listening("127.0.0.1", p) for p in found))  # nothing outlives a kill
 
 
 def test_a_catalog_is_for_this_machine() -> None:
@@ -122,7 +122,7 @@ def test_a_catalog_is_for_this_machine() -> None:
         until(lambda: len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert port in found and set(found.values()) == {LOOPBACK}
-        assert not any(answers(OTHER, p) for p in found)
+        assert not any(is_listening(OTHER, p) for p in found)
 
 
 def test_bind_opens_it_at_one_address() -> None:
@@ -131,7 +131,7 @@ def test_bind_opens_it_at_one_address() -> None:
         until(lambda: len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert set(found.values()) == {"0200007F"}
-        assert all(answers(OTHER, p) and not answers("127.0.0.1", p) for p in found)
+        assert all(is_listening(OTHER, p) and not is_listening("127.0.0.1", p) for p in found)
 
 
 def test_an_address_of_another_machine() -> None:
@@ -142,8 +142,8 @@ def test_an_address_of_another_machine() -> None:
 
 def test_which_pages_may_have_the_data() -> None:
     """A page of somebody else that happens to use the same port is none of them."""
-    assert origins("127.0.0.1", 9090) == []
-    assert origins("192.0.2.1", 9090) == ["http://192.0.2.1:9090"]
+    assert allowed_origins("127.0.0.1", 9090) == []
+    assert allowed_origins("192.0.2.1", 9090) == ["http://192.0.2.1:9090"]
     assert host_for("fd00::1") == "[fd00::1]"
 
 
@@ -154,16 +154,16 @@ def test_which_pages_may_have_the_data() -> None:
 def test_the_window_is_for_this_machine(start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rerun's program, told to draw nowhere since there is no display here."""
     script = tmp_path / "rerun"
-    script.write_text(f'#!/bin/sh\nexec "{rerun_cli.program()}" --headless "$@"\n')
+    script.write_text(f'#!/bin/sh\nexec "{rerun_cli.rerun_program()}" --headless "$@"\n')
     script.chmod(0o755)
-    monkeypatch.setattr(rerun_cli, "program", lambda: str(script))
+    monkeypatch.setattr(rerun_cli, "rerun_program", lambda: str(script))
     if start == "run":
         arguments: list[str] = []
         monkeypatch.setattr(rerun_cli, "start", lambda given, *_, **__: arguments.extend(given))
-        from bevviz.recording.sinks import _viewer
+        from bevviz.recording.sinks import _start_viewer
 
-        _viewer()
-        command = [rerun_cli.program(), *arguments]
+        _start_viewer()
+        command = [rerun_cli.rerun_program(), *arguments]
     else:
         from bevviz.live.viewers import window
 

@@ -18,35 +18,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.bags.source import BagSource
-from bevviz.config import OpinionsConfig, load, revised
+from bevviz.config import OpinionsConfig, changed_config, load
 from bevviz.config.trust import USER
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
-from bevviz.model.colors import OPINIONS as OPINION_COLORS
+from bevviz.model.colors import OPINION_COLORS as OPINION_COLORS
 from bevviz.model.counts import OPINIONS
 from bevviz.model.decisions import explain
 from bevviz.model.frame import F32, Boxes3D, Camera, LabelledBoxes3D
 from bevviz.model.results import Explanation, FrameResult, Objects, Opinion, Opinions
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.primitives import image_outlines
 from bevviz.recording.sinks import open_recording
 from bevviz.stages.detector.names import COCO
-from bevviz.stages.opinions import opinions, right_names
-from bevviz.stages.user_stages import placed
+from bevviz.stages.opinions import matching_names, opinions
+from bevviz.stages.user_stages import make_objects
 from bevviz.stages.visibility import image_boxes, range_image, visible
-from bevviz.sweep.run import Outcome
+from bevviz.sweep.run import SweepOutcome
 from bevviz.synthetic import SyntheticSource
-from bevviz.why import Questioner, Selection
+from bevviz.why import FrameExplainer, Selection
 from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection
-from bevviz.why.stage_owner import origin
+from bevviz.why.pick_answers import selection_of
+from bevviz.why.stage_owner import owner_of
 from bevviz.why.verdict import Reason
 from bevviz.workbench.controls import controls
-from bevviz.workbench.findings import finds
-from bevviz.workbench.trials import attempt
+from bevviz.workbench.findings import find_findings
+from bevviz.workbench.trials import trial_effects
 from tests.recordings import Recording
 
 Drive = list[tuple[FrameResult, LabelledBoxes3D]]
@@ -69,7 +69,7 @@ def held(
 ) -> tuple[Objects, Opinions]:
     """A method's boxes on that frame."""
     scores = np.full(len(boxes), 0.9, np.float32)
-    objects = placed(boxes, names, scores, result.obstacles, result.clusters)
+    objects = make_objects(boxes, names, scores, result.obstacles, result.clusters)
     fused = result.objects
     assert fused is not None
     image = range_image(result.frame.points)
@@ -317,11 +317,11 @@ def test_the_frame_step_keeps_both() -> None:
 
 
 def test_the_names_of_networks_meet_those_of_detectors() -> None:
-    assert right_names("Car", COCO) == {"car"} == right_names("vehicle.car", COCO)
-    assert right_names("Pedestrian", COCO) == {"person"} == right_names("human.pedestrian.adult", COCO)
-    assert right_names("Cyclist", COCO) == {"person", "bicycle"}
-    assert right_names("person", ("Pedestrian", "Car")) == {"pedestrian"}
-    assert right_names("barrier", COCO) == frozenset()
+    assert matching_names("Car", COCO) == {"car"} == matching_names("vehicle.car", COCO)
+    assert matching_names("Pedestrian", COCO) == {"person"} == matching_names("human.pedestrian.adult", COCO)
+    assert matching_names("Cyclist", COCO) == {"person", "bicycle"}
+    assert matching_names("person", ("Pedestrian", "Car")) == {"pedestrian"}
+    assert matching_names("barrier", COCO) == frozenset()
     assert accepted_names("vehicle.truck", ("truck",)) == {"truck"}
 
 
@@ -428,7 +428,7 @@ def foreign() -> FrameResult:
 def recorded(path: Path, result: FrameResult) -> Recording:
     scene = SyntheticSource(frames=1).scene
     with open_recording(scene, result.config, save=path) as sinks:
-        logger = Logger(sinks.recording, result.config, scene)
+        logger = FrameLogger(sinks.recording, result.config, scene)
         logger.log_static()
         logger.log(result)
     return Recording(path)
@@ -536,7 +536,7 @@ def test_why_tells_what_the_method_lost_and_the_fusion_has() -> None:
     result = without_truth(foreign())
     assert result.opinions is not None
     fused = result.opinions.fused
-    questioner = Questioner(result, classes=KNOWN)
+    questioner = FrameExplainer(result, classes=KNOWN)
     for j in np.flatnonzero(result.opinions.missed).tolist():
         [answer] = questioner.ask(Selection(detection=int(fused.detection[j]), camera=fused.camera[j]))
         assert answer.verdict.reason is Reason.NOT_AMONG and not answer.folded
@@ -553,7 +553,7 @@ def test_why_tells_what_the_method_lost_and_the_fusion_has() -> None:
 
 def test_why_tells_what_a_camera_denies() -> None:
     result = without_truth(foreign())
-    questioner = Questioner(result, classes=KNOWN)
+    questioner = FrameExplainer(result, classes=KNOWN)
     [denied] = [a for a in questioner.ask(Selection()) if a.verdict.reason is Reason.CONTRADICTED]
     assert (denied.subject.kind, denied.subject.row) == ("object", 1) and denied.verdict.reported
     assert "was reported, but it is contradicted by " in denied.verdict.text
@@ -579,18 +579,18 @@ def test_the_list_has_what_is_in_doubt() -> None:
     """Without the truth, which speaks for itself; each asks about what it is."""
     result = without_truth(foreign())
     assert result.opinions is not None and result.objects is not None
-    found = finds(result, None)
+    found = find_findings(result, None)
     [denied] = [find for find in found if find.what == "contradicted"]
     assert (denied.name, denied.pick) == ("car", Pick("object", 1)) and abs(denied.distance - 12) < 0.1
     lost = [find.pick for find in found if find.what == "lost"]
     fused, missed = result.opinions.fused, result.opinions.missed
     near = missed & (np.hypot(*fused.boxes.center[:, :2].T) <= 40)
     assert lost and len(lost) == near.sum()
-    questioner = Questioner(result, classes=KNOWN)
+    questioner = FrameExplainer(result, classes=KNOWN)
     for asked in lost:
-        [answer] = questioner.ask(selection(asked))
+        [answer] = questioner.ask(selection_of(asked))
         assert "our fusion has it" in answer.verdict.text
-    assert not [find for find in finds(ours(), None) if find.what in ("contradicted", "lost")]
+    assert not [find for find in find_findings(ours(), None) if find.what in ("contradicted", "lost")]
 
 
 def test_what_other_limits_do_is_counted() -> None:
@@ -600,15 +600,15 @@ def test_what_other_limits_do_is_counted() -> None:
     config = load(settings=["opinions.min_height=500"], base=result.config)
     _, found = held(ours(), result.objects.boxes, result.objects.names, config=config.opinions)
     lenient = replace(result, opinions=found, config=config)
-    told = attempt(result, lenient, None)
+    told = trial_effects(result, lenient, None)
     assert told["opinions"] == {"contradicted": [1, 0], "unseen": [0, 1]}
     assert told["changes"] == {"opinions.min_height": "25.0 -> 500.0"}
-    assert attempt(ours(), result, None)["opinions"]["contradicted"] == [None, 1]
-    outcome = Outcome()
+    assert trial_effects(ours(), result, None)["opinions"]["contradicted"] == [None, 1]
+    outcome = SweepOutcome()
     for one in (result, lenient):
         outcome.add(one, None)
     assert (outcome.metrics["contradicted"], outcome.metrics["confirmed"]) == (0.5, 1.0)
-    mine = Outcome()
+    mine = SweepOutcome()
     mine.add(ours(), None)
     assert "contradicted" not in mine.metrics
     [height] = [one for one in controls(config) if one["key"] == "opinions.min_height"]
@@ -624,7 +624,9 @@ def test_a_stage_that_is_somebody_elses_brings_its_own_controls(
     (tmp_path / "boxes_of.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     opened = load(settings=["clustering.eps=0.7"])
-    tried = revised(opened, ["objects.method=boxes_of:detect", "objects.cell=3", "clustering.eps=0.4"], USER)
+    tried = changed_config(
+        opened, ["objects.method=boxes_of:detect", "objects.cell=3", "clustering.eps=0.4"], USER
+    )
     found = {one["key"]: one["value"] for one in controls(tried, opened)}
     before = {one["key"]: one["value"] for one in controls(opened)}
     assert found == {**before, "objects.params.cell": 1.0, "objects.params.axes": [1, 2]}
@@ -637,7 +639,7 @@ def test_a_network_file_is_somebody_elses() -> None:
     config = load()
     theirs = config.objects.model_copy(update={"method": "/models/pillars.onnx"})
     config = config.model_copy(update={"objects": theirs})
-    assert not origin(config, "objects").ours and origin(config, "objects").name == "pillars.onnx"
+    assert not owner_of(config, "objects").ours and owner_of(config, "objects").name == "pillars.onnx"
     result = replace(foreign(), config=config)
     assert result.objects is not None and result.opinions is not None
     said = [e.text for e in texts(result, result.objects, result.opinions) if e.state == "missed"]

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from bevviz.config import Config, dump, load, object_network
-from bevviz.config.descriptions import explain
+from bevviz.config import Config, config_yaml, load, object_network_params
+from bevviz.config.descriptions import describe_parameters
 from bevviz.config.pillars import Feature, PillarParams
 from bevviz.errors import UserError
 from bevviz.model import geometry
@@ -28,7 +28,7 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.pillars.group import Pillars, group, scatter
-from bevviz.stages.pillars.heads import decoded, places
+from bevviz.stages.pillars.heads import anchor_boxes, decode_boxes
 from bevviz.stages.pillars.nms import survivors
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.controls import controls
@@ -168,7 +168,7 @@ def test_features_of_pillars_are_laid_out_with_x_fastest() -> None:
 @given(st.integers(0, 999))
 @settings(max_examples=20, deadline=None)
 def test_a_box_that_is_stated_about_an_anchor_is_found_again(seed: int) -> None:
-    anchors = places((4, 6), params_of(Reference("openpcdet_anchors")))
+    anchors = anchor_boxes((4, 6), params_of(Reference("openpcdet_anchors")))
     draw = np.random.default_rng(seed)
     wanted = anchors + draw.uniform(-0.3, 0.3, anchors.shape)
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
@@ -176,7 +176,7 @@ def test_a_box_that_is_stated_about_an_anchor_is_found_again(seed: int) -> None:
     deltas[:, :2] /= diagonal[:, None]
     deltas[:, 2] /= anchors[:, 5]
     deltas[:, 3:6] = np.log(wanted[:, 3:6] / anchors[:, 3:6])
-    np.testing.assert_allclose(decoded(deltas, anchors), wanted, atol=1e-9)
+    np.testing.assert_allclose(decode_boxes(deltas, anchors), wanted, atol=1e-9)
 
 
 @given(st.integers(0, 999))
@@ -291,13 +291,13 @@ def test_two_files_of_autoware(tmp_path: Path) -> None:
 def test_the_parameters_are_a_part_of_the_section(tmp_path: Path) -> None:
     reference = Reference("openpcdet_anchors")
     config = load(settings=reference.settings(tmp_path / "net.onnx"))
-    params = object_network(config)
+    params = object_network_params(config)
     assert params == params_of(reference)
-    (tmp_path / "config.yaml").write_text(dump(config))
-    assert object_network(load(tmp_path / "config.yaml")) == params
+    (tmp_path / "config.yaml").write_text(config_yaml(config))
+    assert object_network_params(load(tmp_path / "config.yaml")) == params
     other = load(base=config, settings=["objects.method=other.onnx", "objects.nms_iou=0.5"])
-    assert object_network(other) == params_of(reference, nms_iou=0.5)
-    assert object_network(load()) is None
+    assert object_network_params(other) == params_of(reference, nms_iou=0.5)
+    assert object_network_params(load()) is None
 
 
 def test_the_page_and_the_command_explain_its_parameters() -> None:
@@ -307,7 +307,7 @@ def test_the_page_and_the_command_explain_its_parameters() -> None:
     assert (slider["kind"], slider["low"], slider["high"], slider["value"]) == ("number", 0, 1, 0.1)
     assert shown["objects.params.nms"]["choices"] == ["all", "group", "class"]
     assert shown["objects.params.point_range"]["kind"] == "text"
-    text = explain("objects.params.nms_iou", config)
+    text = describe_parameters("objects.params.nms_iou", config)
     assert "at least 0, at most 1" in text and "'objects: {params: {nms_iou: VALUE}}'" in text
 
 
@@ -318,9 +318,9 @@ def test_the_configurations_in_the_docs_are_valid(tmp_path: Path) -> None:
     (tmp_path / "kitti.yaml").write_text(first)
     (tmp_path / "changes.yaml").write_text(f"objects:\n  params:\n{changes}")
     (tmp_path / "autoware.yaml").write_text(second)
-    kitti = object_network(load([tmp_path / "kitti.yaml", tmp_path / "changes.yaml"]))
+    kitti = object_network_params(load([tmp_path / "kitti.yaml", tmp_path / "changes.yaml"]))
     assert kitti is not None and kitti.grid == (432, 496) and kitti.labels == "each"
-    autoware = object_network(load(tmp_path / "autoware.yaml"))
+    autoware = object_network_params(load(tmp_path / "autoware.yaml"))
     assert autoware is not None and autoware.grid == (480, 480)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.config import load, stated_lines
-from bevviz.config.project import layers
+from bevviz.config.project import read_project_layers
 from bevviz.errors import UserError
 from tests import bags
 from tests.recordings import Recording
@@ -40,7 +40,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_it_is_found_above_and_files_are_named_from_it() -> None:
-    config = load(layers=layers(Path.cwd(), {}))
+    config = load(layers=read_project_layers(Path.cwd(), {}))
     assert config.detector.model == "../../nets/yolo.onnx"
     assert config.preset == "reference"
     assert config.source.lidar_topics == ("/points",)
@@ -49,7 +49,7 @@ def test_it_is_found_above_and_files_are_named_from_it() -> None:
 
 def test_the_nearest_one_is_taken(project: Path) -> None:
     (project.parent / "runs" / "bevviz.toml").write_text("[clustering]\neps = 0.8\n")
-    config = load(layers=layers(Path.cwd(), {}))
+    config = load(layers=read_project_layers(Path.cwd(), {}))
     assert (config.clustering.eps, config.detector.model, config.preset) == (0.8, "", "default")
 
 
@@ -57,8 +57,8 @@ def test_the_nearest_one_is_taken(project: Path) -> None:
 def test_what_is_no_file_is_named_as_it_is(project: Path, model: str) -> None:
     project.write_text(f'model = "{model}"\n')
     if "mine" not in model:  # which is code, and asks for trust
-        assert load(layers=layers(Path.cwd(), {})).detector.model == model
-    (layer,) = layers(Path.cwd(), {})
+        assert load(layers=read_project_layers(Path.cwd(), {})).detector.model == model
+    (layer,) = read_project_layers(Path.cwd(), {})
     assert layer.values.get("detector.model", "") == model
 
 
@@ -79,7 +79,7 @@ def test_who_wins(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["config", "clustering.eps", "--config", "mine.yaml"]) == 0
     said = capsys.readouterr().out
     assert "clustering.eps = 0.7" in said and "stated by  mine.yaml" in said
-    assert load("mine.yaml", layers=layers(Path.cwd())).preset == "default"
+    assert load("mine.yaml", layers=read_project_layers(Path.cwd())).preset == "default"
 
 
 @pytest.mark.parametrize(
@@ -105,11 +105,11 @@ def test_a_wrong_project_is_one_clear_line(project: Path, capsys: Capture, text:
 def test_a_file_that_it_names_and_that_is_not_there(project: Path) -> None:
     project.write_text('config = ["robot.yaml", "absent.yaml"]')
     with pytest.raises(UserError, match=r"\.\./\.\./absent\.yaml: cannot read"):
-        layers(Path.cwd(), {})
+        read_project_layers(Path.cwd(), {})
 
 
 def test_where_values_come_from_is_said_and_is_no_difference(project: Path) -> None:
-    config = load(settings=["fusion.min_iou=0.2"], layers=layers(Path.cwd(), {}))
+    config = load(settings=["fusion.min_iou=0.2"], layers=read_project_layers(Path.cwd(), {}))
     assert stated_lines(config, folders=False) == [
         "bevviz.toml: clustering.eps, voxel.size, source.lidar_topics, preset, detector.model",
         "robot.yaml: clustering.min_points",
@@ -158,9 +158,9 @@ def test_one_parameter_is_explained(capsys: Capture, project: Path) -> None:
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_every_parameter_can_be_explained(preset: str, project: Path, capsys: Capture) -> None:
     from bevviz.config import keys
-    from bevviz.config.descriptions import explain
+    from bevviz.config.descriptions import describe_parameters
 
     config = load(preset=preset)  # type: ignore[arg-type]
     for key in keys():
-        text = explain(key, config)
+        text = describe_parameters(key, config)
         assert text.startswith(f"{key} = ") and "stated by" in text and "None" not in text, text

@@ -11,7 +11,7 @@ import pytest
 
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.pipeline.bag_info import network_of
+from bevviz.pipeline.bag_info import network_provider
 from bevviz.stages.detector import DEMO_MODEL, providers
 from bevviz.support import progress
 
@@ -26,8 +26,8 @@ def gpu_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(ort, "__file__", str(folder / "__init__.py"))
     names = ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr(ort, "get_available_providers", lambda: names)
-    providers.obstacle.cache_clear()
-    providers.tell.cache_clear()
+    providers.why_unavailable.cache_clear()
+    providers.say_once.cache_clear()
     return folder
 
 
@@ -56,7 +56,7 @@ def test_a_missing_library_is_told_once_and_the_processor_takes_over(
         "the network runs on CPU: CUDA is installed, but libcublasLt.so.13 is missing "
         "(pip install 'onnxruntime-gpu[cuda,cudnn]', and NVIDIA's driver)"
     ]
-    assert "CPU; CUDA is installed, but libcublasLt.so.13 is missing" in network_of(
+    assert "CPU; CUDA is installed, but libcublasLt.so.13 is missing" in network_provider(
         load(settings=["detector.model=demo"])
     )
     assert capfd.readouterr().out == "", "nothing of onnxruntime's own"
@@ -86,5 +86,5 @@ def test_a_gpu_that_does_not_start(gpu_package: Path, monkeypatch: pytest.Monkey
 
 
 def test_without_a_detector_nothing_is_said() -> None:
-    assert network_of(load()) == ""
-    assert network_of(load(settings=["detector.model=nowhere.onnx"]))
+    assert network_provider(load()) == ""
+    assert network_provider(load(settings=["detector.model=nowhere.onnx"]))

@@ -17,9 +17,9 @@ from bevviz.cli import main
 from bevviz.config import load, object_files
 from bevviz.errors import UserError
 from bevviz.messages.roles import find_roles
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import open_recording
-from bevviz.recording.source_lookup import fingerprint, follow, read
+from bevviz.recording.source_lookup import find_source, fingerprint, read_origin
 from bevviz.stages.detector import DEMO_MODEL
 
 EPS = 0.437
@@ -61,7 +61,7 @@ def gone(made: Path) -> Iterator[Callable[[str], None]]:
 
 
 def test_it_holds_where_it_came_from(made: Path) -> None:
-    how, origin = read(made / "run.rrd")
+    how, origin = read_origin(made / "run.rrd")
     assert f"eps: {EPS}" in how
     assert origin is not None
     (bag,) = origin.bag
@@ -72,14 +72,14 @@ def test_it_holds_where_it_came_from(made: Path) -> None:
 
 
 def test_beside_it_comes_first_then_the_stored_path(folder: Path, made: Path) -> None:
-    assert follow(folder / "run.rrd").paths == (folder / "demo.mcap",)
+    assert find_source(folder / "run.rrd").paths == (folder / "demo.mcap",)
     (folder / "demo.mcap").unlink()
-    assert follow(folder / "run.rrd").paths == (made / "demo.mcap",)
+    assert find_source(folder / "run.rrd").paths == (made / "demo.mcap",)
 
 
 def test_roles_and_configuration_are_those_of_the_recording(folder: Path) -> None:
     """The topics are stated one by one, and give the same roles again."""
-    recorded = follow(folder / "run.rrd")
+    recorded = find_source(folder / "run.rrd")
     config = recorded.load()
     assert config.clustering.eps == EPS
     assert config.detector.model == str(folder / "net.onnx")
@@ -90,7 +90,7 @@ def test_roles_and_configuration_are_those_of_the_recording(folder: Path) -> Non
 
 
 def test_options_say_otherwise(folder: Path) -> None:
-    recorded = follow(folder / "run.rrd")
+    recorded = find_source(folder / "run.rrd")
     assert recorded.load(settings=["clustering.eps=0.9"]).clustering.eps == 0.9
     assert recorded.load(preset="reference").clustering.eps == load(preset="reference").clustering.eps
     assert recorded.load(preset="reference").detector.model == str(folder / "net.onnx")
@@ -107,35 +107,35 @@ def test_what_is_not_found_is_said_with_every_place(
     gone("demo.mcap")
     (folder / "demo.mcap").unlink()
     with pytest.raises(UserError) as error:
-        follow(folder / "run.rrd")
+        find_source(folder / "run.rrd")
     for part in ("the bag demo.mcap", str(folder / "demo.mcap"), str(made / "demo.mcap"), "--bag PATH"):
         assert part in str(error.value)
     (folder / "demo.mcap").write_bytes(b"something else")
     with pytest.raises(UserError, match=r"demo\.mcap is another one \(size or content\)"):
-        follow(folder / "run.rrd")
+        find_source(folder / "run.rrd")
 
 
 def test_a_bag_that_is_given_is_taken(folder: Path) -> None:
     moved = (folder / "demo.mcap").rename(folder / "moved.mcap")
-    recorded = follow(folder / "run.rrd", [moved])
+    recorded = find_source(folder / "run.rrd", [moved])
     assert (recorded.paths, recorded.warnings) == ((moved,), ())
     shutil.copyfile(moved, folder / "other.mcap")
     with (folder / "other.mcap").open("r+b") as file:
         file.write(b"changed")
     assert (
         "is not what run.rrd was made from, demo.mcap"
-        in follow(folder / "run.rrd", [folder / "other.mcap"]).warnings[0]
+        in find_source(folder / "run.rrd", [folder / "other.mcap"]).warnings[0]
     )
     with pytest.raises(UserError, match=r"--bag .*nowhere"):
-        follow(folder / "run.rrd", [folder / "nowhere.mcap"])
+        find_source(folder / "run.rrd", [folder / "nowhere.mcap"])
 
 
 def test_a_detector_that_is_gone_is_asked_for(folder: Path, gone: Callable[[str], None]) -> None:
     gone("net.onnx")
     (folder / "net.onnx").unlink()
     with pytest.raises(UserError, match=r"net\.onnx; there is none at .*: give --model FILE"):
-        follow(folder / "run.rrd")
-    assert follow(folder / "run.rrd", settings=["detector.model=demo"]).load().clustering.eps == EPS
+        find_source(folder / "run.rrd")
+    assert find_source(folder / "run.rrd", settings=["detector.model=demo"]).load().clustering.eps == EPS
 
 
 def test_what_stands_for_no_bag_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,12 +207,12 @@ def test_a_report_stands_for_the_bag_that_comes_with_it(
     report = away / "bug.rrd"
     given = ["--at", "0.1", "--before", "0", "--after", "0", "--include-model"]
     assert main(["report", str(folder / "run.rrd"), *given, "-o", str(report)]) == 0
-    _, origin = read(report)
+    _, origin = read_origin(report)
     assert origin is not None
     for place in (*origin.bag, *origin.files.values()):
         assert (place.beside, place.path) == (place.name, "")
     assert str(folder).encode() not in report.read_bytes()
-    recorded = follow(report)
+    recorded = find_source(report)
     assert recorded.paths == (away / "bug.mcap",)
     assert recorded.load().detector.model == str(away / "net.onnx")
     capsys.readouterr()
@@ -228,7 +228,7 @@ def test_a_redacted_report_tells_no_more_and_says_what_it_is(folder: Path) -> No
     assert str(folder).encode() not in content
     _, mark = fingerprint(folder / "demo.mcap")
     assert mark.encode() not in content, "the whole images' bag is not to be known again"
-    assert "are redacted" in follow(report).warnings[0]
+    assert "are redacted" in find_source(report).warnings[0]
 
 
 def test_code_that_a_recording_names_is_not_run_unasked(
@@ -282,11 +282,11 @@ def test_the_files_of_a_3d_detector_are_found_again(folder: Path, made: Path) ->
     with BagSource([folder / "demo.mcap"], config) as source:
         rrd = folder / "objects.rrd"
         with open_recording(source.scene, config, save=rrd) as sinks:
-            Logger(sinks.recording, config, source.scene).log_static()
+            FrameLogger(sinks.recording, config, source.scene).log_static()
     away = folder.with_name("moved")
     folder.rename(away)
 
-    recorded = follow(away / "objects.rrd")
+    recorded = find_source(away / "objects.rrd")
     found = recorded.load()
     assert object_files(found) == {key: str(away / name) for key, name in names.items()}
     assert found.objects.params["classes"] == ["Car"]
@@ -295,9 +295,9 @@ def test_the_files_of_a_3d_detector_are_found_again(folder: Path, made: Path) ->
     (away / "head.onnx").unlink()
     lost = r"made with objects\.method head\.onnx; there is none at .*: give --set objects\.method=FILE"
     with pytest.raises(UserError, match=lost):
-        follow(away / "objects.rrd")
+        find_source(away / "objects.rrd")
     for other, files in (("frustum", {}), (str(away / "demo.onnx"), {"encoder": str(away / "encoder.onnx")})):
         settings = [f"objects.method={other}"]
-        there = follow(away / "objects.rrd", settings=settings).load(settings=settings)
+        there = find_source(away / "objects.rrd", settings=settings).load(settings=settings)
         assert there.objects.method == other
         assert {k: v for k, v in there.objects.params.items() if k == "encoder"} == files

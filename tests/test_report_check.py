@@ -17,7 +17,7 @@ import pytest
 import rerun as rr
 
 from bevviz.cli import main
-from bevviz.config import Config, dump
+from bevviz.config import Config, config_yaml
 from bevviz.recording import entities, rerun_cli
 from tests import bags
 from tests.recordings import Recording
@@ -108,7 +108,7 @@ def damage_that_breaks_the_reader(recording: Path) -> None:
         changed = bytearray(sound)
         changed[found.end() - 1] ^= 2
         recording.write_bytes(changed)
-        verify = [rerun_cli.program(), "rrd", "verify", str(recording)]
+        verify = [rerun_cli.rerun_program(), "rrd", "verify", str(recording)]
         if subprocess.run(verify, capture_output=True, check=False).returncode > 100:
             return
     pytest.fail("nothing breaks the reader: is there need of bevviz.recording.decoding.check_decodes?")
@@ -142,25 +142,25 @@ FORGED: dict[str, tuple[Callable[[Path], object], str]] = {
         "clustering.min_points must be a finite number",
     ),
     "YAML that is none": (lambda made: forge(json.dumps(about(made)), "a: ]["), "bug.rrd"),
-    "deep JSON": (lambda made: forge("[" * 100_000, dump(Config())), "another version"),
+    "deep JSON": (lambda made: forge("[" * 100_000, config_yaml(Config())), "another version"),
     "a time that is infinite": (
-        lambda made: forge(json.dumps({**about(made), "low": float("inf")}), dump(Config())),
+        lambda made: forge(json.dumps({**about(made), "low": float("inf")}), config_yaml(Config())),
         "another version",
     ),
     "names that are no text": (
-        lambda made: forge(json.dumps({**about(made), "names": [1]}), dump(Config())),
+        lambda made: forge(json.dumps({**about(made), "names": [1]}), config_yaml(Config())),
         "another version",
     ),
     "versions that are none": (
-        lambda made: forge(json.dumps({**about(made), "provenance": 5}), dump(Config())),
+        lambda made: forge(json.dumps({**about(made), "provenance": 5}), config_yaml(Config())),
         "another version",
     ),
     "fingerprints that are no archive": (
-        lambda made: forge(json.dumps(about(made)), dump(Config()), ["00 cloud"], ZIP),
+        lambda made: forge(json.dumps(about(made)), config_yaml(Config()), ["00 cloud"], ZIP),
         "cannot be read as a report",
     ),
     "fingerprints that are numbers": (
-        lambda made: forge(json.dumps(about(made)), dump(Config()), [1, 2], np.zeros(3, np.uint8)),
+        lambda made: forge(json.dumps(about(made)), config_yaml(Config()), [1, 2], np.zeros(3, np.uint8)),
         "cannot be read as a report",
     ),
     "no bag": (lambda made: Path("bug.mcap").unlink(), "bug.mcap: the bag of the report is not there"),
@@ -203,7 +203,7 @@ def test_one_clear_line(name: str, made: Path, capsys: Capture) -> None:
 
 def test_no_frames_are_no_proof(made: Path, capsys: Capture) -> None:
     info = about(made)
-    forge(json.dumps({**info, "interrupted": True}), dump(Config()))
+    forge(json.dumps({**info, "interrupted": True}), config_yaml(Config()))
     assert main(["report", "--check", "bug.rrd"]) == 1
     assert "the same" not in capsys.readouterr().out
 

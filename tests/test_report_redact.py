@@ -21,9 +21,9 @@ from bevviz.config import DetectorConfig
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.model.frame import F32, U8
-from bevviz.report.image_fields import Contents
+from bevviz.report.image_fields import ImageFinder
 from bevviz.report.pictures import shrink
-from bevviz.report.redact import CELLS, Redactor, _encoded, grown, hide
+from bevviz.report.redact import CELLS, Redactor, _encoded, grow_boxes, hide_boxes
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.synthetic import SyntheticSource
 from tests import bags, videos
@@ -357,7 +357,7 @@ def test_an_image_of_the_synthetic_drive_is_hidden(crowded: Path, tmp_path: Path
             images.append(decode_image(bag.decode(first), first.topic, 0).bgr)
         redactor = Redactor(DetectorConfig(model="demo"), old)
     changed = (images[0] != images[1]).any(axis=2)
-    places = grown(redactor.find(images[0]), images[0].shape[1], images[0].shape[0])
+    places = grow_boxes(redactor.find(images[0]), images[0].shape[1], images[0].shape[0])
     assert places and changed.any()
     for left, top, right, bottom in places:
         changed[top:bottom, left:right] = False
@@ -385,7 +385,7 @@ def test_what_is_asked_for_is_kept_and_said(crowded: Path, tmp_path: Path, capsy
 def test_definitions_that_lead_nowhere(text: str, reason: str) -> None:
     types = get_types_from_msg(text, "robot_msgs/msg/Loop")
     with pytest.raises(MessageError, match=reason):
-        Contents("robot_msgs/msg/Loop", types)
+        ImageFinder("robot_msgs/msg/Loop", types)
 
 
 def test_no_older_report_is_left_when_redaction_ends_early(
@@ -423,8 +423,8 @@ def test_a_box_becomes_a_few_flat_cells_and_nothing_else_changes(
 ) -> None:
     image: U8 = np.random.default_rng(seed).integers(0, 256, (90, 120, 3), np.uint8)
     box: F32 = np.array([[x, y, x + width, y + height]], np.float32)
-    hidden = hide(image, box)
-    places = grown(box, 120, 90)
+    hidden = hide_boxes(image, box)
+    places = grow_boxes(box, 120, 90)
     if not places:
         np.testing.assert_array_equal(hidden, image)
         assert x + width < 0 or y + height < 0 or x > 119 or y > 89

@@ -20,15 +20,15 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline.session import Session
 from bevviz.report.bag_window import (
-    Cut,
+    CutContent,
     Edit,
     Edited,
-    Window,
-    as_it_is,
+    ReportWindow,
     choose_topics,
-    cut,
+    cut_bag,
     find_window,
     open_window,
+    unchanged,
 )
 from bevviz.report.fingerprints import StageDigest, compare, digest
 from bevviz.synthetic.bag import _qos
@@ -44,12 +44,12 @@ def cut_out(
     at: str = "4",
     before: float = 0.5,
     topics: list[str] | None = None,
-    edit: Edit = as_it_is,
-) -> tuple[Window, Cut]:
+    edit: Edit = unchanged,
+) -> tuple[ReportWindow, CutContent]:
     with BagSource([path], CONFIG, at=at) as source:
         window = find_window(source, source.span[0], before, before)
         chosen = choose_topics(source.recording, source.roles, topics)
-        return window, cut(source.recording, window, chosen, source.roles.tf_static, target, edit)
+        return window, cut_bag(source.recording, window, chosen, source.roles.tf_static, target, edit)
 
 
 def contents(path: Path, low: int = 0, high: int = 2**62) -> dict[str, list[tuple[int, bytes]]]:
@@ -60,7 +60,7 @@ def contents(path: Path, low: int = 0, high: int = 2**62) -> dict[str, list[tupl
     return dict(found)
 
 
-def digests(path: Path, config: Config, window: Window) -> list[tuple[StageDigest, ...]]:
+def digests(path: Path, config: Config, window: ReportWindow) -> list[tuple[StageDigest, ...]]:
     with open_window([path], config, window.low, window.high) as source:
         session = Session(config)
         return [digest(session.run(frame)) for frame in source]

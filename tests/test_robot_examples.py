@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bevviz.cli import _parser
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from tests.graphs import own_graph
 from tests.waiting import PATIENCE
 
@@ -31,12 +31,12 @@ def unit() -> configparser.ConfigParser:
     return parser
 
 
-def settings_of(arguments: list[str]) -> Settings:
+def settings_of(arguments: list[str]) -> ReloadableConfig:
     """What bevviz makes of a command line, the configuration being that of the example."""
     options = _parser()[0].parse_args(arguments)
     assert options.config == Path("/etc/bevviz/robot.yaml")
     given = [*options.set, f"live.nice={options.nice}"]
-    return Settings(
+    return ReloadableConfig(
         CONFIG, given if options.flight is None else [*given, f"live.flight_time={options.flight}"]
     )
 

@@ -17,7 +17,7 @@ import pytest
 import bevviz.pipeline.run
 from bevviz.model.frame import Scene
 from bevviz.model.protocols import Items, Observer
-from bevviz.pipeline.run import Dropping, RunEnd, overlapped, results, run
+from bevviz.pipeline.run import DropPolicy, RunEnd, iterate_results, map_ahead, run
 from tests.waiting import PATIENCE, until
 
 
@@ -241,7 +241,7 @@ def test_the_collector_is_left_as_it_was() -> None:
 
 
 def test_slow_work_takes_the_newest() -> None:
-    dropping, seen = Dropping(), Seen()
+    dropping, seen = DropPolicy(), Seen()
     numbers = Numbers(40, pause=0.01)
     end = run(numbers, Squares(pause=0.05), [seen], dropping=dropping)
     assert seen.seen == sorted(seen.seen)
@@ -251,7 +251,7 @@ def test_slow_work_takes_the_newest() -> None:
 
 
 def test_who_is_slow_beside_holds_nobody_up() -> None:
-    dropping, fast, slow = Dropping(), Seen(), Seen(pause=0.1, beside=2)
+    dropping, fast, slow = DropPolicy(), Seen(), Seen(pause=0.1, beside=2)
     run(Numbers(30, pause=0.01), Squares(), [slow, fast], dropping=dropping)
     assert len(fast.seen) == 30
     assert slow.seen == sorted(slow.seen)
@@ -262,12 +262,12 @@ def test_who_is_slow_beside_holds_nobody_up() -> None:
 
 def test_an_error_beside_ends_the_run() -> None:
     with pytest.raises(RuntimeError, match="full"):
-        run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, beside=1)], dropping=Dropping())
+        run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, beside=1)], dropping=DropPolicy())
 
 
-@pytest.mark.parametrize("dropping", [None, Dropping()], ids=["waited for", "dropping"])
+@pytest.mark.parametrize("dropping", [None, DropPolicy()], ids=["waited for", "dropping"])
 @pytest.mark.parametrize("fails_at", [-1, 2], ids=["whole", "failed"])
-def test_a_source_is_told_the_end_however_it_ended(dropping: Dropping | None, fails_at: int) -> None:
+def test_a_source_is_told_the_end_however_it_ended(dropping: DropPolicy | None, fails_at: int) -> None:
     source = Numbers(5)
     with suppress(RuntimeError):
         run(source, Squares(), [Seen(fails_at=fails_at)], dropping=dropping)
@@ -286,7 +286,7 @@ def test_a_source_that_waits_for_good_can_be_ended() -> None:
     stop = threading.Event()
     threading.Timer(0.3, stop.set).start()
     start = time.monotonic()
-    assert run(Silent(), Squares(), [Seen()], dropping=Dropping(), stop=stop).frames == 1
+    assert run(Silent(), Squares(), [Seen()], dropping=DropPolicy(), stop=stop).frames == 1
     assert time.monotonic() - start < 5
 
 
@@ -294,12 +294,12 @@ def test_a_source_that_waits_for_good_can_be_ended() -> None:
 
 
 def test_results_can_be_drawn() -> None:
-    assert list(results(Numbers(20), Squares())) == finished(20)
+    assert list(iterate_results(Numbers(20), Squares())) == finished(20)
 
 
 def test_closing_ends_the_threads_and_draws_no_more() -> None:
     numbers = Numbers(10_000)
-    drawn = results(numbers, Squares())
+    drawn = iterate_results(numbers, Squares())
     assert next(drawn) == 1
     drawn.close()
     assert numbers.drawn == 3
@@ -307,7 +307,7 @@ def test_closing_ends_the_threads_and_draws_no_more() -> None:
 
 
 def test_what_is_made_comes_in_order_from_another_thread() -> None:
-    made = list(overlapped(range(100), lambda i: (i * i, threading.get_ident()), 2))
+    made = list(map_ahead(range(100), lambda i: (i * i, threading.get_ident()), 2))
     assert [square for square, _ in made] == [i * i for i in range(100)]
     assert threading.get_ident() not in {thread for _, thread in made}
 
@@ -316,7 +316,7 @@ def test_what_is_made_comes_in_order_from_another_thread() -> None:
 def test_a_cut_source_gives_what_preceded_the_cut(depth: int) -> None:
     got = []
     with pytest.raises(ValueError, match="cut"):
-        for item in overlapped(Numbers(fails_at=2), str, depth):
+        for item in map_ahead(Numbers(fails_at=2), str, depth):
             got.append(item)  # noqa: PERF402
     assert got == ["0", "1"]
 
@@ -334,4 +334,4 @@ def test_the_work_goes_on_while_the_next_is_made() -> None:
         begun.set()
         return item
 
-    assert list(overlapped(items(), work, 2)) == [1, 2]
+    assert list(map_ahead(items(), work, 2)) == [1, 2]

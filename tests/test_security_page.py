@@ -16,10 +16,10 @@ import pytest
 
 import bevviz
 from bevviz.cli import importer, main
-from bevviz.config import load, plugins, revised
-from bevviz.config.project import layers, named_code
-from bevviz.config.reloading import Settings
-from bevviz.config.trust import allow
+from bevviz.config import changed_config, load, plugins
+from bevviz.config.project import named_code, read_project_layers
+from bevviz.config.reloading import ReloadableConfig
+from bevviz.config.trust import grant_trust
 from bevviz.errors import UserError
 from tests import bags
 
@@ -72,7 +72,7 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def _forget() -> None:
-    plugins.find.cache_clear()
+    plugins.load_plugin.cache_clear()
     sys.modules.pop("page_tools", None)
 
 
@@ -89,14 +89,14 @@ def _user(trusts: bool) -> None:
 def _project(trusts: bool) -> None:
     Path("bevviz.toml").write_text('[clustering]\nmethod = "page_tools:cells"\n')
     if trusts:
-        allow(named_code(Path("bevviz.toml")))
+        grant_trust(named_code(Path("bevviz.toml")))
     main(["info", "drive"])
 
 
 def _yaml(trusts: bool) -> None:
     Path("robot.yaml").write_text("clustering: {method: 'page_tools:cells'}\n")
     if trusts:
-        allow(named_code(Path("robot.yaml")))
+        grant_trust(named_code(Path("robot.yaml")))
     main(["config", "--config", "robot.yaml"])
 
 
@@ -121,25 +121,27 @@ def _bag(trusts: bool) -> None:
 
 def _viewer(trusts: bool) -> None:
     Path("bevviz.toml").write_text('[clustering]\nmethod = "page_tools:cells"\n')
-    allow(named_code(Path("bevviz.toml")))
+    grant_trust(named_code(Path("bevviz.toml")))
     (bag,) = Path("drive").glob("*.db3")
     assert importer.run([str(bag), "--application-id", bag.stem]) == 1
 
 
 def _ros(trusts: bool) -> None:
     with pytest.raises(UserError, match="may not run"):
-        Settings().take([FUNCTION])
+        ReloadableConfig().take([FUNCTION])
     assert not Path("ran").exists()
     if trusts:
-        Settings(settings=[FUNCTION]).take([FUNCTION])
+        ReloadableConfig(settings=[FUNCTION]).take([FUNCTION])
 
 
 def _page(trusts: bool) -> None:
     with pytest.raises(UserError, match="may not run"):
-        revised(load(), [FUNCTION])
+        changed_config(load(), [FUNCTION])
     assert not Path("ran").exists()
     if trusts:
-        assert revised(load(settings=[FUNCTION]), [FUNCTION, "clustering.eps=0.7"]).clustering.eps == 0.7
+        assert (
+            changed_config(load(settings=[FUNCTION]), [FUNCTION, "clustering.eps=0.7"]).clustering.eps == 0.7
+        )
 
 
 def _registered(trusts: bool) -> None:
@@ -147,7 +149,7 @@ def _registered(trusts: bool) -> None:
         patch.setattr(plugins, "registered", lambda: {"cells": "page_tools:cells"})
         patch.syspath_prepend(Path.cwd())
         Path("bevviz.toml").write_text('[clustering]\nmethod = "cells"\n')
-        assert load(layers=layers(Path.cwd(), {})).clustering.method == "cells"
+        assert load(layers=read_project_layers(Path.cwd(), {})).clustering.method == "cells"
 
 
 def _blueprint(trusts: bool) -> None:
@@ -209,7 +211,7 @@ def test_what_the_page_says_of_trust(folder: Path) -> None:
     assert kept.stat().st_mode & 0o777 == 0o700 and len(list(kept.iterdir())) == 1
     (folder / "page_tools.py").write_text(TOOLS + "# edited\n")
     with pytest.raises(UserError, match="has changed since you trusted it"):
-        load(layers=layers(folder, {}))
+        load(layers=read_project_layers(folder, {}))
 
 
 @pytest.mark.parametrize("function", ["pickle:loads", "os:system", "numpy:load"])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from bevviz.model.frame import F32
-from bevviz.recording.labels import NEAR, apart, named_from_above, named_in_space
+from bevviz.recording.labels import MAX_NAMES, choose_named, choose_named_in_3d, choose_named_in_bev
 from bevviz.recording.states import COLORS, StateLanes
 from bevviz.recording.writer import Writer
 
@@ -19,14 +19,14 @@ PLACES = arrays.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(3)), el
 @given(places=PLACES)
 def test_names_do_not_meet_and_the_nearest_has_one(places: F32) -> None:
     at, order = places[:, :2], places[:, 2]
-    named = apart(at, order, (4.0, 2.0))
-    assert named.sum() <= NEAR
+    named = choose_named(at, order, (4.0, 2.0))
+    assert named.sum() <= MAX_NAMES
     chosen = at[named]
     beside = np.abs(chosen[:, None] - chosen[None]) >= (4.0, 2.0)
     assert (beside.any(axis=2) | np.eye(len(chosen), dtype=bool)).all()
     if len(places):
         assert order[named].min() == order.min()
-    if named.sum() < NEAR:  # whoever has none would meet one
+    if named.sum() < MAX_NAMES:  # whoever has none would meet one
         for place in at[~named]:
             assert (np.abs(chosen - place) < (4.0, 2.0)).all(axis=1).any()
 
@@ -34,19 +34,19 @@ def test_names_do_not_meet_and_the_nearest_has_one(places: F32) -> None:
 def test_a_longer_name_has_more_room() -> None:
     at = np.array([[0, 0], [5, 0], [10, 0]], np.float32)
     order = np.arange(3, dtype=np.float32)
-    assert apart(at, order, (np.array([4.0, 4.0, 4.0]), 1.0)).all()
-    assert apart(at, order, (np.array([8.0, 4.0, 4.0]), 1.0)).tolist() == [True, False, True]
+    assert choose_named(at, order, (np.array([4.0, 4.0, 4.0]), 1.0)).all()
+    assert choose_named(at, order, (np.array([8.0, 4.0, 4.0]), 1.0)).tolist() == [True, False, True]
 
 
 def test_who_comes_first_is_named_before_the_nearest() -> None:
     places = np.array([[10, 0, 0], [10.5, 0.2, 0], [10, 9, 0]], np.float32)
-    assert named_in_space(places).tolist() == [True, False, True]
-    assert named_in_space(places, np.array([False, True, False])).tolist() == [False, True, True]
+    assert choose_named_in_3d(places).tolist() == [True, False, True]
+    assert choose_named_in_3d(places, np.array([False, True, False])).tolist() == [False, True, True]
 
 
 def test_from_above_a_name_is_wide_and_low() -> None:
     places = np.array([[5, 0], [5, 8], [10, 0]], np.float32)
-    assert named_from_above(places).tolist() == [True, False, True]
+    assert choose_named_in_bev(places).tolist() == [True, False, True]
 
 
 def test_a_lane_is_there_from_its_first_state_on() -> None:

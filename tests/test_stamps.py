@@ -13,7 +13,7 @@ import pytest
 import bevviz
 from bevviz import UserError
 from bevviz.datasets.folder import Folder
-from bevviz.datasets.stamps import sensors_of, told_by
+from bevviz.datasets.stamps import file_times, group_by_sensor
 from tests.test_folders import cloud
 
 START = 1_700_000_000_950_000_000
@@ -46,7 +46,7 @@ def date(stamp: int, form: str) -> str:
 )
 def test_stamps_as_programs_write_them(name: Callable[[int, int], str], off: int, precision: int) -> None:
     files = [Path(f"{name(i, stamp)}.pcd") for i, stamp in enumerate(STAMPS)]
-    told = told_by(sorted(files))
+    told = file_times(sorted(files))
     assert told and not told.frames
     there = STAMPS if precision else [SECOND // 10 * i for i in range(len(files))]
     off_by = [abs(told.values[file] + off - stamp) for file, stamp in zip(files, there, strict=True)]
@@ -71,8 +71,8 @@ def test_stamps_as_programs_write_them(name: Callable[[int, int], str], off: int
 @pytest.mark.parametrize("count", [5, 40])
 def test_numbers_of_frames_wherever_they_are(name: str, count: int) -> None:
     files = [Path(name.format(i=i) + ".pcd") for i in range(count)]
-    assert list(sensors_of(files)) == [""]
-    told = told_by(files)
+    assert list(group_by_sensor(files)) == [""]
+    told = file_times(files)
     assert told and told.frames
     assert [told.values[file] for file in files] == list(range(count))
 
@@ -90,7 +90,7 @@ def test_numbers_of_frames_wherever_they_are(name: str, count: int) -> None:
 def test_cameras_in_one_folder(name: str) -> None:
     pairs = [(frame, camera) for frame in range(30) for camera in range(2)]
     names = [name.format(frame=f, camera=c, stamp=STAMPS[f] + 777 * c) for f, c in pairs]
-    groups = sensors_of([Path(f"{name}.png") for name in names])
+    groups = group_by_sensor([Path(f"{name}.png") for name in names])
     assert [len(found) for found in groups.values()] == [30, 30]
     for camera, found in enumerate(groups.values()):
         assert all(f"cam{camera}" in file.stem for file in found)

@@ -16,13 +16,13 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.errors import UserError
-from bevviz.evaluate import Score, Truth, pair_in_order, truth_of
+from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import apply as move
 from bevviz.model.geometry import corners, project
 from bevviz.model.results import Objects
 from bevviz.sweep import Parameter, Sweep, combine, parse
-from bevviz.sweep.chart import HEIGHT, WIDTH, scale
+from bevviz.sweep.chart import HEIGHT, WIDTH, axis_scale
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests import bags
 from tests.recordings import Recording, verify
@@ -114,7 +114,7 @@ def truth(*rows: tuple[str, float, float, bool]) -> Truth:
 
 
 def test_planted_errors_are_counted() -> None:
-    score = Score()
+    score = ObjectScore()
     there = truth(
         ("car", 10, 0, True), ("Person", 5, 5, True), ("person", 30, 0, False), ("car", 20, 0, True)
     )
@@ -138,7 +138,7 @@ def test_planted_errors_are_counted() -> None:
 
 
 def test_nothing_found_and_nothing_there() -> None:
-    score = Score()
+    score = ObjectScore()
     score.add(objects(), truth())
     assert np.isnan([score.precision, score.recall, score.f1]).all()
     score.add(objects(), truth(("car", 5, 0, True)))
@@ -349,6 +349,6 @@ def test_wrong_calls(arguments: list[str], message: str, drive: str, capsys: Cap
 
 @given(st.floats(-1e6, 1e6), st.floats(0, 1e6))
 def test_axes_hold_every_number_with_few_ticks(low: float, span: float) -> None:
-    begin, end, step = scale(low, low + span)
+    begin, end, step = axis_scale(low, low + span)
     assert begin <= low + 1e-6 * step and low + span <= end + 1e-6 * step
     assert 1 <= round((end - begin) / step) <= 8

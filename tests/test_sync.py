@@ -646,7 +646,7 @@ def test_memory_is_bounded() -> None:
 
     def held() -> Iterator[int]:
         yield len(feed.sync._clouds) + len(feed.sync._done)
-        yield from (len(track) for track in feed.sync._tracks())
+        yield from (len(track) for _, track in feed.sync._buffers())
         yield from (len(edge.poses) for edge in feed.sync.tf._edges.values())
 
     frames = most = most_images = 0

@@ -17,14 +17,14 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.config import Config, Layer, dump, load, plugins, revised
-from bevviz.config.project import layers, named_code
-from bevviz.config.reloading import Settings
-from bevviz.config.trust import RECEIVED, allow, records
+from bevviz.config import Config, Layer, changed_config, config_yaml, load, plugins
+from bevviz.config.project import named_code, read_project_layers
+from bevviz.config.reloading import ReloadableConfig
+from bevviz.config.trust import RECEIVED, grant_trust, trust_records
 from bevviz.errors import UserError
 from bevviz.live.remote_requests import Orders
-from bevviz.recording.source_lookup import Origin, Recorded
-from bevviz.why.hints import changed
+from bevviz.recording.source_lookup import Origin, RecordingSource
+from bevviz.why.hints import with_changes
 from tests import bags
 
 Capture = pytest.CaptureFixture[str]
@@ -55,7 +55,7 @@ def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name in ("BEVVIZ_MODEL", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     yield folder
-    plugins.find.cache_clear()
+    plugins.load_plugin.cache_clear()
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, plugins._FolderFinder)]
     for name in [name for name in sys.modules if name.startswith(("drive_tools", "drive_parts"))]:
         del sys.modules[name]
@@ -119,7 +119,8 @@ def test_a_recording_does_not_run_the_pickle_in_its_bag(
         if through == "yaml":
             sly_yaml = 'model: "pickle:loads"'
             patch.setattr(
-                "bevviz.recording.properties.dump", lambda config: dump(config).replace('model: ""', sly_yaml)
+                "bevviz.recording.properties.config_yaml",
+                lambda config: config_yaml(config).replace('model: ""', sly_yaml),
             )
         assert main(["bag", "bug.mcap", "--save", "bug.rrd"]) == 0
     for command in (["why", "bug.rrd", "--at", "0.1"], ["bag", "bug.rrd", "--save", "x.rrd"]):
@@ -161,7 +162,7 @@ def test_the_importer_runs_nothing_even_of_a_trusted_project(
 
     bags.write(received / "drive", bags.small_items(scans=3), form="sqlite3")
     (bag,) = (received / "drive").glob("*.db3")
-    allow(named_code(write_project(received)))
+    grant_trust(named_code(write_project(received)))
     status = run([str(bag), "--application-id", bag.stem])
     assert not has_run(received)
     assert status == 1 and "Rerun's viewer runs none" in capfd.readouterr().err
@@ -172,12 +173,12 @@ def test_root_trusts_no_project_of_another_user(received: Path, monkeypatch: pyt
     path = write_project(received)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     with pytest.raises(UserError, match="is not trusted"):
-        load(layers=layers(received, {}))
-    allow(named_code(path))
+        load(layers=read_project_layers(received, {}))
+    grant_trust(named_code(path))
     owner = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: owner + 1000)
     with pytest.raises(UserError, match="is not trusted"):
-        load(layers=layers(received, {}))
+        load(layers=read_project_layers(received, {}))
     assert not has_run(received)
 
 
@@ -229,7 +230,7 @@ def test_trust_is_listed_and_revoked(received: Path, capsys: Capture) -> None:
     assert main(["trust", "--list"]) == 0
     assert "changed since" in capsys.readouterr().out
     assert main(["trust", "--revoke"]) == 0
-    assert not list(records())
+    assert not list(trust_records())
     assert "is not trusted" in error_of(capsys, "config")
     assert "is not trusted" in error_of(capsys, "trust", "--revoke")
 
@@ -263,7 +264,7 @@ def test_a_file_without_functions_needs_no_trust(received: Path, capsys: Capture
     assert main(["config", "clustering.eps"]) == 0
     assert main(["trust"]) == 0
     assert "names no function" in capsys.readouterr().out
-    assert not list(records())
+    assert not list(trust_records())
 
 
 def test_a_registered_name_needs_no_trust(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,7 +275,7 @@ def test_a_registered_name_needs_no_trust(received: Path, monkeypatch: pytest.Mo
     monkeypatch.syspath_prepend(installed)
     monkeypatch.setattr(plugins, "registered", lambda: {"flat": "drive_tools:segment"})
     write_project(received, '[ground]\nmethod = "flat"\n')
-    assert load(layers=layers(received, {})).ground.method == "flat"
+    assert load(layers=read_project_layers(received, {})).ground.method == "flat"
     assert has_run(installed) and not has_run(received)
 
 
@@ -283,23 +284,23 @@ def test_a_registered_name_needs_no_trust(received: Path, monkeypatch: pytest.Mo
 
 def test_modules_of_a_trusted_file_lie_beside_it(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not in the working directory, though Python has that on its path; and the same in another process."""
-    allow(named_code(write_project(received)))
+    grant_trust(named_code(write_project(received)))
     below = received / "monday"
     below.mkdir()
     (below / "drive_tools.py").write_text(TOOLS)
     monkeypatch.chdir(below)
     monkeypatch.syspath_prepend(below)
-    config = load(layers=layers(below, {}))
+    config = load(layers=read_project_layers(below, {}))
     assert has_run(received) and not has_run(below)
     assert pickle.loads(pickle.dumps(config)).functions == {
         ("ground", "drive_tools:segment"): str(received.resolve())
     }
     (received / "drive_tools.py").unlink()
     sys.modules.pop("drive_tools")
-    plugins.find.cache_clear()
-    allow(named_code(received / "bevviz.toml"))
+    plugins.load_plugin.cache_clear()
+    grant_trust(named_code(received / "bevviz.toml"))
     with pytest.raises(UserError, match="there is no module 'drive_tools' in "):
-        load(layers=layers(below, {}))
+        load(layers=read_project_layers(below, {}))
     assert not has_run(below)
 
 
@@ -309,14 +310,14 @@ def test_modules_beside_a_trusted_file_come_first(received: Path, monkeypatch: p
     installed.mkdir()
     (installed / "drive_tools.py").write_text(TOOLS)
     monkeypatch.syspath_prepend(installed)
-    allow(named_code(write_project(received)))
-    load(layers=layers(received, {}))
+    grant_trust(named_code(write_project(received)))
+    load(layers=read_project_layers(received, {}))
     assert has_run(received) and not has_run(installed)
     del sys.modules["drive_tools"]
-    plugins.find.cache_clear()
+    plugins.load_plugin.cache_clear()
     __import__("drive_tools")
     with pytest.raises(UserError, match="another module 'drive_tools' is in use already, of "):
-        load(layers=layers(received, {}))
+        load(layers=read_project_layers(received, {}))
 
 
 def test_compiled_files_beside_a_trusted_source_do_not_run(received: Path) -> None:
@@ -324,14 +325,14 @@ def test_compiled_files_beside_a_trusted_source_do_not_run(received: Path) -> No
     import importlib.util
     import marshal
 
-    allow(named_code(write_project(received)))
+    grant_trust(named_code(write_project(received)))
     source = received / "drive_tools.py"
     sly = compile("from pathlib import Path\nPath('compiled').touch()\ndef segment(points): ...", "x", "exec")
     cached = Path(importlib.util.cache_from_source(str(source)))
     cached.parent.mkdir()
     unchecked = importlib.util.MAGIC_NUMBER + (1).to_bytes(4, "little") + bytes(8)
     cached.write_bytes(unchecked + marshal.dumps(sly))
-    load(layers=layers(received, {}))
+    load(layers=read_project_layers(received, {}))
     assert has_run(received) and not (received / "compiled").exists()
 
 
@@ -381,7 +382,7 @@ def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rcl_interfaces", SimpleNamespace(msg=msg))
     monkeypatch.setitem(sys.modules, "rcl_interfaces.msg", msg)
     write_project(received, "")
-    settings, node = Settings(), Node()
+    settings, node = ReloadableConfig(), Node()
     Orders(node, settings.config, settings.take)
     told = node.on_set([Parameter("ground.method", "drive_tools:segment")])
     assert not told.successful
@@ -392,18 +393,18 @@ def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.M
 
 
 def test_a_page_names_no_function(received: Path) -> None:
-    """Every message of the workbench goes by ``revised``, or by the settings of a live run."""
+    """Every message of the workbench goes by ``changed_config``, or by the settings of a live run."""
     write_project(received, "")
     message = ["ground.method=drive_tools:segment"]
     with pytest.raises(UserError, match="start bevviz with --set ground"):
-        revised(load(), message)
+        changed_config(load(), message)
     with pytest.raises(UserError, match="start bevviz with --set ground"):
-        Settings().read(message)
+        ReloadableConfig().read(message)
     assert not has_run(received)
     opened = load(settings=["ground.method=drive_tools:segment"])
-    tried = revised(opened, ["ground.method=drive_tools:segment", "clustering.eps=0.7"])
+    tried = changed_config(opened, ["ground.method=drive_tools:segment", "clustering.eps=0.7"])
     assert (tried.ground.method, tried.clustering.eps) == ("drive_tools:segment", 0.7)
-    assert changed(tried, {"clustering.eps": 0.8}).functions == opened.functions
+    assert with_changes(tried, {"clustering.eps": 0.8}).functions == opened.functions
 
 
 def test_an_edited_file_goes_on_with_the_functions_in_force(received: Path) -> None:
@@ -411,8 +412,8 @@ def test_an_edited_file_goes_on_with_the_functions_in_force(received: Path) -> N
     write_project(received, "")
     file = Path("live.yaml")
     file.write_text("ground: {method: 'drive_tools:segment'}\n")
-    allow(named_code(file))
-    settings = Settings(file)
+    grant_trust(named_code(file))
+    settings = ReloadableConfig(file)
     file.write_text("ground: {method: 'drive_tools:segment'}\nclustering: {eps: 0.7}\n")
     assert settings.read().clustering.eps == 0.7
     file.write_text("ground: {method: 'drive_tools:cluster'}\n")
@@ -532,7 +533,7 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
 def test_a_recorded_detector_is_refused_with_a_preset_too(received: Path) -> None:
     """A file or a preset takes the configuration's place, but not the detector's."""
     write_project(received, "")
-    recorded = Recorded(received / "bug.rrd", (), (), (), "detector: {model: drive_tools:segment}\n")
+    recorded = RecordingSource(received / "bug.rrd", (), (), (), "detector: {model: drive_tools:segment}\n")
     with pytest.raises(UserError, match="add --set detector"):
         recorded.load(preset="reference")
     assert recorded.load(settings=["detector.model="], preset="reference").detector.model == ""

@@ -16,14 +16,14 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.compare.differences import Change
-from bevviz.config import dump, load
-from bevviz.config.reloading import Settings
+from bevviz.config import config_yaml, load
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.model.frame import Frame
-from bevviz.pipeline.run import Dropping, run
+from bevviz.pipeline.run import DropPolicy, run
 from bevviz.recording.sinks import open_recording
 from bevviz.stages import detector
-from bevviz.sweep.tune import OneFrame, Saves, Version, VersionRecorder, create
+from bevviz.sweep.tune import ConfigSaves, FrameTuner, Version, VersionRecorder, create_config_file
 from bevviz.synthetic import SyntheticSource
 from tests import bags
 from tests.recordings import Recording, verify
@@ -61,13 +61,13 @@ class Tuned:
         self._thread.join()
 
     def _run(self, path: Path) -> None:
-        settings, one = Settings(self.file, [MODEL]), OneFrame(frame())
-        saves = Saves(settings, source().scene, one.check, self.versions.put)
+        settings, one = ReloadableConfig(self.file, [MODEL]), FrameTuner(frame())
+        saves = ConfigSaves(settings, source().scene, one.check, self.versions.put)
         with open_recording(source().scene, settings.config, save=path, blueprint="tune") as sinks:
             recorder = VersionRecorder(
                 sinks.recording, settings.config, lambda version, seconds: self.versions.put(version)
             )
-            run(saves, one, [recorder], dropping=Dropping(), stop=self._stop)
+            run(saves, one, [recorder], dropping=DropPolicy(), stop=self._stop)
 
     def save(self, text: str) -> None:
         time.sleep(0.05)  # the file system's clock may be coarse
@@ -153,12 +153,12 @@ def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
 def test_a_file_is_made_once(tmp_path: Path) -> None:
     file = tmp_path / "my.yaml"
     config = load(settings=["clustering.eps=0.7"], preset="reference")
-    assert create(file, dump(config))
+    assert create_config_file(file, config_yaml(config))
     assert load(file) == config
-    assert not create(file, "")
+    assert not create_config_file(file, "")
     assert load(file) == config
     with pytest.raises(UserError, match="cannot write the file"):
-        create(tmp_path / "none" / "my.yaml", "")
+        create_config_file(tmp_path / "none" / "my.yaml", "")
 
 
 def test_as_a_user_runs_it(tmp_path: Path) -> None:

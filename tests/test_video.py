@@ -19,7 +19,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drivers.bitstream import Continuity, is_key
 from bevviz.model.frame import Frame, Image
-from bevviz.report.bag_window import choose_topics, cut, find_window, open_window
+from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window
 from bevviz.sync import video
 from tests import bags, videos
 from tests.networks import FLOAT, answer
@@ -263,7 +263,7 @@ def test_a_part_cut_out_has_the_video_that_its_first_pictures_need(tmp_path: Pat
     with BagSource([path], load()) as source:
         window = find_window(source, int(source.scans[50]), 0.1, 0.1)
         topics = choose_topics(source.recording, source.roles, None)
-        cut(source.recording, window, topics, source.roles.tf_static, target)
+        cut_bag(source.recording, window, topics, source.roles.tf_static, target)
     with open_window([target], load(), window.low, window.high) as source:
         assert numbers(list(source)) == [n % 31 for n in (49, 50, 51)]
 

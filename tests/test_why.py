@@ -20,10 +20,10 @@ from bevviz.model.frame import Boxes3D, LabelledBoxes3D
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.synthetic import BagWriter, SyntheticSource
-from bevviz.why import Answer, Questioner, Selection, why
-from bevviz.why.answer_text import summary
-from bevviz.why.frame_index import Fate, Traces
-from bevviz.why.subject import projected
+from bevviz.why import Answer, FrameExplainer, Selection, why
+from bevviz.why.answer_text import summary_line
+from bevviz.why.frame_index import Fate, FrameIndex
+from bevviz.why.subject import projected_box
 from bevviz.why.verdict import Reason
 from tests import bags, forms
 from tests.recordings import Recording
@@ -50,8 +50,8 @@ def of_truth(answers: list[Answer], row: int) -> Answer:
 def about(name: str, preset: str, row: int) -> Answer:
     """The answer about one object, with hints: asked for by its place in the image."""
     result = run(name, preset)
-    place = Traces(result).truth[row].box
-    box = projected(place, result.frame.cameras[0]) if place is not None else None
+    place = FrameIndex(result).truth[row].box
+    box = projected_box(place, result.frame.cameras[0]) if place is not None else None
     assert box is not None
     (answer,) = why(result, Selection(box=tuple(box.tolist())), CLASSES, hints=1)
     assert (answer.subject.kind, answer.subject.row) == ("truth", row)
@@ -222,7 +222,7 @@ def test_the_fates_add_up() -> None:
 
 def test_a_pixel_lists_all_that_lies_there_and_begins_with_what_it_shows() -> None:
     """A cyclist that is missed before a car: neither the pixel nor the box is answered for the car."""
-    shot, questioner = at("merged_people"), Questioner(run("merged_people", "default"), classes=CLASSES)
+    shot, questioner = at("merged_people"), FrameExplainer(run("merged_people", "default"), classes=CLASSES)
     asked_for = 0
     for row, number in enumerate(shot.truth_object.tolist()):
         ys, xs = np.nonzero(shot.pixel_object == number)
@@ -241,7 +241,7 @@ def test_a_pixel_lists_all_that_lies_there_and_begins_with_what_it_shows() -> No
 
 
 def test_an_empty_place_says_what_is_there() -> None:
-    questioner = Questioner(run("flat_car", "default"), classes=CLASSES)
+    questioner = FrameExplainer(run("flat_car", "default"), classes=CLASSES)
     (road,) = questioner.ask(Selection(point=(-5.0, 1.0, -1.9)))
     assert road.verdict.text.startswith("There is only ground at -5, 1, -1.9 m: ")
     assert "points, all ground, -0.0" in road.verdict.text
@@ -255,7 +255,7 @@ def test_an_empty_place_says_what_is_there() -> None:
 
 def test_a_cell_of_the_birds_eye_view_is_the_column_over_it() -> None:
     result = run("merged_people", "default")
-    questioner, clusters = Questioner(result, classes=CLASSES), result.clusters
+    questioner, clusters = FrameExplainer(result, classes=CLASSES), result.clusters
     assert clusters is not None and result.bev is not None
     for k in np.flatnonzero(clusters.kept)[:10].tolist():
         inside = result.frame.points[questioner.traces.cluster == k]
@@ -278,7 +278,7 @@ def test_a_track_is_its_cluster_or_the_place_where_it_is_expected() -> None:
         result = session.run(source.frame(index))
     tracks = result.tracks
     assert tracks is not None
-    questioner = Questioner(result, classes=CLASSES)
+    questioner = FrameExplainer(result, classes=CLASSES)
     seen = int(np.flatnonzero((tracks.cluster >= 0) & (tracks.object >= 0))[0])
     (answer,) = questioner.ask(Selection(track=int(tracks.id[seen])))
     assert answer.verdict.reported and answer.subject.label == tracks.names[seen]
@@ -290,12 +290,12 @@ def test_a_track_is_its_cluster_or_the_place_where_it_is_expected() -> None:
     with pytest.raises(UserError, match="there is no track 9999 in this frame; there are "):
         questioner.ask(Selection(track=9999))
     with pytest.raises(UserError, match="tracks are known in a run over the drive only"):
-        Questioner(session.alone(source.frame(6))).ask(Selection(track=1))
+        FrameExplainer(session.alone(source.frame(6))).ask(Selection(track=1))
 
 
 def test_a_row_is_what_the_result_has_there() -> None:
     result = run("merged_people", "default")
-    questioner = Questioner(result, classes=CLASSES)
+    questioner = FrameExplainer(result, classes=CLASSES)
     assert result.objects is not None and result.clusters is not None
     (thing,) = questioner.ask(Selection(object=0))
     assert thing.verdict.reported and thing.subject.label == result.objects.names[0]
@@ -314,7 +314,7 @@ def test_a_row_is_what_the_result_has_there() -> None:
 
 
 def test_the_nearest_missed_is_near_and_missed() -> None:
-    missed = Questioner(run("merged_people", "default"), classes=CLASSES).missed()
+    missed = FrameExplainer(run("merged_people", "default"), classes=CLASSES).missed()
     assert len(missed) >= 2
     assert not any(a.verdict.reported or a.folded for a in missed)
     assert all(a.distance <= 40 and a.points >= 10 for a in missed)
@@ -323,13 +323,13 @@ def test_the_nearest_missed_is_near_and_missed() -> None:
 
 def test_weak_detections_are_not_told_unasked_and_the_surest_comes_first() -> None:
     result = run("merged_people", "default")
-    blind = Questioner(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
+    blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
     told, everything = (blind.explain(Selection(), 0, everything=flag) for flag in (False, True))
     weak = [a for a in everything if a.weak]
     scores = [a.evidence.best.score for a in weak if a.evidence.best is not None]
     assert len(scores) == len(weak) > 20 and scores == sorted(scores, reverse=True)
     assert everything[-len(weak) :] == weak and not any(a.folded for a in told)
-    assert f"{len(weak)} weak detections (folded: --all)" in summary(blind.ask(Selection()))
+    assert f"{len(weak)} weak detections (folded: --all)" in summary_line(blind.ask(Selection()))
     for answer in everything:  # what is missed has a place, too: where the middle of its box has most points
         assert np.isfinite(answer.distance) or answer.points == 0
 
@@ -352,7 +352,7 @@ def test_without_a_model_or_an_image_the_detector_is_not_said_to_have_looked() -
         never = [a for a in answers if a.verdict.reason is Reason.NOT_RUN]
         assert len(never) >= 2 and all(what in a.verdict.text for a in never)
         assert not any(a.verdict.reported or "no candidate" in str(a.as_dict()) for a in answers)
-        assert "the detector never ran" in summary(answers)
+        assert "the detector never ran" in summary_line(answers)
         box = never[0].subject.box
         assert box is not None
         (there,) = why(result, Selection(point=tuple(box.center[0].tolist())), CLASSES)
@@ -372,7 +372,7 @@ def test_a_camera_without_a_place_compares_nothing() -> None:
 def test_what_is_too_weak_was_not_suppressed() -> None:
     """A rival is not to blame for what would have been dropped without it."""
     result = Session(config_of("default", "detector.conf_threshold=0.5")).run(at("merged_people").frame)
-    questioner, detections = Questioner(result, classes=CLASSES), result.cameras[0].detections
+    questioner, detections = FrameExplainer(result, classes=CLASSES), result.cameras[0].detections
     assert detections is not None
     suppressed = np.flatnonzero(detections.state == DetectionState.SUPPRESSED)
     weak = suppressed[detections.score[suppressed] < 0.5]

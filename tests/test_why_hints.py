@@ -10,8 +10,8 @@ import pytest
 
 from bevviz.config import load
 from bevviz.pipeline.session import Session
-from bevviz.why import Answer, Questioner, Selection
-from bevviz.why.hints import SURE, Hint, Search
+from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.hints import SURE, Hint, HintSearch
 from bevviz.why.verdict import Reason
 from tests.test_faults import at, run
 
@@ -19,8 +19,8 @@ CLASSES = ("car", "person", "cyclist")
 
 
 @cache
-def questioner(preset: str) -> Questioner:
-    return Questioner(run("flat_car", preset), classes=CLASSES)
+def questioner(preset: str) -> FrameExplainer:
+    return FrameExplainer(run("flat_car", preset), classes=CLASSES)
 
 
 @cache
@@ -42,7 +42,7 @@ def again(preset: str, answer: Answer) -> Answer:
     config = load(
         None, [model, *answer.hints[0].settings], "reference" if preset == "reference" else "default"
     )
-    after = Questioner(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    after = FrameExplainer(Session(config).run(at("flat_car").frame), classes=CLASSES)
     return after.ask(Selection(truth=answer.subject.row))[0]
 
 
@@ -98,25 +98,25 @@ def _as_hint(settings: tuple[str, ...]) -> Hint:
 @pytest.mark.parametrize(
     ("search", "said"),
     [
-        (Search((), 1), "; the change that was tried does not help."),
-        (Search((), 7), "; none of the 7 changes that were tried helps."),
+        (HintSearch((), 1), "; the change that was tried does not help."),
+        (HintSearch((), 7), "; none of the 7 changes that were tried helps."),
         (
-            Search((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), Reason.TAKEN),
+            HintSearch((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), Reason.TAKEN),
             "; none of the 7 changes that were tried helps:"
             " with clustering.eps=0.3, fusion.min_iou=0 it is lost as 'taken'.",
         ),
         (
-            Search((), 1, ("fusion.method=frustum",), Reason.SPLIT, True),
+            HintSearch((), 1, ("fusion.method=frustum",), Reason.SPLIT, True),
             "; the change that was tried does not help:"
             " with fusion.method=frustum it is reported, but 'split'.",
         ),
-        (Search((), 0), "."),
+        (HintSearch((), 0), "."),
     ],
 )
-def test_the_sentence(search: Search, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sentence(search: HintSearch, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = questioner("reference")
     answer = asked.missed()[0]
-    monkeypatch.setattr(Questioner, "search", lambda self, answer: search)
+    monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: search)
     assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
 
 
@@ -124,7 +124,7 @@ def test_the_sentence(search: Search, said: str, monkeypatch: pytest.MonkeyPatch
 def test_no_value_is_tried_that_nobody_may_set(eps: float) -> None:
     """Of parts whose distance is not known, too, and where a larger value is beyond the limit."""
     config = load(settings=["detector.model=demo", f"clustering.eps={eps}"])
-    asked = Questioner(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    asked = FrameExplainer(Session(config).run(at("flat_car").frame), classes=CLASSES)
     answer = next(a for a in asked.ask(Selection()) if a.subject.kind == "truth" and a.evidence.parts)
     odd = replace(answer, evidence=replace(answer.evidence, apart=float("nan")))
     split = replace(odd, verdict=replace(odd.verdict, reason=Reason.SPLIT))

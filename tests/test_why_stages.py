@@ -16,7 +16,7 @@ from bevviz.config import load, plugins
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.why import Answer, Questioner, Selection
+from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.verdict import Reason
 from tests.test_faults import at
 
@@ -57,7 +57,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "somebody.py").write_text(textwrap.dedent(MODULE))
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    plugins.find.cache_clear()
+    plugins.load_plugin.cache_clear()
     sys.modules.pop("somebody", None)
 
 
@@ -72,7 +72,7 @@ def ours() -> FrameResult:
 
 
 def ask(result: FrameResult, hints: bool = False) -> list[Answer]:
-    questioner = Questioner(result, classes=CLASSES)
+    questioner = FrameExplainer(result, classes=CLASSES)
     answers = [a for a in questioner.ask(Selection()) if a.subject.kind == "truth"]
     return [questioner.with_hints(a) for a in answers[:5]] if hints else answers
 
@@ -104,7 +104,7 @@ def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
     """Of ours only those that still have a say."""
     theirs = ("clustering.method=somebody:cells", "clustering.cell=0.3")
     result = Session(load(settings=["detector.model=demo", *theirs])).run(frame())
-    questioner = Questioner(result, classes=CLASSES)
+    questioner = FrameExplainer(result, classes=CLASSES)
     hints = [hint for answer in questioner.missed() for hint in questioner.search(answer).hints]
     keys = {setting.partition("=")[0] for hint in hints for setting in hint.settings}
     assert "clustering.params.cell" in keys

@@ -25,7 +25,7 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.config import revised
+from bevviz.config import changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
 from bevviz.model.frame import Frame
@@ -35,12 +35,12 @@ from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.why.pick import Pick, pick
-from bevviz.why.subject import one_of, projected
+from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.controls import controls
-from bevviz.workbench.findings import finds
-from bevviz.workbench.recording_buffer import Film
-from bevviz.workbench.session import Bench
-from bevviz.workbench.token import kept_token
+from bevviz.workbench.findings import find_findings
+from bevviz.workbench.recording_buffer import RecordingBuffer
+from bevviz.workbench.session import WorkbenchSession
+from bevviz.workbench.token import persistent_token
 from tests import waiting
 from tests.test_files import small_disk
 from tests.waiting import PATIENCE
@@ -218,8 +218,9 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     (camera,), boxes = result.frame.cameras, in_points_frame(result.frame, result.frame.truth)
     around = {
         str(find.pick): [float(p) for p in box]
-        for find in finds(result, truth_of(result.frame, result.frame.truth))
-        if find.what == "missed" and (box := projected(one_of(boxes, find.pick.row), camera)) is not None
+        for find in find_findings(result, truth_of(result.frame, result.frame.truth))
+        if find.what == "missed"
+        and (box := projected_box(single_box(boxes, find.pick.row), camera)) is not None
     }
     inside = [pick for pick, box in around.items() if box[0] > 20 and box[2] < 620]
     # The one whose left line is farthest from every other line.
@@ -646,22 +647,22 @@ def test_a_token_outlives_a_server_that_was_killed_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with kept_token(1, "drive") as first:
+    with persistent_token(1, "drive") as first:
         (kept,) = tmp_path.glob("bevviz/*")
         assert kept.stat().st_mode & 0o077 == 0
         left = kept.read_bytes()
     assert not kept.exists()
     kept.write_bytes(left)
-    with kept_token(1, "drive") as readable_by_others:
+    with persistent_token(1, "drive") as readable_by_others:
         assert readable_by_others != first
     kept.touch(mode=0o600)
     kept.chmod(0o600)
     kept.write_bytes(left)
-    with kept_token(1, "another drive") as other:
+    with persistent_token(1, "another drive") as other:
         assert other != first
     kept.touch(mode=0o600)
     kept.write_bytes(left)
-    with kept_token(1, "drive") as again:
+    with persistent_token(1, "drive") as again:
         assert again == first
 
 
@@ -734,7 +735,7 @@ def test_what_the_truth_misses_is_what_is_listed(result: FrameResult) -> None:
     assert frame.truth is not None
     assert result.objects is not None
     truth = truth_of(frame, frame.truth)
-    missed = {find.pick.row for find in finds(result, truth) if find.what == "missed"}
+    missed = {find.pick.row for find in find_findings(result, truth) if find.what == "missed"}
     assert missed
     for row, (label, must) in enumerate(zip(truth.labels, truth.must, strict=True)):
         near = [
@@ -749,8 +750,10 @@ def test_what_the_truth_misses_is_what_is_listed(result: FrameResult) -> None:
 
 
 def test_without_truth_it_is_what_nothing_explains(result: FrameResult) -> None:
-    few = revised(result.config, ["detector.conf_threshold=0.6"])  # so that not every near cluster has a name
-    listed = finds(Session(few).run(result.frame), None)
+    few = changed_config(
+        result.config, ["detector.conf_threshold=0.6"]
+    )  # so that not every near cluster has a name
+    listed = find_findings(Session(few).run(result.frame), None)
     assert {find.what for find in listed} <= {"unmatched", "unnamed"}
     assert any(find.what == "unnamed" for find in listed)
     assert all(not find.distance > 40 for find in listed)
@@ -764,7 +767,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     from rerun.chunk import RrdReader
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
-        bench = Bench(drive, again.frames, [bag])
+        bench = WorkbenchSession(drive, again.frames, [bag])
         bench.see(drive.at(frame=0))
         told = bench.attempt(0, ("clustering.min_cluster_points=100000",))
         recoloured = bench.attempt(0, ("ground.distance_threshold=0.5",))
@@ -799,7 +802,7 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
     """A page that is opened again asks for what it showed, long before the run is there."""
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         stamps = [drive.raw(number).stamp for number in range(FRAMES)]
-        bench = Bench(drive, again.frames, [bag], first=2)
+        bench = WorkbenchSession(drive, again.frames, [bag], first=2)
         with pytest.raises(UserError, match="no frame"):
             bench.number_at(stamps[0])
         bench._show(bench.look(2), ())
@@ -834,7 +837,7 @@ def test_a_frame_shows_nothing_of_those_that_a_page_has_got_before(bag: Path, tm
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         results = [drive.at(frame=number) for number in range(4)]
         seen = entities.detections(results[0].cameras[0].camera.name)
-        bench = Bench(drive, again.frames, [bag], first=3)
+        bench = WorkbenchSession(drive, again.frames, [bag], first=3)
         bench._show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):
             bench.see(result)
@@ -850,7 +853,7 @@ def test_a_frame_shows_nothing_of_those_that_a_page_has_got_before(bag: Path, tm
 
 def test_pieces_come_back_as_they_were() -> None:
     told = []
-    with Film() as film:
+    with RecordingBuffer() as film:
         end = film.listen(lambda: told.append(len(film)))
         for piece in (b"one", b"", None, b"two" * 1000):
             film.add(piece)

@@ -23,8 +23,8 @@ from bevviz.live.encoder import Encoder
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.why.pick import Pick
-from bevviz.workbench.live_buffer import WHOLE, LiveFilm
-from bevviz.workbench.live_session import KEPT, LiveBench
+from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
+from bevviz.workbench.live_session import KEPT, LiveSession
 from tests.graphs import own_graph, playing
 from tests.live_bench import live_bench
 from tests.ros_player import Play
@@ -60,12 +60,12 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]
 
 def _address(said: Path, live: subprocess.Popen[bytes]) -> str:
     """What it prints, once it can be reached."""
-    from bevviz.recording.ports import answers
+    from bevviz.recording.ports import is_listening
 
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and live.poll() is None:
         found = re.search(r"workbench at (http://([^:]+):(\d+)\S+)", said.read_text())
-        if found and answers(found[2], int(found[3])):
+        if found and is_listening(found[2], int(found[3])):
             return found[1]
         time.sleep(0.1)
     raise AssertionError(said.read_text())
@@ -210,13 +210,13 @@ def results() -> list[FrameResult]:
 
 
 @pytest.fixture
-def bench(results: list[FrameResult]) -> Iterator[LiveBench]:
+def bench(results: list[FrameResult]) -> Iterator[LiveSession]:
     with live_bench(results, f"live.held={HELD}") as bench:
         yield bench
 
 
 def test_only_the_newest_frames_and_those_held_are_there(
-    bench: LiveBench, results: list[FrameResult]
+    bench: LiveSession, results: list[FrameResult]
 ) -> None:
     with pytest.raises(UserError, match="no frame has come yet"):
         bench.number_at(0)
@@ -240,7 +240,7 @@ def test_only_the_newest_frames_and_those_held_are_there(
     assert len(bench._held()) == HELD + KEPT
 
 
-def test_a_held_frame_can_be_asked_with_other_values(bench: LiveBench, results: list[FrameResult]) -> None:
+def test_a_held_frame_can_be_asked_with_other_values(bench: LiveSession, results: list[FrameResult]) -> None:
     for result in results[:2]:
         bench._see(result)
     assert results[1].objects is not None and len(results[1].objects)
@@ -264,7 +264,7 @@ def detect(points, params):
 @pytest.fixture
 def bench_with_network(
     results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[LiveBench]:
+) -> Iterator[LiveSession]:
     """A run whose user has named a function, and then ours again: a page may go to and fro."""
     (tmp_path / "network.py").write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
@@ -274,7 +274,7 @@ def bench_with_network(
 
 
 def test_the_objects_method_is_changed_there_and_back(
-    bench_with_network: LiveBench, results: list[FrameResult]
+    bench_with_network: LiveSession, results: list[FrameResult]
 ) -> None:
     """Ours, a function with parameters of its own, the robot's topic, and ours again."""
     bench = bench_with_network
@@ -300,9 +300,9 @@ def test_the_objects_method_is_changed_there_and_back(
     assert again.objects.names == results[0].objects.names
 
 
-def test_pages_begin_at_a_whole_frame_and_miss_none(bench: LiveBench, results: list[FrameResult]) -> None:
+def test_pages_begin_at_a_whole_frame_and_miss_none(bench: LiveSession, results: list[FrameResult]) -> None:
     encoder: Encoder = bench.live.encoder
-    film: LiveFilm = bench.film
+    film: LiveBuffer = bench.film
     assert film.since(None) == ([], -1)
     packets = deque(encoder.encode(result, bench.live.scene, {}, ()) for result in results[:3])
     film._take(packets[0], True)

@@ -15,7 +15,7 @@ from rerun.experimental import ViewerClient
 
 from bevviz.cli import main
 from bevviz.recording import entities, rerun_cli
-from bevviz.recording.ports import LOOPBACK, answers, free_port
+from bevviz.recording.ports import LOOPBACK, free_port, is_listening
 from tests.test_workbench import FRAMES, bag, browser, serving, state, until, verdict  # noqa: F401
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def native() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     port = free_port(9950)
     arguments = ["--headless", "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
     process = subprocess.Popen(
-        [rerun_cli.program(), *arguments],
+        [rerun_cli.rerun_program(), *arguments],
         stdin=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=rerun_cli.environment(),
@@ -40,7 +40,7 @@ def native() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     url = f"rerun+http://{LOOPBACK}:{port}/proxy"
     try:
         end = time.monotonic() + 30
-        while not answers(LOOPBACK, port) and time.monotonic() < end and process.poll() is None:
+        while not is_listening(LOOPBACK, port) and time.monotonic() < end and process.poll() is None:
             time.sleep(0.05)
         try:
             ViewerClient.connect(url).get_state()
@@ -48,7 +48,7 @@ def native() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
             pytest.skip(NO_VULKAN)
         yield url, process
     finally:
-        rerun_cli.end(process)
+        rerun_cli.stop(process)
 
 
 def shown(client: ViewerClient) -> tuple[str | None, int | None]:

@@ -34,7 +34,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, U8
-from bevviz.synthetic.sensors import Caster, PinholeCamera, View, optical
+from bevviz.synthetic.sensors import Caster, PinholeCamera, RaycastView, optical
 from bevviz.synthetic.world import SECTION, World
 
 NAMES = ("person", "car", "cyclist")
@@ -65,7 +65,7 @@ def street_images(seed: int) -> list[tuple[U8, Labels]]:
         base = world.street.pose(s, rng.normal(-1.7, 0.7), turn=rng.normal(0, 0.12), upright=False)
         pose = base @ optical((0.7, 0.06, rng.normal(1.55, 0.08)), np.radians(rng.normal(3.0, 1.0)))
         centre = pose[:3, 3]
-        view = View(static(int(s // SECTION)), world.moving(t, centre, 120.0))
+        view = RaycastView(static(int(s // SECTION)), world.moving(t, centre, 120.0))
         picture = camera.picture(view, pose, world.light, rng)
         boxes, kinds = [], []
         for actor, mesh, _ in world.objects(t, centre, 120.0):

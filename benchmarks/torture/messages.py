@@ -566,7 +566,7 @@ def read_frames(argument: tuple[Path, Sequence[str]]) -> Outcome:
     from bevviz.bags.source import BagSource
     from bevviz.config import load
     from bevviz.errors import UserError
-    from bevviz.pipeline.bag_info import describe, render
+    from bevviz.pipeline.bag_info import describe_bag, render_bag_info
 
     path, settings = argument
     outcome, frames, ended = Outcome(), 0, ""
@@ -574,7 +574,7 @@ def read_frames(argument: tuple[Path, Sequence[str]]) -> Outcome:
     start = time.perf_counter()
     try:
         config = load(settings=settings)
-        render(describe([path], config))
+        render_bag_info(describe_bag([path], config))
         with BagSource([path], config) as source:
             for _ in source:
                 frames += 1

@@ -33,7 +33,7 @@ def read_bag(path: Path) -> Outcome:
     from bevviz.bags.bag import Recording
     from bevviz.config import Config
     from bevviz.errors import UserError
-    from bevviz.pipeline.bag_info import describe, render
+    from bevviz.pipeline.bag_info import describe_bag, render_bag_info
 
     outcome = Outcome()
     try:
@@ -52,7 +52,7 @@ def read_bag(path: Path) -> Outcome:
             outcome.said = [*recording.warnings, *[f"{packed} messages cannot be unpacked"] * bool(packed)]
             lost = recording.message_count != len(in_order) and not outcome.said
             outcome.uneven = in_order != sorted(in_order) or given != times or lost
-        render(describe([path], Config()))
+        render_bag_info(describe_bag([path], Config()))
     except UserError as error:
         outcome.said.append(f"{error} (0 messages)" if not outcome.found else str(error))
     except Exception:

@@ -20,7 +20,7 @@ from bevviz.config import AnomaliesConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool, Boxes3D
 from bevviz.model.results import Anomaly, CameraResult, FrameResult, Tracks
-from bevviz.stages.fusion import in_view
+from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.visibility import range_image, visible
 
 MEMORY = 20  # frames of the history of an object
@@ -98,7 +98,7 @@ class ObjectWatch:
     def update(self, result: FrameResult, tracks: Tracks, config: AnomaliesConfig) -> Iterator[Anomaly]:
         """Yield the anomalies of this frame, given the frames before it."""
         count = 0 if result.clusters is None else len(result.clusters)
-        looked_at = np.append(in_view(result.cameras, count), False)[tracks.cluster]
+        looked_at = np.append(clusters_in_view(result.cameras, count), False)[tracks.cluster]
         visibility, measured = _expected_visibility(result, tracks), _clusters(result, tracks)
         before, self._known = self._known, {}
         missing: dict[str, list[tuple[int, Past]]] = defaultdict(list)
@@ -266,7 +266,7 @@ def _expected_visibility(result: FrameResult, tracks: Tracks) -> _Visibility:
     """Compute the expected visibility of the tracks. Only confirmed tracks are examined."""
     boxes = tracks.boxes
     if tracks.absolute:
-        boxes = geometry.moved(boxes, geometry.inverse(result.frame.pose))
+        boxes = geometry.transform_boxes(boxes, geometry.inverse(result.frame.pose))
     n = len(boxes)
     open_, whole = np.ones(n, np.float32), np.zeros(n, bool)
     detected = np.zeros(n, bool)

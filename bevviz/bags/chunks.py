@@ -20,8 +20,8 @@ from rosbags.interfaces import Connection
 
 from bevviz.bags.reader import (
     LAST_TIME,
-    Bytes,
     DamageError,
+    FileBytes,
     Message,
     Reader,
     as_damage,
@@ -169,15 +169,17 @@ class ChunkFormat:
     """Functions of one chunked file format."""
 
     open_rosbags: Callable[[Path], RosbagsReader]  # reader of rosbags
-    read_by_index: bool  # messages are read by our index, see ``SoundChunks``
+    read_by_index: bool  # messages are read by our index, see ``ChunkReader``
     read_index: Callable[[Path], FileIndex]  # raises DamageError if the index cannot be right
-    read_times: Callable[[Bytes, Chunk, int], I64]  # log times of a connection by the index
-    read_messages: Callable[[Bytes, Chunk], tuple[list[ChunkMessage], str]]  # and the damage of the chunk
-    scan: Callable[[Bytes, ScanResult, Callable[[int], object]], None]  # the last argument gets the offset
+    read_times: Callable[[FileBytes, Chunk, int], I64]  # log times of a connection by the index
+    read_messages: Callable[[FileBytes, Chunk], tuple[list[ChunkMessage], str]]  # and the damage of the chunk
+    scan: Callable[
+        [FileBytes, ScanResult, Callable[[int], object]], None
+    ]  # the last argument gets the offset
     repair: str  # command that writes a sound copy
 
 
-class SoundChunks:
+class ChunkReader:
     """Reader of a file with a valid index. rosbags opens the file, and reads the messages of ROS 1 bags.
 
     The messages of an MCAP file are read by our index, as views into its chunks. rosbags copies each message
@@ -217,7 +219,7 @@ class SoundChunks:
         self._index: FileIndex | None = index
         self._chunks = index.chunks
         self._indexed = IndexedChunkReader(path, form, index)
-        self._bytes = Bytes(path)
+        self._bytes = FileBytes(path)
 
     @property
     def connections(self) -> Sequence[Connection]:
@@ -292,7 +294,7 @@ class IndexedChunkReader:
 
     def __init__(self, path: Path, form: ChunkFormat, index: FileIndex, notes: Sequence[str] = ()) -> None:
         self._form, self._index, self._notes = form, index, notes
-        self._bytes = Bytes(path)
+        self._bytes = FileBytes(path)
         # By number of a damaged chunk: lost messages by connection, log times of the kept ones, the damage.
         self._damaged: dict[int, tuple[Counter[int], Mapping[int, I64], str]] = {}
         self.compression = ", ".join(sorted({c.compression for c in index.chunks} - {"", "none"}))
@@ -404,7 +406,7 @@ class IndexedChunkReader:
 
 def rescue_chunks(path: Path, form: ChunkFormat) -> IndexedChunkReader:
     """Scan a file from front to back. Return a reader of the messages found."""
-    result, file = ScanResult(), Bytes(path)
+    result, file = ScanResult(), FileBytes(path)
     try:
         bar = progress.bar(total=file.size, unit="B", unit_scale=True, desc=f"rescue {path.name}", delay=1)
         with bar:

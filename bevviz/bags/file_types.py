@@ -10,8 +10,8 @@ from pathlib import Path
 from backports import zstd
 
 from bevviz.bags import mcap, ros1
-from bevviz.bags.chunks import ChunkFormat, SoundChunks, rescue_chunks
-from bevviz.bags.reader import PIECE, ZSTD, BagFile, Bytes, Reader, SoundReader, megabytes
+from bevviz.bags.chunks import ChunkFormat, ChunkReader, rescue_chunks
+from bevviz.bags.reader import PIECE, ZSTD, BagFile, FileBytes, Reader, SoundReader, megabytes
 from bevviz.bags.rescue import mcap as mcap_rescue
 from bevviz.bags.rescue import sqlite_pages
 from bevviz.bags.rescue.sqlite import SqliteRescuer
@@ -20,7 +20,7 @@ from bevviz.datasets.dataset import CLOUDS, IMAGES
 from bevviz.datasets.unread_files import ADVICE as UNREAD
 from bevviz.errors import UserError
 from bevviz.support import progress
-from bevviz.support.files import LFS_HINT, LFS_POINTER, Scratch
+from bevviz.support.files import LFS_HINT, LFS_POINTER, ScratchFolder
 
 ZSTD_FRAME = re.compile(re.escape(ZSTD))
 
@@ -49,7 +49,7 @@ def _chunked_format(name: str, magic: bytes, suffix: str, form: ChunkFormat) -> 
         name,
         magic,
         suffix,
-        lambda path, public: SoundChunks(path, form, public),
+        lambda path, public: ChunkReader(path, form, public),
         lambda path: rescue_chunks(path, form),
     )
 
@@ -73,7 +73,7 @@ OTHER_FORMATS = {
 }
 
 
-def open_file(path: Path, scratch: Scratch, warn: Callable[[str], object]) -> BagFile:
+def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> BagFile:
     """Open a file of a recording by its first bytes. A compressed file is unpacked.
 
     Args:
@@ -114,7 +114,7 @@ def open_file(path: Path, scratch: Scratch, warn: Callable[[str], object]) -> Ba
     )
 
 
-def _open_as(kind: FileFormat, path: Path, scratch: Scratch) -> BagFile:
+def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
     public = path
     if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
@@ -122,7 +122,7 @@ def _open_as(kind: FileFormat, path: Path, scratch: Scratch) -> BagFile:
     return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
 
 
-def _unpack(path: Path, scratch: Scratch, warn: Callable[[str], object]) -> Path:
+def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> Path:
     target = scratch.new() / path.stem
     damaged, whole = unpack_file(path, target)
     if damaged or not whole:
@@ -140,7 +140,7 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
     Returns:
         Number of damaged places, and whether the last frame is complete.
     """
-    source, damaged, stream = Bytes(path), 0, zstd.ZstdDecompressor()
+    source, damaged, stream = FileBytes(path), 0, zstd.ZstdDecompressor()
     bar = progress.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
     try:
         with target.open("wb") as out, bar:

@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.bags.chunks import Chunk, FileIndex
-from bevviz.bags.reader import LAST_TIME, Bytes, DamageError, UnindexedError, unpack
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, unpack
 from bevviz.model.frame import I64
 from bevviz.support.loggers import logger
 
@@ -105,7 +105,7 @@ def read_index(path: Path) -> FileIndex:
     Raises:
         DamageError: there is no index, it ends early, or it disagrees with the statistics.
     """
-    file = Bytes(path)
+    file = FileBytes(path)
     try:
         end = file.size - _FOOTER.size
         if file.read(0, len(MAGIC)) != MAGIC:
@@ -145,7 +145,7 @@ def read_attachments(path: Path) -> dict[str, bytes]:
 
     ``McapWriter.attach`` writes them there. A damaged attachment is left out.
     """
-    file, attachments = Bytes(path), dict[str, bytes]()
+    file, attachments = FileBytes(path), dict[str, bytes]()
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
             return attachments
@@ -169,7 +169,7 @@ def read_attachments(path: Path) -> dict[str, bytes]:
         file.close()
 
 
-def _correct_channels(file: Bytes, index: FileIndex, channels: Channels) -> None:
+def _correct_channels(file: FileBytes, index: FileIndex, channels: Channels) -> None:
     """Correct channel descriptions by the data if the summary has no checksum.
 
     Reading all data takes too long. A writer describes a channel at its first message at the latest, so the
@@ -201,7 +201,7 @@ def _note_all(content: bytes, channels: Channels) -> None:
                 channels.note(opcode, content[start:offset])
 
 
-def unpack_chunk(file: Bytes, chunk: Chunk) -> tuple[bytes, str, bool]:
+def unpack_chunk(file: FileBytes, chunk: Chunk) -> tuple[bytes, str, bool]:
     """Return the content of a chunk, its damage, and whether the content fits its checksum."""
     crc = chunk.crc
     if crc is None:  # The checksum stands before the content.
@@ -277,7 +277,7 @@ def _parse_chunk_index(record: bytes, end: int) -> Chunk:
     )
 
 
-def read_times(file: Bytes, chunk: Chunk, channel: int) -> I64:
+def read_times(file: FileBytes, chunk: Chunk, channel: int) -> I64:
     """Return the log times of the messages of a channel by the message index of a chunk.
 
     Raises:

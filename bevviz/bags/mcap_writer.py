@@ -42,7 +42,7 @@ from bevviz.bags.mcap import (
 )
 from bevviz.errors import UserError, first_line
 from bevviz.support import cleanup
-from bevviz.support.files import claim, lock, rename_new, write_all
+from bevviz.support.files import claim_target, lock_file, rename_new, write_all
 from bevviz.support.version import __version__
 
 HEADER, CHUNK_INDEX, STATISTICS = 1, 8, 0x0B
@@ -101,13 +101,13 @@ class McapWriter:
         self._end = 0
 
     def __enter__(self) -> Self:
-        unfinished = claim(self._path, "bag")
+        unfinished = claim_target(self._path, "bag")
         self._partial_path, self._file = unfinished.path, unfinished.handle
-        cleanup.remember(self, partial(self._partial_path.unlink, missing_ok=True))
+        cleanup.register(self, partial(self._partial_path.unlink, missing_ok=True))
         try:
             self._write_bytes(MAGIC + _record(HEADER, _text(self._profile) + _text(f"bevviz {__version__}")))
         except OSError as error:
-            cleanup.forget(self)
+            cleanup.unregister(self)
             unfinished.discard()
             raise UserError(f"{self._path}: cannot write the bag: {error.strerror}") from None
         return self
@@ -131,7 +131,7 @@ class McapWriter:
         finally:
             if not keep:
                 self._partial_path.unlink(missing_ok=True)
-            cleanup.forget(self)
+            cleanup.unregister(self)
             os.close(self._file)  # releases the lock as well
 
     @property
@@ -392,7 +392,7 @@ def complete(path: Path) -> int:
     try:
         handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            lock(handle, f"{path}: another process is writing it")
+            lock_file(handle, f"{path}: another process is writing it")
             if os.fstat(handle).st_nlink > 1:
                 raise UserError(f"{path}: cannot be completed: it has another name, too (a hard link)")
             with mmap(handle, 0, access=ACCESS_READ) as data:

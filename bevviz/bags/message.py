@@ -61,7 +61,7 @@ class RawMessage:
             data = self.content()
         except zstd.ZstdError:
             raise MessageError(f"{self.topic}: a message of {len(self.data)} bytes is damaged") from None
-        if form_of(self.connection):
+        if foxglove_encoding(self.connection):
             return guard(self, foxglove.header, self.parsed(data), self.connection.msgtype)
         little = is_ros1(self.connection) or data[1:2] != b"\0"
         return read_header(data, "<" if little else ">", self.topic)
@@ -73,13 +73,13 @@ class RawMessage:
             MessageError: the bytes do not fit the Foxglove type.
         """
         about = self.connection
-        return guard(self, foxglove.parse, data, about.msgtype, form_of(about), about.msgdef.data)
+        return guard(self, foxglove.parse, data, about.msgtype, foxglove_encoding(about), about.msgdef.data)
 
 
-def form_of(connection: Connection) -> str:
+def foxglove_encoding(connection: Connection) -> str:
     """Return the serialisation of a Foxglove message that ROS cannot decode: protobuf, json, or empty."""
     form = getattr(connection.ext, "serialization_format", "")
-    return form if form in foxglove.ENCODINGS and foxglove.short_of(connection.msgtype) else ""
+    return form if form in foxglove.ENCODINGS and foxglove.foxglove_type(connection.msgtype) else ""
 
 
 def is_ros1(connection: Connection) -> bool:

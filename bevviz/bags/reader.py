@@ -241,7 +241,7 @@ class BagFile:
         self._notes.append(f"{error}: {how}")
 
 
-class Bytes:
+class FileBytes:
     """Bytes of a file by offset. The file is not memory-mapped: if it shrinks meanwhile, reads are short."""
 
     def __init__(self, path: Path) -> None:
@@ -286,8 +286,8 @@ class Bytes:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-class MemoryBytes(Bytes):
-    """Bytes in memory with the interface of ``Bytes``, for the unpacked content of a chunk."""
+class MemoryBytes(FileBytes):
+    """Bytes in memory with the interface of ``FileBytes``, for the unpacked content of a chunk."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self.size = data, len(data)

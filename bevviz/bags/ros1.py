@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefiniti
 from rosbags.rosbag1 import Reader
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex, ScanResult
-from bevviz.bags.reader import LAST_TIME, Bytes, DamageError, MemoryBytes, normalized, unpack
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, MemoryBytes, normalized, unpack
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -63,7 +63,7 @@ class Record:
         return int(sec) * 10**9 + int(nsec)
 
 
-def read_record(source: Bytes, offset: int) -> Record | None:
+def read_record(source: FileBytes, offset: int) -> Record | None:
     """Read the record at an offset. Return None if there is none. Its data may be cut."""
     size = int.from_bytes(source.read(offset, 4), "little")
     if not 4 <= size <= LONGEST_HEADER:
@@ -159,7 +159,7 @@ def read_index(path: Path) -> FileIndex:
     Raises:
         DamageError: there is no index, it ends early, or it contradicts itself.
     """
-    file = Bytes(path)
+    file = FileBytes(path)
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
             raise DamageError("it does not begin as a ROS 1 bag does")
@@ -180,7 +180,7 @@ def read_index(path: Path) -> FileIndex:
         file.close()
 
 
-def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: int) -> FileIndex:
+def _read_index(file: FileBytes, offset: int, connection_count: int, chunk_count: int) -> FileIndex:
     connections, chunks, end = Connections(), [], offset
     described = 0
     while offset < file.size:
@@ -208,7 +208,7 @@ def _read_index(file: Bytes, offset: int, connection_count: int, chunk_count: in
     return FileIndex(chunks, connections.counted(counts))
 
 
-def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
+def _read_chunk(file: FileBytes, info: Record, end: int) -> Chunk:
     """Read the head of a chunk and the index records after it. Compare them with the index of the bag."""
     pairs = np.frombuffer(file.read(info.body, info.end - info.body), "<u4").reshape(-1, 2)
     counts = {number: count for number, count in pairs.tolist() if count}
@@ -233,7 +233,7 @@ def _read_chunk(file: Bytes, info: Record, end: int) -> Chunk:
     return Chunk(start, last, record.body, length, record.number("size"), compression, counts, index=index)
 
 
-def read_times(file: Bytes, chunk: Chunk, number: int) -> I64:
+def read_times(file: FileBytes, chunk: Chunk, number: int) -> I64:
     """Return the log times of the messages of a connection by the index of a chunk.
 
     Raises:
@@ -259,7 +259,7 @@ class RecordWalker:
     Only a chunk may be cut: it may end beyond the bytes.
     """
 
-    def __init__(self, source: Bytes) -> None:
+    def __init__(self, source: FileBytes) -> None:
         self._source = source
         self.broken = self.passed = 0
 
@@ -316,7 +316,7 @@ class RecordWalker:
         return None
 
 
-def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> None:
+def scan(file: FileBytes, result: ScanResult, report: Callable[[int], object]) -> None:
     """Scan a bag from front to back, with the content of every chunk."""
     connections, walker = Connections(), RecordWalker(file)
     outside = array("q")  # messages of an uncompressed chunk whose head is damaged
@@ -344,7 +344,7 @@ def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> No
     result.index.connections = connections.counted(result.finish(connections, outside))
 
 
-def _describe(file: Bytes, chunk: Chunk, connections: Connections, result: ScanResult) -> None:
+def _describe(file: FileBytes, chunk: Chunk, connections: Connections, result: ScanResult) -> None:
     """Fill in the messages and connections of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     content, chunk.damage = _unpacked(file, chunk)
@@ -360,7 +360,7 @@ def _describe(file: Bytes, chunk: Chunk, connections: Connections, result: ScanR
     chunk.fill(times)
 
 
-def read_messages(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+def read_messages(file: FileBytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
     """Return the messages of a chunk on the connections of its index, and the damage of its content."""
     content, damage = _unpacked(file, chunk)
     data = memoryview(content.read(0, content.size))
@@ -372,7 +372,7 @@ def read_messages(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
     return messages, damage
 
 
-def _unpacked(file: Bytes, chunk: Chunk) -> tuple[MemoryBytes, str]:
+def _unpacked(file: FileBytes, chunk: Chunk) -> tuple[MemoryBytes, str]:
     """Return the content of a chunk and its damage."""
     packed = file.read(chunk.data, chunk.packed)
     cut = chunk.cut or len(packed) < chunk.packed

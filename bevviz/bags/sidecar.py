@@ -7,7 +7,7 @@ from pathlib import Path
 from bevviz.errors import UserError
 
 
-def bag_beside(path: Path) -> Path:
+def find_saved_bag(path: Path) -> Path:
     """Return the bag NAME.mcap next to a recording NAME.rrd. Return any other path unchanged.
 
     Raises:

@@ -20,11 +20,11 @@ from bevviz.messages.guard import guard
 from bevviz.messages.roles import find_roles
 from bevviz.messages.transforms import decode_transforms
 from bevviz.model.frame import F64, I64, Frame, Scene
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.report import blindness
+from bevviz.sync.report import why_no_images
 from bevviz.sync.synchronizer import Synchronizer
-from bevviz.sync.unusable_messages import Damage
+from bevviz.sync.unusable_messages import UnusableMessages
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
@@ -62,10 +62,10 @@ class ReadingState:
     stop: int = 0
     number: int = -1
     numbers: dict[int, list[int]] = field(default_factory=dict)
-    damage: Damage = field(default_factory=Damage)
+    damage: UnusableMessages = field(default_factory=UnusableMessages)
 
 
-class BagSource(Closing):
+class BagSource(Closable):
     """Frames of one recording, which may consist of several bags.
 
     Args:
@@ -129,7 +129,7 @@ class BagSource(Closing):
         """All warnings about the recording and the frames read so far."""
         report = self._state.sync.report if self._state else None
         synced = report.warnings() if report else ()
-        blind = blindness(self.config, self.roles, report)
+        blind = why_no_images(self.config, self.roles, report)
         alone = [f"{self.roles.no_lidar}: the frames are {self._driver}'s"] if self.roles.no_lidar else []
         return [*self.recording.warnings, *alone, *self._damage, *blind, *synced]
 

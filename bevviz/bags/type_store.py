@@ -20,7 +20,7 @@ from bevviz.errors import first_line
 from bevviz.messages import decoders, grid_map_msgs, vision_msgs
 
 PREPROCESSED = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # IDL lines such as #include; rosbags rejects them
-_MADE: Mapping[str, Callable[[Any, Typestore], Any]] = {
+_COMPILERS: Mapping[str, Callable[[Any, Typestore], Any]] = {
     "deserialize_cdr_le": lambda fields, store: generate_deserialize_cdr(fields, store, "le"),
     "deserialize_cdr_be": lambda fields, store: generate_deserialize_cdr(fields, store, "be"),
     "deserialize_ros1": generate_deserialize_ros1,
@@ -94,12 +94,12 @@ def _defined(connection: Connection) -> Typestore:
         for part in filter(str.strip, text.split("=" * 80 + "\n")):
             _, _, body = part.partition("\n") if part.startswith("IDL: ") else ("", "", part)
             types.update(get_types_from_idl(PREPROCESSED.sub("", body)))
-    store = ReadTypes()
+    store = LazyTypeStore()
     store.register(types)
     return store
 
 
-class ReadTypes(Typestore):
+class LazyTypeStore(Typestore):
     """Type store that compiles only the functions in use. The store of rosbags compiles twelve for each type.
 
     That takes 2 ms for the types of a usual bag instead of 100 to 300 ms. rosbags 0.11 has no public way to
@@ -112,7 +112,7 @@ class ReadTypes(Typestore):
     def get_msgdef(self, typename: str) -> Any:
         """Return a message definition that compiles its functions at first use."""
         if typename not in self.cache:
-            self.cache[typename] = _Read(self, typename)  # type: ignore[assignment]
+            self.cache[typename] = _LazyDefinition(self, typename)  # type: ignore[assignment]
         return self.cache[typename]
 
     def whole(self, typename: str) -> Any:
@@ -124,17 +124,17 @@ class ReadTypes(Typestore):
             self.cache[typename] = made
 
 
-class _Read:
+class _LazyDefinition:
     """Replacement of a rosbags ``Msgdef`` whose functions are compiled at first use."""
 
-    def __init__(self, store: ReadTypes, typename: str) -> None:
+    def __init__(self, store: LazyTypeStore, typename: str) -> None:
         self._store, self.name, self.cls = store, typename, store.types[typename]
         self.fields = [(normalize_fieldname(name), kind) for name, kind in store.fielddefs[typename][1]]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        make = _MADE.get(name)
+        make = _COMPILERS.get(name)
         found = (
             getattr(self._store.whole(self.name), name) if make is None else make(self.fields, self._store)
         )

@@ -1,16 +1,16 @@
 """Check of extrinsic calibration and clocks. Imports `pipeline` and below."""
 
 from bevviz.calib.offsets import AXES, Axis
-from bevviz.calib.result import AxisResult, Calibration, Finding
+from bevviz.calib.result import AxisFinding, AxisResult, Calibration
 from bevviz.calib.samples import Shot, Shots, gather
 from bevviz.calib.solve import calibrate
 
 __all__ = [
     "AXES",
     "Axis",
+    "AxisFinding",
     "AxisResult",
     "Calibration",
-    "Finding",
     "Shot",
     "Shots",
     "calibrate",

@@ -8,11 +8,11 @@ import numpy as np
 import rerun as rr
 
 from bevviz.calib.offsets import TIME, error_pose
-from bevviz.calib.result import Calibration, Finding
+from bevviz.calib.result import AxisFinding, Calibration
 from bevviz.calib.samples import Shot
 from bevviz.config import LoggingConfig
 from bevviz.model import geometry
-from bevviz.model.colors import State, bins
+from bevviz.model.colors import StateColor, color_rows
 from bevviz.model.frame import F32, F64, Bool, Intrinsics
 from bevviz.recording import entities
 from bevviz.recording.annotations import depth_annotations
@@ -20,12 +20,12 @@ from bevviz.recording.primitives import CORNER, document, encode_image
 from bevviz.support import table
 from bevviz.support.text import fenced, markdown
 
-_STATED, _CORRECTED = State.BAD.value, State.GOOD.value
+_STATED, _CORRECTED = StateColor.BAD.value, StateColor.GOOD.value
 _COLORS = {
-    Finding.FINE: State.GOOD.value,
-    Finding.OFF: State.BAD.value,
-    Finding.UNKNOWN: State.UNKNOWN.value,
-    Finding.CONFLICT: State.DOUBTFUL.value,
+    AxisFinding.FINE: StateColor.GOOD.value,
+    AxisFinding.OFF: StateColor.BAD.value,
+    AxisFinding.UNKNOWN: StateColor.UNKNOWN.value,
+    AxisFinding.CONFLICT: StateColor.DOUBTFUL.value,
 }
 
 
@@ -74,7 +74,7 @@ def _log_pair(
     intrinsics = shot.camera.intrinsics
     uv, depth = geometry.project(geometry.apply(camera_from_points, shot.frame.points), intrinsics)
     seen = _inside(uv, intrinsics)
-    classes = bins(depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+    classes = color_rows(depth[seen], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
     recording.log(
         f"{path}/points",
         rr.Points2D(

@@ -12,7 +12,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64
 
 
-class Finding(StrEnum):
+class AxisFinding(StrEnum):
     """Judgement about one axis."""
 
     FINE = "fine"
@@ -31,7 +31,7 @@ class AxisResult:
     axis: Axis
     offset: float  # of the stated value from the best fit
     interval: float
-    finding: Finding
+    finding: AxisFinding
     reason: str  # reason of a finding UNKNOWN or CONFLICT, else empty
     abscissa: F64  # (S,) offsets along this axis; the other axes stay at their best fit
     score: F64  # (S,) mean score at each of these offsets
@@ -47,9 +47,9 @@ class AxisResult:
     @property
     def text(self) -> str:
         """The finding in words."""
-        if self.finding is Finding.OFF:
+        if self.finding is AxisFinding.OFF:
             return f"off: {self.axis.positive if self.offset > 0 else self.axis.negative}"
-        if self.finding is Finding.FINE:
+        if self.finding is AxisFinding.FINE:
             most = abs(self.offset) + self.interval
             return f"fine: off by no more than {most:.{self.axis.decimals}f} {self.axis.unit}"
         return f"{self.finding}: {self.reason}" if self.reason else str(self.finding)
@@ -74,7 +74,7 @@ class Calibration:
     score_corrected: float
     notes: tuple[str, ...] = ()
 
-    def by(self, finding: Finding) -> list[AxisResult]:
+    def by(self, finding: AxisFinding) -> list[AxisResult]:
         """Return the axes with this finding."""
         return [axis for axis in self.axes if axis.finding is finding]
 
@@ -84,7 +84,9 @@ class Calibration:
         reasons = {axis.reason for axis in self.axes}
         if len(reasons) == 1 and (reason := reasons.pop()):
             return f"Camera '{self.camera}': {self.axes[0].finding}: {reason}."
-        off, fine, unknown = (self.by(kind) for kind in (Finding.OFF, Finding.FINE, Finding.UNKNOWN))
+        off, fine, unknown = (
+            self.by(kind) for kind in (AxisFinding.OFF, AxisFinding.FINE, AxisFinding.UNKNOWN)
+        )
         if off:
             text = f"Camera '{self.camera}' is off: {'; '.join(_error(axis) for axis in off)}."
         elif not fine:
@@ -108,7 +110,7 @@ class Calibration:
     @property
     def config(self) -> str:
         """Configuration that applies the correction, in YAML."""
-        return configuration([self])
+        return correction_yaml([self])
 
     def table(self) -> str:
         """Return one line of fixed width for each axis."""
@@ -149,7 +151,7 @@ class Calibration:
         }
 
 
-def configuration(results: Sequence[Calibration]) -> str:
+def correction_yaml(results: Sequence[Calibration]) -> str:
     """Return one configuration that corrects several cameras, in YAML: extrinsics and offsets of stamps."""
     lines = ["source:", "  extrinsics:"]
     for result in results:

@@ -156,7 +156,7 @@ def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
 def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
     """Return the image without distortion, scaled down to PIXELS, and its camera matrix."""
     picture, K = bgr, intrinsics.K
-    if geometry.is_bent(intrinsics):
+    if geometry.has_distortion(intrinsics):
         if intrinsics.distortion_model in geometry.FISHEYE:
             picture = cv2.fisheye.undistortImage(picture, K, intrinsics.D[:4], Knew=K)
         else:

@@ -10,7 +10,7 @@ import numpy as np
 
 from bevviz.calib.evidence import LEAD, caution_factor, independent_views, lead, scatter
 from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
-from bevviz.calib.result import AxisResult, Calibration, Finding
+from bevviz.calib.result import AxisFinding, AxisResult, Calibration
 from bevviz.calib.samples import REACH, Shot, Shots
 from bevviz.calib.score import Scorer
 from bevviz.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
@@ -46,7 +46,7 @@ class _Estimate:
 class _Judgement:
     """A finding and its reason."""
 
-    finding: Finding
+    finding: AxisFinding
     reason: str = ""
 
 
@@ -84,7 +84,7 @@ def calibrate(
         scorer = Scorer(shots.shots, FINEST)
     progress(0.8, "curves")
     axes = _judge(shots, estimate, trouble)
-    off = np.array([axis.finding is Finding.OFF for axis in axes])
+    off = np.array([axis.finding is AxisFinding.OFF for axis in axes])
     fixed = climb(scorer, np.where(off, estimate.offsets, 0.0), off).offsets
     frame, stated = shots.shots[0].frame, shots.shots[0].mounting
     if frame.upright is not None:
@@ -124,9 +124,9 @@ def _too_little(shots: Shots) -> _Judgement | None:
     """Return a finding UNKNOWN if cloud or images have too few edges, else None."""
     if shots.edges < EDGES:
         reason = f"too little data: only {shots.edges} edges in the clouds, {EDGES} are needed"
-        return _Judgement(Finding.UNKNOWN, reason)
+        return _Judgement(AxisFinding.UNKNOWN, reason)
     if not any(shot.maps.any() for shot in shots.shots):
-        return _Judgement(Finding.UNKNOWN, "too little data: the images show no edges")
+        return _Judgement(AxisFinding.UNKNOWN, "too little data: the images show no edges")
     return None
 
 
@@ -136,7 +136,7 @@ def _weigh(
     """Return the offsets with their uncertainty, and a finding that holds for all axes or None."""
     if not peaks:
         reason = "too little data: there is no place where it would hold the camera"
-        return _Estimate(np.zeros(len(AXES)), 2 * PRIOR), _Judgement(Finding.UNKNOWN, reason)
+        return _Estimate(np.zeros(len(AXES)), 2 * PRIOR), _Judgement(AxisFinding.UNKNOWN, reason)
     best = peaks[0]
     nothing = _Estimate(best.offsets, 2 * PRIOR)
     rivals = [rival for rival in peaks[1:] if np.less(*lead(best, rival))]
@@ -161,12 +161,16 @@ def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
     if max(best.height, LEAD * error) < FIT * scorer.edges:  # A right calibration would have a higher score.
         within = f"{np.degrees(REACH):.1f} deg"
         reason = f"the edges of image and cloud do not agree anywhere within {within} of what is stated"
-        return _Judgement(Finding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)")
+        return _Judgement(
+            AxisFinding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)"
+        )
     shown, taken = max(round(independent_views(best)), 1), len(scorer.shots)
     frames = f"{shown} frame{'s' if shown > 1 else ''}"
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
-    return _Judgement(Finding.UNKNOWN, f"too little data: in {frames} several alignments fit about as well")
+    return _Judgement(
+        AxisFinding.UNKNOWN, f"too little data: in {frames} several alignments fit about as well"
+    )
 
 
 def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Judgement | None:
@@ -188,7 +192,7 @@ def _halves(taken: Sequence[Shot], peaks: list[Peak], free: Bool) -> _Judgement 
     axis = AXES[row]
     values = ", ".join(f"{offsets[row] * axis.scale:+.{axis.decimals}f}" for offsets in (first, second))
     reason = f"the two halves of the frames disagree on the {axis.what} ({values} {axis.unit})"
-    return _Judgement(Finding.CONFLICT, f"{reason}, as if the camera had been moved on the way")
+    return _Judgement(AxisFinding.CONFLICT, f"{reason}, as if the camera had been moved on the way")
 
 
 # --- each axis ---------------------------------------------------------------------------------
@@ -220,14 +224,14 @@ def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: st
     if axis is AXES[TIME]:
         speeds = _speeds(shots)
         if len(speeds) < len(shots.shots):
-            return _Judgement(Finding.UNKNOWN, f"{MOTIONLESS} (no fixed frame in TF, no odometry)")
+            return _Judgement(AxisFinding.UNKNOWN, f"{MOTIONLESS} (no fixed frame in TF, no odometry)")
         if speeds.max() < STILL:
-            return _Judgement(Finding.UNKNOWN, f"the robot hardly moved ({speeds.max():.1f} m/s at most)")
+            return _Judgement(AxisFinding.UNKNOWN, f"the robot hardly moved ({speeds.max():.1f} m/s at most)")
     if abs(offset) > max(CERTAIN * interval, axis.least):
-        return _Judgement(Finding.OFF)
+        return _Judgement(AxisFinding.OFF)
     if abs(offset) + interval <= axis.sure:
-        return _Judgement(Finding.FINE)
-    return _Judgement(Finding.UNKNOWN, rival or _why_unsure(shots, axis))
+        return _Judgement(AxisFinding.FINE)
+    return _Judgement(AxisFinding.UNKNOWN, rival or _why_unsure(shots, axis))
 
 
 def _why_unsure(shots: Shots, axis: Axis) -> str:

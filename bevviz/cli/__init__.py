@@ -36,8 +36,8 @@ from bevviz.cli import (
     workbench,
 )
 from bevviz.cli.inputs import check_outputs
-from bevviz.cli.machine import with_json
-from bevviz.cli.options import follow_recording, with_negatives
+from bevviz.cli.machine import join_json_option
+from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
 from bevviz.support.version import __version__
@@ -89,7 +89,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser, commands = _parser()
         if "_ARGCOMPLETE" in os.environ:
             completion.complete(parser)
-        command_line = with_json(with_negatives(sys.argv[1:] if arguments is None else arguments))
+        command_line = join_json_option(
+            join_negative_numbers(sys.argv[1:] if arguments is None else arguments)
+        )
         if not command_line:
             parser.print_help()
             return 2
@@ -98,7 +100,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         options = parser.parse_args(command_line)
         if options.verbose:
             _log_to_stderr()
-        outputs.speak(quiet=options.quiet)
+        outputs.set_up_notes(quiet=options.quiet)
         follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
@@ -114,12 +116,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except Exception as error:
-        if interrupt_in(error) or interrupts.came():
+        if interrupt_in(error) or interrupts.signal_came():
             print("bevviz: interrupted", file=sys.stderr)
             return 130
-        from bevviz.support.files import full_disk
+        from bevviz.support.files import full_disk_error
 
-        if (disk_message := full_disk(error)) is not None:
+        if (disk_message := full_disk_error(error)) is not None:
             _log().debug("what led to the error", exc_info=error)
             print(f"{style.error('bevviz: error:')} {disk_message}", file=sys.stderr)
             return 2

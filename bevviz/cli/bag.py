@@ -17,7 +17,7 @@ from bevviz.cli.options import (
 )
 from bevviz.cli.outputs import Outputs
 from bevviz.cli.run import process
-from bevviz.support.contexts import without_collections
+from bevviz.support.contexts import garbage_collection_off
 
 
 def add(commands: Commands) -> None:
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
     bag.set_defaults(run=_bag)
 
 
-@without_collections()
+@garbage_collection_off()
 def _bag(options: argparse.Namespace) -> int:
     from bevviz.drive import Drive
 

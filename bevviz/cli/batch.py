@@ -10,7 +10,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable, wait_for_interrupt
+from bevviz.cli.interrupts import interruptible, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
     Commands,
@@ -23,7 +23,7 @@ from bevviz.cli.options import (
     port,
     positive,
 )
-from bevviz.cli.outputs import hint, say, warn
+from bevviz.cli.outputs import print_hints, say, warn
 from bevviz.errors import UserError
 from bevviz.support import progress
 
@@ -92,20 +92,20 @@ def add(commands: Commands) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from bevviz.fleet.batch import claimed, whole_results
+    from bevviz.fleet.batch import intact_results, lock_folder
 
     limits = _limits(options)
     if options.catalog and options.serve_catalog:
         raise UserError("--catalog and --serve-catalog: give one of them")
     failed: list[tuple[str, str]] = []
-    with claimed(options.output):
+    with lock_folder(options.output):
         if options.paths:
             jobs = _jobs(options)
             interrupted = _run(jobs, options, failed)
             complete = [(job.table, info) for job in jobs if (info := job.complete())]
         else:
             interrupted = False
-            complete = whole_results(options.output.resolve(), _warn)
+            complete = intact_results(options.output.resolve(), _warn)
         return _sum_up(complete, failed, limits, options, interrupted)
 
 
@@ -132,7 +132,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     blueprints.load(options.blueprint, Scene("", "lidar"))
     if config.detector.model:
         Detector(config.detector)
-    hint(Scene("", "lidar", cameras=("any",)), config)
+    print_hints(Scene("", "lidar", cameras=("any",)), config)
     return jobs
 
 
@@ -144,15 +144,15 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
         options: of the command.
         failed: filled with the name and the error of each failed bag.
     """
-    from bevviz.fleet.batch import left_to_do
+    from bevviz.fleet.batch import unfinished_jobs
 
-    todo = left_to_do(jobs, options.force, _warn)
+    todo = unfinished_jobs(jobs, options.force, _warn)
     if len(todo) < len(jobs):
         say(f"{len(jobs) - len(todo)} of {len(jobs)} bags are complete and up to date")
     frames = 0
     try:
         with (
-            terminable() as ended,
+            interruptible() as ended,
             progress.bar(total=len(jobs), initial=len(jobs) - len(todo), unit="bag") as bar,
         ):
 
@@ -221,9 +221,9 @@ def _sum_up(
         if interrupted:
             url = None
         elif options.serve_catalog:
-            from bevviz.fleet.catalog import served
+            from bevviz.fleet.catalog import serve_catalog
 
-            url, viewer = stack.enter_context(served(options.serve_catalog, options.bind))
+            url, viewer = stack.enter_context(serve_catalog(options.serve_catalog, options.bind))
         if url:
             from bevviz.fleet.catalog import register
 
@@ -250,9 +250,9 @@ def _gate(
     junit: Path | None,
 ) -> bool:
     """Return whether every bag is within every limit."""
-    from bevviz.evaluate.gate import Kept, check, write_junit
+    from bevviz.evaluate.gate import LimitResult, check, write_junit
 
-    suites: dict[str, list[Kept] | str] = dict(failed)
+    suites: dict[str, list[LimitResult] | str] = dict(failed)
     for table, info in complete:
         metrics = {name: value for name, value in (info.metrics or {}).items() if value is not None}
         suites[table.stem] = check(limits, metrics)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -73,8 +73,8 @@ def _calib(options: argparse.Namespace) -> int:
                 steps.update(round(100 * share) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
-    give(options, "calib", {"cameras": [result.to_dict() for result in results]})
-    if not on_stdout(options):
+    write_json(options, "calib", {"cameras": [result.to_dict() for result in results]})
+    if not json_on_stdout(options):
         _print(results)
     if options.write is not None:
         _write(results, options.write)
@@ -108,10 +108,10 @@ def _print(results: list[Calibration]) -> None:
 
 
 def _write(results: list[Calibration], path: Path) -> None:
-    from bevviz.calib.result import configuration
-    from bevviz.support.files import save
+    from bevviz.calib.result import correction_yaml
+    from bevviz.support.files import save_text
 
-    save(path, configuration(results), "--write")
+    save_text(path, correction_yaml(results), "--write")
     say(f"configuration in {path}{'' if any(r.moved for r in results) else ': all as it is stated'}")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -15,11 +15,11 @@ from bevviz.cli.options import (
     add_output,
     add_selection,
     add_truth,
-    loaded,
+    load_config_from,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, hint, say, warn
-from bevviz.cli.run import logged
+from bevviz.cli.outputs import Outputs, print_hints, say, warn
+from bevviz.cli.run import run_logged
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _run(
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
 
     def observers(recording: RecordingStream) -> list[Observer[ComparedFrame]]:
-        hint(source.scene, config)
+        print_hints(source.scene, config)
         return [ComparisonRecorder(recording, *configs, summary), summary, failures]
 
     def finish() -> None:
@@ -141,7 +141,7 @@ def _run(
             say(f"{summary.without} frames for which the robot published nothing are left out")
         _report(summary, options)
 
-    return logged(
+    return run_logged(
         source,
         processor,
         config,
@@ -159,7 +159,7 @@ def _saved(options: argparse.Namespace) -> int:
     if has_sides or options.truth or options.kitti_labels:
         raise UserError("compare: two .rrd files are compared as they are; leave the sides and the truth out")
     pair = SavedPair(*options.paths)
-    return logged(
+    return run_logged(
         pair,
         pair,
         Config(),
@@ -174,9 +174,9 @@ def _default(options: argparse.Namespace) -> Path:
 
 
 def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
-    if not on_stdout(options):
+    if not json_on_stdout(options):
         print(summary.table(), flush=True)
-    give(options, "compare", summary.as_tree())
+    write_json(options, "compare", summary.as_tree())
     if options.csv is not None:
         summary.write_csv(options.csv)
 
@@ -197,7 +197,7 @@ def _side(options: argparse.Namespace, base: str | None, settings: list[str]) ->
     files = [] if options.config is None else [options.config]
     files += [] if base is None or base in presets else [Path(base)]
     model = [f"detector.model={options.model}"] if options.model else []
-    config = loaded(options, files, [*options.set, *model, *settings], preset)
+    config = load_config_from(options, files, [*options.set, *model, *settings], preset)
     default_name = options.config or (
         "as recorded" if _recorded(options) and preset is None else config.preset
     )

@@ -28,14 +28,14 @@ def add(commands: Commands) -> None:
 
 
 def _config(options: argparse.Namespace) -> int:
-    from bevviz.config import dump, stated_lines
-    from bevviz.config.descriptions import explain
+    from bevviz.config import config_yaml, stated_lines
+    from bevviz.config.descriptions import describe_parameters
 
     config = load_config(options)
     if options.key is not None:
-        print(explain(options.key, config))
+        print(describe_parameters(options.key, config))
         return 0
     for line in stated_lines(config):
         print(f"# {line}")
-    print(dump(config), end="")
+    print(config_yaml(config), end="")
     return 0

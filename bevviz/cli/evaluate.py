@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -18,8 +18,8 @@ from bevviz.cli.options import (
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, hint, say, warn
-from bevviz.cli.run import logged, through
+from bevviz.cli.outputs import Outputs, print_hints, say, warn
+from bevviz.cli.run import run_logged, run_with_progress
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.gate import Limit
-    from bevviz.model.protocols import Frames, Observer
+    from bevviz.model.protocols import FrameSource, Observer
     from bevviz.model.results import FrameResult
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
@@ -71,21 +71,23 @@ def _evaluate(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as frames:
         evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels))
-        status = _run(frames, config, evaluation, Outputs.of(options), table=not on_stdout(options))
+        status = _run(frames, config, evaluation, Outputs.of(options), table=not json_on_stdout(options))
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
         return _report(evaluation, limits, options) or status
 
 
-def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool) -> int:
+def _run(
+    frames: FrameSource, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool
+) -> int:
     """Run the pipeline with the evaluation and return the exit status."""
     from bevviz.anomalies import FailureSummary
     from bevviz.pipeline.session import Session
 
     session, failures = Session(config), FailureSummary()
     if not outputs:
-        hint(frames.scene, config)
-        end = through(frames, session, [evaluation, failures])
+        print_hints(frames.scene, config)
+        end = run_with_progress(frames, session, [evaluation, failures])
         warn([*frames.warnings, *failures.warnings])
         if end.interrupted:
             say(f"interrupted after {end.frames} frames; the table is of these")
@@ -95,7 +97,7 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
     from bevviz.recording.recorder import Recorder
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
-        hint(frames.scene, config)
+        print_hints(frames.scene, config)
         return [
             Recorder(recording, config, session.stages.provider),
             evaluation,
@@ -108,20 +110,20 @@ def _run(frames: Frames, config: Config, evaluation: Evaluation, outputs: Output
         if table:
             print(evaluation.table(), flush=True)
 
-    return logged(frames, session, config, outputs, observers, finish)
+    return run_logged(frames, session, config, outputs, observers, finish)
 
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
     """Print and write the results. Return the exit status of the gate: 1 if a limit is not kept, else 0."""
     from bevviz.evaluate.gate import check, write_junit
 
-    if not Outputs.of(options) and not on_stdout(options):
+    if not Outputs.of(options) and not json_on_stdout(options):
         print(evaluation.table())
     results = check(limits, evaluation.metrics)
     gate = [
         {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
     ]
-    give(options, "evaluate", {**evaluation.as_tree(), "limits": gate})
+    write_json(options, "evaluate", {**evaluation.as_tree(), "limits": gate})
     if options.junit is not None:
         write_junit(options.junit, {options.paths[0].resolve().stem: results})
     for result in results:

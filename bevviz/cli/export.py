@@ -13,8 +13,8 @@ from bevviz.cli.options import (
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import hint, say, warn
-from bevviz.cli.run import through
+from bevviz.cli.outputs import print_hints, say, warn
+from bevviz.cli.run import run_with_progress
 
 DESCRIPTION = """Write a drive, or a part of it, as a data set, with the objects that were found as labels to
 be corrected: the folders of KITTI's object benchmark (velodyne, image_2, calib, label_2), or a scene with the
@@ -59,10 +59,10 @@ def _export(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as source:
         drive = Drive(source, config)
-        hint(drive.scene, config)
+        print_hints(drive.scene, config)
         export = writer(options.out, options.camera)
         failures = FailureSummary()
-        end = through(drive.frames, drive.new_session(), [export, failures])
+        end = run_with_progress(drive.frames, drive.new_session(), [export, failures])
         warn([*source.warnings, *failures.warnings])
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
     say(f"{export.frames} frames with {export.labels} labels in {options.out}")

@@ -67,7 +67,7 @@ def _end_with_viewer() -> None:
     pipe = select.poll()
     pipe.register(sys.stdout, 0)  # poll() always reports errors and hang-ups.
     pipe.poll()
-    cleanup.remove()
+    cleanup.remove_all()
     os._exit(1)
 
 
@@ -75,9 +75,9 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     import rerun as rr
 
     from bevviz.bags.source import BagSource
-    from bevviz.cli.outputs import hint, warn
+    from bevviz.cli.outputs import print_hints, warn
     from bevviz.config import load
-    from bevviz.config.project import layers
+    from bevviz.config.project import read_project_layers
     from bevviz.config.trust import Trust
     from bevviz.drive import Drive
     from bevviz.recording import blueprints
@@ -86,11 +86,11 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
 
     # The viewer may open files of unknown origin. Never run the functions they name, even if trusted.
     no_trust = Trust(advice="Rerun's viewer runs none; 'bevviz' does, on the command line")
-    project_layers = layers(path if path.is_dir() else path.parent)
+    project_layers = read_project_layers(path if path.is_dir() else path.parent)
     config = load(layers=[replace(layer, trust=no_trust) for layer in project_layers])
     with BagSource([path], config) as source:
         drive = Drive(source, config)
-        hint(drive.scene, config)
+        print_hints(drive.scene, config)
         recording = rr.RecordingStream(application_id or "bevviz", recording_id=recording_id)
         recording.set_log_time_enabled(False)
         recording.stdout(default_blueprint=blueprints.load("debug", drive.scene, config))

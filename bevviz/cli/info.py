@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_config,
@@ -44,23 +44,23 @@ def add(commands: Commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from bevviz.pipeline.bag_info import as_tree, describe, render
+    from bevviz.pipeline.bag_info import contents_tree, describe_bag, render_bag_info
 
     if options.live:
         from bevviz.live import graph_info as info
 
         seconds = options.seconds or info.LISTEN
         live = info.describe(load_config(options), options.ros_args, seconds)
-        give(options, "info", as_tree(live))
-        if not on_stdout(options):
+        write_json(options, "info", contents_tree(live))
+        if not json_on_stdout(options):
             print(info.render(live))
         return 0
     if options.seconds is not None:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
-    bag_info = describe(options.paths, load_config(options))
-    give(options, "info", as_tree(bag_info))
-    if not on_stdout(options):
-        print(render(bag_info))
+    bag_info = describe_bag(options.paths, load_config(options))
+    write_json(options, "info", contents_tree(bag_info))
+    if not json_on_stdout(options):
+        print(render_bag_info(bag_info))
     return 0

@@ -18,7 +18,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _came = Event()  # Set by every signal, even if its exception got lost.
 
 
-def came() -> bool:
+def signal_came() -> bool:
     """Return whether a signal came. An exception raised during an import can arrive as another one."""
     return _came.is_set()
 
@@ -47,7 +47,7 @@ def leave(status: int) -> None:
     """
     threads = threading.enumerate()
     is_endless = any(thread.name == cleanup.ENDLESS_THREAD for thread in threads)
-    if is_endless or (came() and any(thread.daemon for thread in threads)):
+    if is_endless or (signal_came() and any(thread.daemon for thread in threads)):
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
@@ -59,8 +59,8 @@ def _interrupt(number: int, stack: object) -> None:
 
     Imports and libraries may swallow the exception. So it is raised only if it is needed.
     """
-    if not cleanup.any_unfinished():
-        cleanup.remove()
+    if not cleanup.is_any_unfinished():
+        cleanup.remove_all()
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
     _came.set()
@@ -68,7 +68,7 @@ def _interrupt(number: int, stack: object) -> None:
 
 
 @contextmanager
-def terminable() -> Iterator[Event]:
+def interruptible() -> Iterator[Event]:
     """Raise KeyboardInterrupt and set the yielded event when a signal comes.
 
     The event is needed because an exception can get lost while a library calls back into Python. After
@@ -97,5 +97,5 @@ def terminable() -> Iterator[Event]:
 
 def wait_for_interrupt() -> None:
     """Wait for a signal."""
-    with suppress(KeyboardInterrupt), terminable():
+    with suppress(KeyboardInterrupt), interruptible():
         signal.pause()

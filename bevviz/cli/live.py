@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable
+from bevviz.cli.interrupts import interruptible
 from bevviz.cli.options import (
     Commands,
     add_config,
@@ -28,7 +28,7 @@ from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.config.reloading import Settings
+    from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.control import Control
     from bevviz.live.notes import Notes
     from bevviz.live.raw_recorder import RawRecorder
@@ -118,7 +118,7 @@ def _split(text: str) -> str:
 def _live(options: argparse.Namespace) -> int:
     # Silence Rerun's warning about files without an index. They get one when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
-    from bevviz.config.reloading import Settings
+    from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.notes import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -143,7 +143,7 @@ def _live(options: argparse.Namespace) -> int:
         raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
-    settings = Settings(
+    settings = ReloadableConfig(
         options.config, [*options.set, *option_settings], options.preset, project_layers(options)
     )
     _check_outputs(options)
@@ -180,7 +180,7 @@ def _check_outputs(options: argparse.Namespace) -> None:
 
 def _watch_robot(
     source: LiveSource,
-    settings: Settings,
+    settings: ReloadableConfig,
     options: argparse.Namespace,
     notes: Notes,
     loader: StageLoader,
@@ -210,7 +210,7 @@ def _watch_robot(
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
         reported_missing = ""
-        with suppress(KeyboardInterrupt), terminable() as ended:
+        with suppress(KeyboardInterrupt), interruptible() as ended:
             while not source.wait(1.0):
                 missing = source.missing
                 if missing and missing != reported_missing:
@@ -256,7 +256,7 @@ def _replay(frames: int) -> Replay:
 
 def _watch(
     source: Source,
-    settings: Settings,
+    settings: ReloadableConfig,
     options: argparse.Namespace,
     notes: Notes,
     loader: StageLoader,
@@ -295,7 +295,7 @@ def _watch(
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
-        terminable(),
+        interruptible(),
         _page(options, live),
         progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
@@ -334,12 +334,12 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
         return nullcontext()
     try:
         from bevviz.workbench.live_page import LivePage
-        from bevviz.workbench.live_session import LiveBench
+        from bevviz.workbench.live_session import LiveSession
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    page = LivePage(LiveBench(live), options.workbench or None)
+    page = LivePage(LiveSession(live), options.workbench or None)
     say(f"workbench at {page.address}", always=True)
     return page
 

@@ -24,7 +24,7 @@ def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
     )
 
 
-def with_json(arguments: Iterable[str]) -> list[str]:
+def join_json_option(arguments: Iterable[str]) -> list[str]:
     """Replace ``--json PATH`` by ``--json=- PATH``, unless PATH is a .json file."""
     joined: list[str] = []
     for argument in arguments:
@@ -34,12 +34,12 @@ def with_json(arguments: Iterable[str]) -> list[str]:
     return joined
 
 
-def on_stdout(options: argparse.Namespace) -> bool:
+def json_on_stdout(options: argparse.Namespace) -> bool:
     """Return whether JSON replaces the text on standard output."""
     return str(options.json) == STDOUT
 
 
-def give(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> None:
+def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> None:
     """Print or write the result if ``--json`` is given.
 
     Args:
@@ -54,13 +54,13 @@ def give(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> Non
         return
     import json
 
-    from bevviz.support.files import save
+    from bevviz.support.files import save_text
 
     text = json.dumps({"form": f"bevviz.{form}/1", **_plain(tree)}, indent=1, allow_nan=False)
-    if on_stdout(options):
+    if json_on_stdout(options):
         print(text, flush=True)
     else:
-        save(options.json, f"{text}\n", OPTION)
+        save_text(options.json, f"{text}\n", OPTION)
 
 
 def _plain(value: Any) -> Any:

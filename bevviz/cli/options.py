@@ -13,7 +13,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
     from bevviz.config import Config, Layer, Preset
-    from bevviz.recording.source_lookup import Recorded
+    from bevviz.recording.source_lookup import RecordingSource
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -109,7 +109,7 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")
     group.add_argument("--end", metavar="TIME", help="stop at this time")
     group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
-    group.add_argument("--frames", type=slice_, metavar="A:B", help="run scans A to B-1, counted from 0")
+    group.add_argument("--frames", type=frame_range, metavar="A:B", help="run scans A to B-1, counted from 0")
 
 
 def number(text: str) -> int:
@@ -233,10 +233,10 @@ def add_ros_args(parser: argparse.ArgumentParser) -> None:
 
 def load_config(options: argparse.Namespace) -> Config:
     """Return the requested configuration, ``--model`` included."""
-    return loaded(options, options.config, given_settings(options), options.preset)
+    return load_config_from(options, options.config, collect_settings(options), options.preset)
 
 
-def given_settings(options: argparse.Namespace) -> list[str]:
+def collect_settings(options: argparse.Namespace) -> list[str]:
     """Return the settings of ``--set``, ``--model``, ``--keep`` and the data set, as ``key=value``."""
     model = getattr(options, "model", None)
     return [
@@ -257,7 +257,7 @@ def _dataset(options: argparse.Namespace) -> list[str]:
     return [f"source.{key}={value}" for key, value in values.items() if value is not None]
 
 
-def loaded(
+def load_config_from(
     options: argparse.Namespace,
     file: Path | Sequence[Path] | None,
     settings: Sequence[str],
@@ -266,7 +266,7 @@ def loaded(
     """Load a configuration on top of the recording's, if the input is one, else of the project's."""
     from bevviz.config import load
 
-    recorded: Recorded | None = getattr(options, "recorded", None)
+    recorded: RecordingSource | None = getattr(options, "recorded", None)
     settings = [*settings, *_dataset(options)]
     if recorded is not None:
         config = recorded.load(file, settings, preset)
@@ -285,14 +285,14 @@ def project_layers(options: argparse.Namespace) -> list[Layer]:
     The files are read once.
 
     Raises:
-        UserError: as ``bevviz.config.project.layers``.
+        UserError: as ``bevviz.config.project.read_project_layers``.
     """
-    from bevviz.config.project import layers
+    from bevviz.config.project import read_project_layers
 
     if getattr(options, "recorded", None) is not None:
         return []
     if not hasattr(options, "layers"):
-        options.layers = layers(Path.cwd())
+        options.layers = read_project_layers(Path.cwd())
     project: list[Layer] = options.layers
     return project
 
@@ -303,7 +303,7 @@ def follow_recording(options: argparse.Namespace) -> None:
     A recording without a bag becomes ``options.shown`` if the command can show recordings.
 
     Raises:
-        UserError: as ``bevviz.recording.source_lookup.follow``; ``--bag`` without a recording.
+        UserError: as ``bevviz.recording.source_lookup.find_source``; ``--bag`` without a recording.
     """
     if not hasattr(options, "bags") or getattr(options, "check", False):
         return
@@ -313,10 +313,10 @@ def follow_recording(options: argparse.Namespace) -> None:
             raise UserError("--bag says where the bag of a recording is: PATH has to be one .rrd file")
         return
     from bevviz.cli.outputs import say, warn
-    from bevviz.recording.source_lookup import NoBagError, follow
+    from bevviz.recording.source_lookup import NoBagError, find_source
 
     try:
-        recorded = follow(paths[0], options.bags, given_settings(options))
+        recorded = find_source(paths[0], options.bags, collect_settings(options))
     except NoBagError:
         if not getattr(options, "shows_recordings", False) or options.bags:
             raise
@@ -327,7 +327,7 @@ def follow_recording(options: argparse.Namespace) -> None:
     warn(recorded.warnings)
 
 
-def with_negatives(arguments: Iterable[str]) -> list[str]:
+def join_negative_numbers(arguments: Iterable[str]) -> list[str]:
     """Return the arguments with ``--point -5,1,0`` replaced by ``--point=-5,1,0``.
 
     Argparse takes the negative number for an option.
@@ -356,7 +356,7 @@ def port(text: str) -> int:
     return int(text)
 
 
-def slice_(text: str) -> tuple[int | None, int | None]:
+def frame_range(text: str) -> tuple[int | None, int | None]:
     """Parse ``A:B``. An empty end is None."""
     first, colon, last = text.partition(":")
     if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):

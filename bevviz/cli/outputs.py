@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.model.frame import Scene
-    from bevviz.recording.sinks import Sinks
+    from bevviz.recording.sinks import OpenRecording
 
 
 class Outputs(NamedTuple):
@@ -69,7 +69,7 @@ class Outputs(NamedTuple):
         return chosen._replace(save=default, unseen=True)
 
     @contextmanager
-    def opened(self, scene: Scene, config: Config) -> Iterator[Sinks]:
+    def opened(self, scene: Scene, config: Config) -> Iterator[OpenRecording]:
         """Open a recording with these outputs and print their addresses."""
         from bevviz.recording.sinks import open_recording
 
@@ -90,7 +90,7 @@ class Outputs(NamedTuple):
             warn(sinks.warnings)
             yield sinks
 
-    def keep_serving(self, sinks: Sinks, what: str = "") -> None:
+    def keep_serving(self, sinks: OpenRecording, what: str = "") -> None:
         """Serve until the user ends it, if a server is requested."""
         if self.serve is not None:
             from bevviz.recording.saved_viewer import too_large_for_web
@@ -105,11 +105,11 @@ class Outputs(NamedTuple):
 _quiet = False
 
 
-def speak(*, quiet: bool) -> None:
+def set_up_notes(*, quiet: bool) -> None:
     """Print notes and progress on stderr, unless ``quiet``. A process that is a command calls this."""
     global _quiet
     _quiet = quiet
-    progress.to(None if quiet else say, bars=not quiet)
+    progress.set_receiver(None if quiet else say, bars=not quiet)
 
 
 def say(line: str, *, always: bool = False) -> None:
@@ -124,7 +124,7 @@ def warn(warnings: Iterable[str]) -> None:
         print(f"bevviz: {style.warning('warning:')} {printable(warning)}", file=sys.stderr)
 
 
-def hint(scene: Scene, config: Config) -> None:
+def print_hints(scene: Scene, config: Config) -> None:
     """Tell the user which missing input or setting would give more."""
     from bevviz.support.kernel import CACHED
 
@@ -137,7 +137,7 @@ def hint(scene: Scene, config: Config) -> None:
         say("no detector: give --model FILE.onnx, or name it in bevviz.toml, to find objects in the images")
 
 
-def tell_of_browser(address: str) -> None:
+def announce_viewer(address: str) -> None:
     """Print the address of a viewer and how to reach it from elsewhere. Open the browser if there is one."""
     say(f"viewer at {address}", always=True)
     ports = [str(port) for port in re.findall(r":(\d+)", unquote(address))]

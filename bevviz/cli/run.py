@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from bevviz.cli.interrupts import terminable
-from bevviz.cli.outputs import Outputs, hint, program, say, warn
+from bevviz.cli.interrupts import interruptible
+from bevviz.cli.outputs import Outputs, print_hints, program, say, warn
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -23,12 +23,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def through(items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]) -> RunEnd:
+def run_with_progress(
+    items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]
+) -> RunEnd:
     """Run the frames with a progress bar. After a signal the run ends with the current frame."""
     from bevviz.pipeline.progress_bar import Progress
     from bevviz.pipeline.run import run
 
-    with terminable() as ended:
+    with interruptible() as ended:
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
@@ -48,7 +50,7 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     recorders: list[Recorder] = []
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
-        hint(drive.scene, drive.config)
+        print_hints(drive.scene, drive.config)
         recorders.append(Recorder(recording, drive.config, session.stages.provider))
         return [*recorders, anomalies, failures]
 
@@ -57,10 +59,10 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
         warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")
 
-    return logged(drive.frames, session, drive.config, outputs.or_file(default), observers, finish)
+    return run_logged(drive.frames, session, drive.config, outputs.or_file(default), observers, finish)
 
 
-def logged(
+def run_logged(
     items: Items[T],
     processor: Processor[T, R],
     config: Config,
@@ -87,7 +89,7 @@ def logged(
         all_observers = [*observers(sinks.recording), DiskWatch(sinks)]
         early_warnings = list(items.warnings)  # Print these warnings before the long run, not after it.
         warn(early_warnings)
-        end = through(items, processor, all_observers)
+        end = run_with_progress(items, processor, all_observers)
         warn(warning for warning in items.warnings if warning not in early_warnings)
         finish()
         if end.frames and not end.interrupted:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -15,11 +15,11 @@ from bevviz.cli.options import (
     add_output,
     add_selection,
     add_truth,
-    loaded,
+    load_config_from,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, hint, say, warn
-from bevviz.cli.run import through
+from bevviz.cli.outputs import Outputs, print_hints, say, warn
+from bevviz.cli.run import run_with_progress
 
 if TYPE_CHECKING:
     from bevviz.config import Config
@@ -44,7 +44,7 @@ def add(commands: Commands) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from bevviz.config import flattened
+    from bevviz.config import flatten
     from bevviz.evaluate import truth_source
     from bevviz.pipeline.variants import common_frames
     from bevviz.sweep import Sweep, combine, parse
@@ -54,7 +54,7 @@ def _sweep(options: argparse.Namespace) -> int:
     model = [f"detector.model={options.model}"] if options.model else []
 
     def configured(settings: list[str]) -> Config:
-        return loaded(options, options.config, [*constant, *model, *settings], options.preset)
+        return load_config_from(options, options.config, [*constant, *model, *settings], options.preset)
 
     configs = combine(parameters, configured)
     config = common_frames(configs.values())
@@ -65,16 +65,16 @@ def _sweep(options: argparse.Namespace) -> int:
         with ExitStack() as stack:
             # The run may take long. Report an output that cannot be opened before it.
             sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None
-            hint(source.scene, config)
-            end = through(source, sweep, [])
+            print_hints(source.scene, config)
+            end = run_with_progress(source, sweep, [])
             warn(source.warnings)
-            if not on_stdout(options):
+            if not json_on_stdout(options):
                 print(sweep.table())
-            give(options, "sweep", sweep.as_tree())
+            write_json(options, "sweep", sweep.as_tree())
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
-                values = flattened(configured([]).model_dump())
+                values = flatten(configured([]).model_dump())
                 present = {p.key: f"{values.get(p.key, '')}" for p in parameters}
                 log_sweep(sinks.recording, sweep, source.scene.name, present)
                 if not end.interrupted:

@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
 
 def _trust(options: argparse.Namespace) -> int:
     from bevviz.config.project import named_code
-    from bevviz.config.trust import allow, revoke
+    from bevviz.config.trust import grant_trust, revoke_trust
 
     if options.list:
         if options.path is not None:
@@ -50,7 +50,7 @@ def _trust(options: argparse.Namespace) -> int:
         return _list()
     path = _file(options.path)
     if options.revoke:
-        if not revoke(path):
+        if not revoke_trust(path):
             raise UserError(f"{path}: is not trusted; 'bevviz trust --list' says what is")
         print(f"{path}: no longer trusted")
         return 0
@@ -60,15 +60,15 @@ def _trust(options: argparse.Namespace) -> int:
         return 0
     if not code.is_regular:
         raise UserError(f"{path}: is no file that can be trusted: name the function by --set")
-    allow(code)
+    grant_trust(code)
     print(f"{path}: trusted, with {code}")
     return 0
 
 
 def _list() -> int:
-    from bevviz.config.trust import records
+    from bevviz.config.trust import trust_records
 
-    trusted = list(records())
+    trusted = list(trust_records())
     for record in trusted:
         print(f"{record.path}: {', '.join(record.functions)}{_state(record.path, record.sha256)}")
     if not trusted:
@@ -88,12 +88,12 @@ def _state(path: Path, sha256: str) -> str:
 
 def _file(path: Path | None) -> Path:
     """Return the file to trust: the path itself, or the project file of its folder or of one above."""
-    from bevviz.config.project import NAME, find
+    from bevviz.config.project import NAME, find_project_file
 
     if path is not None and not path.is_dir():
         return path
     folder = Path.cwd() if path is None else path.absolute()
-    project_file = find(folder)
+    project_file = find_project_file(folder)
     if project_file is None:
         raise UserError(f"{os.path.relpath(folder)}: there is no {NAME} in this folder, or in one above")
     return project_file

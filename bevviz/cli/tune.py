@@ -7,23 +7,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable
+from bevviz.cli.interrupts import interruptible
 from bevviz.cli.options import (
     Commands,
     add_at,
     add_bag,
     add_config,
     add_output,
-    given_settings,
-    loaded,
+    collect_settings,
+    load_config_from,
     project_layers,
 )
-from bevviz.cli.outputs import Outputs, hint, say, warn
+from bevviz.cli.outputs import Outputs, print_hints, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Layer
-    from bevviz.config.reloading import Settings
+    from bevviz.config.reloading import ReloadableConfig
     from bevviz.model.frame import Frame, Scene
 
 
@@ -44,29 +44,29 @@ def add(commands: Commands) -> None:
 
 
 def _tune(options: argparse.Namespace) -> int:
-    from bevviz.config import dump, load
-    from bevviz.config.reloading import Settings
-    from bevviz.pipeline.run import Dropping, run
+    from bevviz.config import config_yaml, load
+    from bevviz.config.reloading import ReloadableConfig
+    from bevviz.pipeline.run import DropPolicy, run
     from bevviz.recording.ports import free_port
-    from bevviz.sweep.tune import OneFrame, Saves, Version, VersionRecorder, create
+    from bevviz.sweep.tune import ConfigSaves, FrameTuner, Version, VersionRecorder, create_config_file
 
-    option_settings = given_settings(options)
+    option_settings = collect_settings(options)
     recorded_layers: list[Layer] = []
-    if not options.config.exists() and create(
-        options.config, dump(loaded(options, None, option_settings, options.preset))
+    if not options.config.exists() and create_config_file(
+        options.config, config_yaml(load_config_from(options, None, option_settings, options.preset))
     ):
         say(f"{options.config}: made, with every parameter")
     elif (recorded := getattr(options, "recorded", None)) is not None:
         say(f"{options.config}: is there already, and taken instead of the recording's configuration")
         recorded_layers = [recorded.missing(load(options.config, option_settings, options.preset))]
-    settings = Settings(
+    settings = ReloadableConfig(
         options.config, [*recorded_layers, *option_settings], options.preset, project_layers(options)
     )
     frame, scene, warnings = _frame(options, settings)
     outputs = Outputs.of(options).or_viewer()
     if not outputs:
         outputs = outputs._replace(serve=free_port(9090))
-    processor = OneFrame(frame)
+    processor = FrameTuner(frame)
     processor.check(settings.config)
     last = 0
 
@@ -79,17 +79,17 @@ def _tune(options: argparse.Namespace) -> int:
             say(f"save {options.config} to run it again; Ctrl-C ends")
 
     with outputs.opened(scene, settings.config) as sinks:
-        hint(scene, settings.config)
+        print_hints(scene, settings.config)
         warn(warnings)
-        saves = Saves(settings, scene, processor.check, lambda error: say(f"not taken: {error}"))
+        saves = ConfigSaves(settings, scene, processor.check, lambda error: say(f"not taken: {error}"))
         recorder = VersionRecorder(sinks.recording, settings.config, print_version)
-        with terminable() as ended:
-            run(saves, processor, [recorder], dropping=Dropping(), stop=ended)
+        with interruptible() as ended:
+            run(saves, processor, [recorder], dropping=DropPolicy(), stop=ended)
     say(f"ended at version {last}")
     return 0
 
 
-def _frame(options: argparse.Namespace, settings: Settings) -> tuple[Frame, Scene, Sequence[str]]:
+def _frame(options: argparse.Namespace, settings: ReloadableConfig) -> tuple[Frame, Scene, Sequence[str]]:
     """Return the decoded frame, the sensors' names, and the warnings about the bag."""
     from bevviz.bags.source import BagSource
 

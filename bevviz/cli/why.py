@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.machine import add_json, give, on_stdout
+from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_at,
@@ -21,12 +21,12 @@ from bevviz.cli.options import (
 from bevviz.cli.outputs import Outputs, say, warn
 from bevviz.errors import UserError
 from bevviz.support import progress
-from bevviz.support.contexts import without_collections
+from bevviz.support.contexts import garbage_collection_off
 
 if TYPE_CHECKING:
     from bevviz.model.frame import Scene
     from bevviz.model.results import FrameResult
-    from bevviz.why import Answer, Questioner, Selection
+    from bevviz.why import Answer, FrameExplainer, Selection
 
 EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx                  whatever went wrong in that frame
@@ -111,14 +111,14 @@ def _metres(text: str) -> float:
     return value
 
 
-@without_collections()
+@garbage_collection_off()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
     from bevviz.support.text import printable
-    from bevviz.why import Questioner
-    from bevviz.why.answer_text import plain
+    from bevviz.why import FrameExplainer
+    from bevviz.why.answer_text import plain_text
 
     config, selection = load_config(options), _selection(options)
     with BagSource(options.paths, config, at=options.at) as source:
@@ -132,15 +132,15 @@ def _why(options: argparse.Namespace) -> int:
             raise UserError(f"{option}: the scan there cannot be read")
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.explained(frame)
-        questioner = Questioner(result, loader, session.stages.class_names)
+        questioner = FrameExplainer(result, loader, session.stages.class_names)
         answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
         neighbours = _neighbours(questioner, selection, answers)
         headline = _headline(questioner, selection)
-        give(options, "why", _tree(result, answers, neighbours, headline))
-        if not on_stdout(options):
+        write_json(options, "why", _tree(result, answers, neighbours, headline))
+        if not json_on_stdout(options):
             print(printable(f"frame {frame.index}, preset {config.preset}: {headline}"))
             if answers:
-                print(f"\n{plain(answers, options.limit, neighbours)}")
+                print(f"\n{plain_text(answers, options.limit, neighbours)}")
         if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
@@ -162,7 +162,7 @@ def _selection(options: argparse.Namespace) -> Selection:
     )
 
 
-def _neighbours(questioner: Questioner, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
+def _neighbours(questioner: FrameExplainer, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
     """Return the answers about other objects at the selected place."""
     if not (selection.box or selection.point or selection.cell):
         return []
@@ -170,16 +170,16 @@ def _neighbours(questioner: Questioner, selection: Selection, answers: Sequence[
     return [answer for answer in questioner.candidates(selection) if answer.subject.key not in answered]
 
 
-def _headline(questioner: Questioner, selection: Selection) -> str:
+def _headline(questioner: FrameExplainer, selection: Selection) -> str:
     """Return one line about the selected objects, or the reason why there are none."""
-    from bevviz.why.answer_text import summary
+    from bevviz.why.answer_text import summary_line
     from bevviz.why.sentences import not_run
 
     answers = questioner.ask(selection)
     if selection.one:
         return answers[0].subject.name
     if answers:
-        return summary(answers)
+        return summary_line(answers)
     reasons = "; ".join(not_run(questioner.traces.result, selection.camera))
     problem = f"no {selection.label} is known" if selection.label else "no object is known"
     if reasons:
@@ -204,14 +204,14 @@ def _tree(
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:
-    from bevviz.recording.frame_logger import Logger
-    from bevviz.why.log import focus, log_answers
+    from bevviz.recording.frame_logger import FrameLogger
+    from bevviz.why.log import focus_point, log_answers
 
-    if answers and (position := focus(result.frame, answers[0])) is not None:
+    if answers and (position := focus_point(result.frame, answers[0])) is not None:
         x, y, z = position.tolist()
         scene = replace(scene, focus=(x, y, z))
     with outputs.opened(scene, result.config) as sinks:
-        logger = Logger(sinks.recording, result.config, scene)
+        logger = FrameLogger(sinks.recording, result.config, scene)
         logger.log_static()
         logger.log(result)
         log_answers(sinks.recording, result.frame, answers, limit, result.config.bev)

@@ -8,7 +8,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.interrupts import terminable, wait_for_interrupt
+from bevviz.cli.interrupts import interruptible, wait_for_interrupt
 from bevviz.cli.options import (
     Commands,
     add_at,
@@ -18,11 +18,11 @@ from bevviz.cli.options import (
     load_config,
     port,
 )
-from bevviz.cli.outputs import has_display, hint, say, tell_of_browser, warn
+from bevviz.cli.outputs import announce_viewer, has_display, print_hints, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench
+    from bevviz.workbench.session import WorkbenchSession
 
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
@@ -80,9 +80,9 @@ def _open(options: argparse.Namespace) -> int:
         first = source.checked(number) if options.at is None else source.number_at(options.at)
         warn(source.warnings)
 
-        def make() -> Bench:
+        def make() -> WorkbenchSession:
             _arrow_without_pandas()
-            hint(source.scene, config)
+            print_hints(source.scene, config)
             bench = make_session()
             if native_viewer:
                 from bevviz.workbench.native_viewer import NativeViewer
@@ -90,17 +90,19 @@ def _open(options: argparse.Namespace) -> int:
                 bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
             return bench
 
-        def make_session() -> Bench:
+        def make_session() -> WorkbenchSession:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
-            from bevviz.workbench.session import Bench
-            from bevviz.workbench.truth_frames import Labelled
+            from bevviz.workbench.session import WorkbenchSession
+            from bevviz.workbench.truth_frames import LabelledFrames
 
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
             if truth_of is None or (options.truth is None and options.kitti_labels is None):
-                return Bench(Drive(source, config), second_source, options.paths, truth_of, first)
-            labelled, second_labelled = (Labelled(frames, truth_of) for frames in (source, second_source))
-            return Bench(Drive(labelled, config), second_labelled, options.paths, truth_of, first)
+                return WorkbenchSession(Drive(source, config), second_source, options.paths, truth_of, first)
+            labelled, second_labelled = (
+                LabelledFrames(frames, truth_of) for frames in (source, second_source)
+            )
+            return WorkbenchSession(Drive(labelled, config), second_labelled, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}", always=True)
@@ -110,7 +112,7 @@ def _open(options: argparse.Namespace) -> int:
                 webbrowser.open(address)
             say("open until Ctrl-C; only this machine can reach it")
 
-        with suppress(KeyboardInterrupt), terminable():  # The user ends it with a signal.
+        with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
             drive = "\n".join(str(path.resolve()) for path in options.paths)
             serve(make, drive, options.port, ready, "native" if native_viewer else "page")
     return 0
@@ -122,12 +124,12 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
 
     say(f"{recording}: no bag behind it, shown as it is")
     if has_display():
-        saved_viewer.in_viewer(recording)
+        saved_viewer.open_in_viewer(recording)
         return 0
     if larger := saved_viewer.too_large_for_web(recording, recording.stat().st_size):
         warn([larger])
-    with saved_viewer.in_browser(recording, options.port) as address:
-        tell_of_browser(address)
+    with saved_viewer.serve_in_browser(recording, options.port) as address:
+        announce_viewer(address)
         wait_for_interrupt()
     return 0
 

@@ -9,16 +9,16 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.compare.truth_score import Judged
+from bevviz.compare.truth_score import TruthComparison
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.results import FrameResult
 from bevviz.stages.fusion import assign
 
-REACH = 2.0  # metres between the centres of one object, in the bird's-eye view
-OVERLAP = 0.1  # least IoU of one object with two classes, in the bird's-eye view
+MAX_PAIR_DISTANCE = 2.0  # metres between the centres of one object, in the bird's-eye view
+MIN_BEV_IOU = 0.1  # least IoU of one object with two classes, in the bird's-eye view
 MOVED_DISTANCE = 0.2  # metres: an object has moved if its centre is further away
-IMAGE_OVERLAP = 0.5  # least IoU of one detection in the image
+MIN_IMAGE_IOU = 0.5  # least IoU of one detection in the image
 
 
 class Change(StrEnum):
@@ -49,7 +49,7 @@ class ImageBoxes:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SideResult:
     """Results of one side in a frame. Boxes are in ``Frame.points_frame``."""
 
     boxes: Boxes3D
@@ -87,18 +87,18 @@ class FrameDifferences:
 
     index: int
     stamp: int
-    a: Seen
-    b: Seen
+    a: SideResult
+    b: SideResult
     objects: tuple[Difference, ...]
     images: Mapping[str, tuple[Difference, ...]]  # by camera
-    judged: Judged | None = None  # None: no ground truth
+    judged: TruthComparison | None = None  # None: no ground truth
 
     @property
     def counts(self) -> Counter[Change]:
         """Number of objects of each kind of difference."""
         return Counter(difference.change for difference in self.objects)
 
-    def side_with(self, difference: Difference) -> tuple[Seen, int]:
+    def side_with(self, difference: Difference) -> tuple[SideResult, int]:
         """Return a side that has the object, and the object's row there. B comes first."""
         return (self.a, difference.row_a) if difference.row_b < 0 else (self.b, difference.row_b)
 
@@ -109,7 +109,7 @@ class FrameDifferences:
         return sum(difference.change is not Change.SAME for difference in pairs)
 
 
-def seen(result: FrameResult) -> Seen:
+def seen(result: FrameResult) -> SideResult:
     """Return the result of a run as one side of a comparison."""
     images = {}
     for camera in result.cameras:
@@ -122,11 +122,13 @@ def seen(result: FrameResult) -> Seen:
     if result.clusters is not None:
         clusters = int(result.clusters.kept.sum())
     if result.objects is None:
-        return Seen(Boxes3D.empty(), (), np.zeros(0, np.float32), images, clusters)
-    return Seen(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)
+        return SideResult(Boxes3D.empty(), (), np.zeros(0, np.float32), images, clusters)
+    return SideResult(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)
 
 
-def differences(index: int, stamp: int, a: Seen, b: Seen, judged: Judged | None = None) -> FrameDifferences:
+def differences(
+    index: int, stamp: int, a: SideResult, b: SideResult, judged: TruthComparison | None = None
+) -> FrameDifferences:
     """Return the differences of two sides in a frame."""
     both = [camera for camera in a.images if camera in b.images]
     return FrameDifferences(
@@ -140,7 +142,7 @@ def differences(index: int, stamp: int, a: Seen, b: Seen, judged: Judged | None 
     )
 
 
-def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
+def compare_objects(a: SideResult, b: SideResult) -> tuple[Difference, ...]:
     """Pair the objects of two sides. Each object of either side occurs once.
 
     Two boxes may be one object if they have the same class and their centres are within 2 m in the
@@ -154,8 +156,8 @@ def compare_objects(a: Seen, b: Seen) -> tuple[Difference, ...]:
     distance = np.linalg.norm(a.boxes.center[:, None, :2] - b.boxes.center[None, :, :2], axis=2)
     iou = geometry.bev_iou(a.boxes, b.boxes)
     other_class = _names_differ(a.names, b.names)
-    allowed = np.where(other_class, iou >= OVERLAP, distance <= REACH)
-    cost = np.where(allowed, np.minimum(distance / REACH, 1) + (1 - iou) + other_class, np.inf)
+    allowed = np.where(other_class, iou >= MIN_BEV_IOU, distance <= MAX_PAIR_DISTANCE)
+    cost = np.where(allowed, np.minimum(distance / MAX_PAIR_DISTANCE, 1) + (1 - iou) + other_class, np.inf)
     return _make_pairs(a.names, b.names, cost, distance, iou, MOVED_DISTANCE)
 
 
@@ -167,7 +169,7 @@ def compare_images(a: ImageBoxes, b: ImageBoxes) -> tuple[Difference, ...]:
     iou = geometry.iou(a.xyxy, b.xyxy)
     middle_a, middle_b = ((boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 for boxes in (a, b))
     distance = np.linalg.norm(middle_a[:, None] - middle_b[None], axis=2)
-    cost = np.where(iou >= IMAGE_OVERLAP, 1 - iou + _names_differ(a.names, b.names), np.inf)
+    cost = np.where(iou >= MIN_IMAGE_IOU, 1 - iou + _names_differ(a.names, b.names), np.inf)
     return _make_pairs(a.names, b.names, cost, distance, iou, np.inf)
 
 

@@ -14,12 +14,12 @@ from bevviz.compare.differences import (
     Difference,
     FrameDifferences,
 )
-from bevviz.compare.truth_score import Judged
-from bevviz.model.colors import SIDES, State
+from bevviz.compare.truth_score import TruthComparison
+from bevviz.model.colors import SIDE_COLORS, StateColor
 from bevviz.model.frame import F64
 from bevviz.recording import entities
-from bevviz.recording.camera import over_image
-from bevviz.recording.labels import named_in_space
+from bevviz.recording.camera import image_frame
+from bevviz.recording.labels import choose_named_in_3d
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, document, transform
 from bevviz.recording.states import StateLanes
 from bevviz.recording.writer import Writer
@@ -27,11 +27,11 @@ from bevviz.support import table
 from bevviz.support.text import markdown
 
 COLORS = {
-    Change.SAME: SIDES["same"],
-    Change.MOVED: SIDES["moved"],
-    Change.CLASS: SIDES["class"],
-    Change.ONLY_A: SIDES["only A"],
-    Change.ONLY_B: SIDES["only B"],
+    Change.SAME: SIDE_COLORS["same"],
+    Change.MOVED: SIDE_COLORS["moved"],
+    Change.CLASS: SIDE_COLORS["class"],
+    Change.ONLY_A: SIDE_COLORS["only A"],
+    Change.ONLY_B: SIDE_COLORS["only B"],
 }
 HEIGHT = 0.57  # height of a view of one side, as a share of a 3D view's height in other layouts
 
@@ -63,7 +63,7 @@ class DifferenceLogger(Writer):
                 entities.difference_count(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
             )
-        for outcome, state in (("broken", State.BAD), ("fixed", State.GOOD)):
+        for outcome, state in (("broken", StateColor.BAD), ("fixed", StateColor.GOOD)):
             self.static(
                 entities.difference(outcome),
                 rr.Boxes3D.from_fields(
@@ -101,9 +101,11 @@ class DifferenceLogger(Writer):
             self._log_image(camera, pairs, differences)
         for name, value in _counts(differences).items():
             self.scalar(entities.difference_count(name), float(value))
-        self.put(entities.COMPARE, document(page(differences)))
+        self.put(entities.COMPARE, document(differences_page(differences)))
         changed = [d for d in differences.objects if d.change is not Change.SAME]
-        self.lines(entities.COMPARE_LOG, [("INFO", f"{d.text} {place(d, differences)}") for d in changed])
+        self.lines(
+            entities.COMPARE_LOG, [("INFO", f"{d.text} {position_text(d, differences)}") for d in changed]
+        )
         worst = worst_of_each_class(differences.objects)
         self._lanes.log(self, {entities.difference_state(name): change for name, change in worst.items()})
         self.end()
@@ -116,7 +118,7 @@ class DifferenceLogger(Writer):
             side, rows = (differences.b, [d.row_b for d in objects])
         path = entities.difference(change)
         # If the ground truth is known, only objects that one side alone finds get a name. They matter more.
-        is_named = named_in_space(side.boxes.center[rows], height=HEIGHT)
+        is_named = choose_named_in_3d(side.boxes.center[rows], height=HEIGHT)
         labels = [
             _label(d) if differences.judged is None and is_named[i] else "" for i, d in enumerate(objects)
         ]
@@ -128,10 +130,10 @@ class DifferenceLogger(Writer):
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
             self.put(f"{path}/from_a", arrows)
 
-    def _log_judged(self, judged: Judged, world_from_points: F64) -> None:
+    def _log_judged(self, judged: TruthComparison, world_from_points: F64) -> None:
         rows = np.array([*judged.broken, *judged.fixed], np.int64)
         is_broken = np.arange(len(rows)) < len(judged.broken)
-        is_named = named_in_space(judged.boxes.center[rows], is_broken, HEIGHT)
+        is_named = choose_named_in_3d(judged.boxes.center[rows], is_broken, HEIGHT)
         for outcome, selected in (("broken", is_broken), ("fixed", ~is_broken)):
             if selected.any():
                 labels = [
@@ -152,7 +154,7 @@ class DifferenceLogger(Writer):
                 boxes = differences.b.images[camera].xyxy[[d.row_b for d in selected]]
             self.put(
                 entities.image_difference(camera, change),
-                over_image(camera),
+                image_frame(camera),
                 boxes2d(
                     boxes,
                     [_label(d) for d in selected],
@@ -172,7 +174,7 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
     return worst
 
 
-def place(difference: Difference, differences: FrameDifferences) -> str:
+def position_text(difference: Difference, differences: FrameDifferences) -> str:
     """Return the position of the object relative to its frame's origin, as ``at 12.3 m, 4° left``."""
     side, row = differences.side_with(difference)
     x, y = side.boxes.center[row, :2].tolist()
@@ -181,7 +183,7 @@ def place(difference: Difference, differences: FrameDifferences) -> str:
     return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {direction}"
 
 
-def page(differences: FrameDifferences) -> str:
+def differences_page(differences: FrameDifferences) -> str:
     """Return the differences of one frame as Markdown."""
     return "\n".join(_lines(differences))
 
@@ -203,7 +205,7 @@ def _lines(differences: FrameDifferences) -> Iterator[str]:
             yield ""
             yield f"#### {change[0].upper() + change[1:]}: {len(selected)}"
             yield ""
-            yield from (f"- {markdown(_item(d))} {place(d, differences)}" for d in selected)
+            yield from (f"- {markdown(_item(d))} {position_text(d, differences)}" for d in selected)
     for camera, pairs in differences.images.items():
         rows = [d for d in pairs if d.change is not Change.SAME]
         if rows:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
-from bevviz.compare.differences import FrameDifferences, ImageBoxes, Seen, differences
+from bevviz.compare.differences import FrameDifferences, ImageBoxes, SideResult, differences
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import changes, flat_yaml
@@ -22,8 +22,8 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, Boxes3D, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.recording import entities
-from bevviz.recording.camera import log_shared_image
-from bevviz.recording.decoding import check_decodes, readable
+from bevviz.recording.camera import log_over_shared_image
+from bevviz.recording.decoding import check_decodes, reader_errors_as_user_errors
 from bevviz.recording.primitives import CORNER
 from bevviz.recording.writer import Writer
 
@@ -51,11 +51,11 @@ class SavedFrame:
             np.array(self.fused["Transform3D:quaternion"][0]),
         )
 
-    def seen(self, cameras: Sequence[str]) -> Seen:
+    def seen(self, cameras: Sequence[str]) -> SideResult:
         """Return the results as one side of a comparison."""
         boxes, names, scores = _boxes(self.fused)
         images = {camera: _image_boxes(self.detections.get(camera, {})) for camera in cameras}
-        return Seen(boxes, names, scores, images if self.detected else {}, self.clusters)
+        return SideResult(boxes, names, scores, images if self.detected else {}, self.clusters)
 
 
 class SavedRun:
@@ -72,7 +72,7 @@ class SavedRun:
         if not path.is_file():
             raise UserError(f"{path}: {'it is no file' if path.exists() else 'no such file'}")
         check_decodes(path)
-        with readable(path):
+        with reader_errors_as_user_errors(path):
             for chunk in self.stream():
                 self._read(chunk)
         if not self._property:
@@ -203,7 +203,7 @@ class SavedPairRecorder(Observer[SavedFrames]):
         recording.send_chunks(_under_b(pair.b))
         writer_b = Writer(recording, entities.B)
         for camera in pair.b.cameras:
-            log_shared_image(writer_b, camera)
+            log_over_shared_image(writer_b, camera)
         self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
     def see(self, frames: SavedFrames) -> None:

@@ -12,17 +12,17 @@ from bevviz.anomalies import FailureSummary
 from bevviz.compare.differences import FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
-from bevviz.compare.truth_score import judge
+from bevviz.compare.truth_score import compare_with_truth
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate.ground_truth import Truths
+from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
 from bevviz.pipeline.session import Session
-from bevviz.pipeline.variants import Sessions, check_same_frames
+from bevviz.pipeline.variants import SessionGroup, check_same_frames
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.stages.robot_results import detections_of, in_points_frame
 
 
@@ -65,9 +65,9 @@ class ComparedSessions:
         UserError: a detector's model cannot be used, or the configurations need different frames.
     """
 
-    def __init__(self, a: Config, b: Config, truth: Truths | None = None) -> None:
+    def __init__(self, a: Config, b: Config, truth: TruthLookup | None = None) -> None:
         check_same_frames({"A": a, "B": b})
-        self._sessions, self._truth = Sessions([a, b]), truth
+        self._sessions, self._truth = SessionGroup([a, b]), truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         """Run the stages of both configurations on a frame."""
@@ -85,7 +85,7 @@ class ComparedSessions:
 class ComparedRobot:
     """Processor that compares a session with the robot's Detection3DArray topic."""
 
-    def __init__(self, session: Session, topic: str, truth: Truths | None = None) -> None:
+    def __init__(self, session: Session, topic: str, truth: TruthLookup | None = None) -> None:
         self._session, self._topic, self._truth = session, topic, truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
@@ -95,17 +95,17 @@ class ComparedRobot:
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         """Finish the result in frame order, and compare it with the robot's."""
         assert compared.a is not None
-        robot_result = published(compared.frame, self._topic, compared.a.config)
+        robot_result = published_result(compared.frame, self._topic, compared.a.config)
         return _compare_sides(compared.frame, self._session.finish(compared.a), robot_result, self._truth)
 
 
 def _compare_sides(
-    frame: Frame, a: FrameResult, b: FrameResult | None, truths: Truths | None
+    frame: Frame, a: FrameResult, b: FrameResult | None, truths: TruthLookup | None
 ) -> ComparedFrame:
     if b is None:
         return ComparedFrame(frame, a, b)
     truth = None if truths is None else truths(frame)
-    judged = None if truth is None else judge(a, b, truth)
+    judged = None if truth is None else compare_with_truth(a, b, truth)
     return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b), judged))
 
 
@@ -129,8 +129,8 @@ class ComparisonRecorder(Observer[ComparedFrame]):
         """Log the static entities of both sides."""
         a, b = self._configs
         self._loggers = (
-            Logger(self._recording, a, items.scene),
-            Logger(self._recording, b, items.scene, entities.B),
+            FrameLogger(self._recording, a, items.scene),
+            FrameLogger(self._recording, b, items.scene, entities.B),
         )
         for logger in self._loggers:
             logger.log_static()
@@ -170,7 +170,7 @@ def robot_topic(topics: tuple[str, ...], requested: str) -> str:
     raise UserError(f"--robot: which of its topics? Give one: --robot TOPIC, of {known}")
 
 
-def published(frame: Frame, topic: str, config: Config) -> FrameResult | None:
+def published_result(frame: Frame, topic: str, config: Config) -> FrameResult | None:
     """Return the robot's results for the frame as a frame result. None: the robot published none."""
     labelled = next((boxes for boxes in frame.robot_boxes if boxes.topic == topic), None)
     if labelled is None:

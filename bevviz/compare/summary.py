@@ -18,12 +18,12 @@ from bevviz.compare.differences import (
     Difference,
     FrameDifferences,
 )
-from bevviz.compare.log import place
-from bevviz.compare.truth_score import Judged
+from bevviz.compare.log import position_text
+from bevviz.compare.truth_score import TruthComparison
 from bevviz.config import ParameterChange
 from bevviz.model.protocols import Observer
 from bevviz.support import table
-from bevviz.support.files import save
+from bevviz.support.files import save_text
 from bevviz.support.text import fenced, printable
 
 WORST = 10  # number of frames in the table
@@ -31,7 +31,7 @@ EXAMPLES = 2  # number of objects shown for each frame
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
 
 
-class Compared(Protocol):
+class FrameComparison(Protocol):
     """Frame of a comparison."""
 
     @property
@@ -40,7 +40,7 @@ class Compared(Protocol):
         ...
 
 
-class ComparisonSummary(Observer[Compared]):
+class ComparisonSummary(Observer[FrameComparison]):
     """Observer that counts differences over all frames.
 
     Args:
@@ -67,7 +67,7 @@ class ComparisonSummary(Observer[Compared]):
         """Differences of the configurations, in Markdown."""
         return fenced("\n".join(parameters(self.config)))
 
-    def see(self, compared: Compared) -> None:
+    def see(self, compared: FrameComparison) -> None:
         """Count a frame, or note that a side has no result."""
         if compared.found is None:
             self.without += 1
@@ -116,7 +116,7 @@ class ComparisonSummary(Observer[Compared]):
             }
         )
 
-    def _judge(self, judged: Judged) -> None:
+    def _judge(self, judged: TruthComparison) -> None:
         self._names |= judged.names
         self._wrong["A"].update(judged.wrong_a)
         self._wrong["B"].update(judged.wrong_b)
@@ -238,7 +238,7 @@ class ComparisonSummary(Observer[Compared]):
         writer.writeheader()
         for frame in self.frames:
             writer.writerows({**frame, **row} for row in frame["objects"])
-        save(path, file.getvalue(), "--csv")
+        save_text(path, file.getvalue(), "--csv")
 
 
 def parameters(config: Mapping[str, str]) -> Iterator[str]:
@@ -280,5 +280,5 @@ def _row(difference: Difference, differences: FrameDifferences) -> dict[str, Any
         "distance": round(difference.distance, 3) if pair else None,
         "iou": round(difference.iou, 3) if pair else None,
         "text": difference.text,
-        "place": place(difference, differences),
+        "place": position_text(difference, differences),
     }

@@ -14,7 +14,7 @@ from bevviz.model.results import FrameResult, Objects
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class TruthComparison:
     """Frame of both sides compared with the ground truth. Row i is the i-th object to be found."""
 
     labels: tuple[str, ...]
@@ -42,11 +42,11 @@ class Judged:
         return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
 
 
-def judge(a: FrameResult, b: FrameResult, truth: Truth) -> Judged:
+def compare_with_truth(a: FrameResult, b: FrameResult, truth: Truth) -> TruthComparison:
     """Compare both sides of a frame with its ground truth."""
     to_find = np.flatnonzero(truth.must)
     (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
-    return Judged(
+    return TruthComparison(
         labels=tuple(truth.labels[k] for k in to_find),
         boxes=truth.boxes.chosen(to_find),
         a=found_a[to_find],

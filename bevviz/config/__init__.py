@@ -5,21 +5,21 @@ of the ROS 2 tutorial pipeline. The tutorial's own parameter names (``cluster_to
 everywhere. A user-defined stage takes its parameters under ``SECTION.params``.
 """
 
-from bevviz.config.class_sizes import SIZES
-from bevviz.config.files import Layer, dump, flat_yaml, read_layer, stated_lines
+from bevviz.config.class_sizes import CLASS_SIZES
+from bevviz.config.files import Layer, config_yaml, flat_yaml, read_layer, stated_lines
 from bevviz.config.keys import (
     TUTORIAL_NAMES,
     ParameterChange,
     changes,
-    flattened,
+    flatten,
     keys,
     unit,
     unit_spellings,
     unknown_key,
     values,
 )
-from bevviz.config.loading import load, received, revised
-from bevviz.config.methods import OURS, STAGES
+from bevviz.config.loading import changed_config, load, untrusted_layers
+from bevviz.config.methods import BUILTIN_METHODS, METHOD_KEYS
 from bevviz.config.sections import (
     AnomaliesConfig,
     AnomalyKind,
@@ -41,7 +41,7 @@ from bevviz.config.sections import (
 )
 from bevviz.config.user_stages import (
     object_files,
-    object_network,
+    object_network_params,
     params_of,
     plugin_of,
     stage_topics,
@@ -49,9 +49,9 @@ from bevviz.config.user_stages import (
 )
 
 __all__ = [
-    "OURS",
-    "SIZES",
-    "STAGES",
+    "BUILTIN_METHODS",
+    "CLASS_SIZES",
+    "METHOD_KEYS",
     "TUTORIAL_NAMES",
     "AnomaliesConfig",
     "AnomalyKind",
@@ -72,24 +72,24 @@ __all__ = [
     "SourceConfig",
     "TrackingConfig",
     "VoxelConfig",
+    "changed_config",
     "changes",
-    "dump",
+    "config_yaml",
     "flat_yaml",
-    "flattened",
+    "flatten",
     "keys",
     "load",
     "object_files",
-    "object_network",
+    "object_network_params",
     "params_of",
     "plugin_of",
     "read_layer",
-    "received",
-    "revised",
     "stage_topics",
     "stated_lines",
     "unit",
     "unit_spellings",
     "unknown_key",
+    "untrusted_layers",
     "values",
     "with_object_files",
 ]

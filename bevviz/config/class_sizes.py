@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 # CBGS). The truck is between the two, since COCO also calls a pickup a truck.
 # Spreads are those of KITTI's cars, but wider across, since cars elsewhere are 2 m wide. Other spreads are
 # wider than the difference between the two data sets. Sizes below the line are our own estimates.
-SIZES: dict[str, tuple[float, ...]] = {
+CLASS_SIZES: dict[str, tuple[float, ...]] = {
     "car": (3.88, 1.63, 1.53, 0.43, 0.15, 0.14),
     "van": (5.07, 1.90, 2.21, 0.50, 0.15, 0.25),
     "truck": (8.50, 2.55, 3.05, 2.50, 0.25, 0.50),
@@ -46,7 +46,7 @@ def with_default_sizes(stated: Any) -> Any:
     """Return the default sizes with the stated classes changed."""
     if not isinstance(stated, Mapping):
         return stated
-    return {**SIZES, **{str(name).lower(): size for name, size in stated.items()}}
+    return {**CLASS_SIZES, **{str(name).lower(): size for name, size in stated.items()}}
 
 
 def _check_count(size: tuple[float, ...]) -> tuple[float, ...]:

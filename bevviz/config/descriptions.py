@@ -44,7 +44,7 @@ def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
     return model.model_fields.get(name)
 
 
-def explain(asked: str, config: Config) -> str:
+def describe_parameters(asked: str, config: Config) -> str:
     """Describe a parameter, or all parameters of a section.
 
     Args:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevviz.config.keys import flattened, keys, unit
-from bevviz.config.methods import STAGES
-from bevviz.config.plugins import is_foreign
+from bevviz.config.keys import flatten, keys, unit
+from bevviz.config.methods import METHOD_KEYS
+from bevviz.config.plugins import is_user_function
 from bevviz.config.sections import Config
 from bevviz.config.trust import RECEIVED, NamedCode, Trust, trust_in
 from bevviz.errors import UserError, first_line
@@ -38,8 +38,8 @@ class Layer:
     @property
     def functions(self) -> tuple[str, ...]:
         """The ``module:function`` of every stage for which the values name one."""
-        methods = (self.values.get(f"{section}.{key}") for section, key in STAGES.items())
-        return tuple(method for method in methods if isinstance(method, str) and is_foreign(method))
+        methods = (self.values.get(f"{section}.{key}") for section, key in METHOD_KEYS.items())
+        return tuple(method for method in methods if isinstance(method, str) and is_user_function(method))
 
 
 def read_layer(path: Path, *, pipe: bool = True) -> Layer:
@@ -52,7 +52,7 @@ def read_layer(path: Path, *, pipe: bool = True) -> Layer:
     Raises:
         UserError: the file cannot be read.
     """
-    layer = Layer(str(path), flattened(_read_yaml(path, pipe)))
+    layer = Layer(str(path), flatten(_read_yaml(path, pipe)))
     return replace(layer, trust=trust_in(NamedCode((path,), layer.functions)))
 
 
@@ -63,7 +63,7 @@ def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
         UserError: the file cannot be read, or is no tree of sections.
     """
     problem = f"{path}: cannot read the configuration"
-    tree = yaml_value(read_text(path, CONFIG_LIMIT, problem=problem, pipe=pipe), str(path))
+    tree = parse_yaml(read_text(path, CONFIG_LIMIT, problem=problem, pipe=pipe), str(path))
     if tree is None:
         return {}
     if not isinstance(tree, Mapping):
@@ -71,7 +71,7 @@ def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
     return tree
 
 
-def yaml_value(text: str, where: str) -> Any:
+def parse_yaml(text: str, where: str) -> Any:
     """Parse YAML.
 
     Args:
@@ -119,7 +119,7 @@ def _check_size(tree: Any, where: str) -> None:
         raise UserError(f"{where}: its aliases stand for more than {MOST_VALUES:,} values")
 
 
-def toml_tree(path: Path, problem: str) -> dict[str, Any]:
+def read_toml(path: Path, problem: str) -> dict[str, Any]:
     """Read a TOML file.
 
     Args:
@@ -140,7 +140,7 @@ def toml_tree(path: Path, problem: str) -> dict[str, Any]:
         raise UserError(f"{path}: is no TOML: {first_line(error)}") from None
 
 
-def dump(config: Config) -> str:
+def config_yaml(config: Config) -> str:
     """Return the configuration as YAML, with the unit and meaning of each parameter. ``load`` can read it."""
     descriptions = keys(config)
     lines = []
@@ -171,7 +171,7 @@ def _note(key: str, descriptions: Mapping[str, str]) -> str:
 
 
 def flat_yaml(text: str, where: str) -> dict[str, Any]:
-    """Return the values by dotted key of YAML that ``dump`` of any version has written.
+    """Return the values by dotted key of YAML that ``config_yaml`` of any version has written.
 
     Args:
         text: YAML.
@@ -180,7 +180,7 @@ def flat_yaml(text: str, where: str) -> dict[str, Any]:
     Raises:
         UserError: the text is not valid YAML.
     """
-    return flattened(yaml_value(text, where) or {})
+    return flatten(parse_yaml(text, where) or {})
 
 
 def stated_lines(config: Config, *, folders: bool = True) -> list[str]:

@@ -95,7 +95,7 @@ def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) ->
     }
 
 
-def flattened(tree: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a tree of sections by dotted key.
 
     A deeper mapping is a value, except for the parameters of plugins.

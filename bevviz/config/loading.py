@@ -8,15 +8,15 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from bevviz.config.files import Layer, read_layer, yaml_value
-from bevviz.config.keys import TUTORIAL_NAMES, flattened, keys, unit, unknown_key, values
-from bevviz.config.methods import STAGES
-from bevviz.config.pillars import COMPLETE_SENTENCE, is_network
+from bevviz.config.files import Layer, parse_yaml, read_layer
+from bevviz.config.keys import TUTORIAL_NAMES, flatten, keys, unit, unknown_key, values
+from bevviz.config.methods import METHOD_KEYS
+from bevviz.config.pillars import COMPLETE_SENTENCE, is_network_file
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
 from bevviz.config.user_stages import names_function, params_model
 from bevviz.errors import UserError
-from bevviz.support.text import shown
+from bevviz.support.text import short_repr
 
 BASE = "configuration"  # source name of values that come from a whole configuration
 
@@ -55,7 +55,7 @@ def load(
 
     Args:
         file: YAML files.
-        settings: ``key=value`` each, typed by the user. Settings from other sources come from ``received``.
+        settings: ``key=value`` each, typed by the user. ``untrusted_layers`` takes settings of other sources.
         preset: name of the preset. None: the preset that the files name, or else ``default``.
         base: configuration to change, or its values by dotted key.
         layers: layers of the project, see ``bevviz.config.project``.
@@ -79,14 +79,14 @@ def load(
         for key, value in layer.values.items()
     ]
     preset_name = preset or next((value for key, value, _ in reversed(entries) if key == "preset"), "default")
-    preset_values = flattened(REFERENCE) if preset_name == "reference" else {}
+    preset_values = flatten(REFERENCE) if preset_name == "reference" else {}
     stated: dict[str, Any] = {}
     origin: dict[str, str] = {}
     layers_in_force: dict[str, Layer] = {}
     for key, value, layer in entries:
         section, _, name = key.partition(".")
         previous = stated.get(key, value)
-        if name == STAGES.get(section) and previous != value and not _alike(previous, value):
+        if name == METHOD_KEYS.get(section) and previous != value and not _alike(previous, value):
             stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
         stated[key], origin[key], layers_in_force[key] = value, layer.where, layer
     running_functions = [config.functions for config in (in_force, base) if isinstance(config, Config)]
@@ -117,12 +117,16 @@ def load(
         loc = (*prefix.split(".")[:-1], *first["loc"])
         key = next((k for k in _prefixes(loc) if k in origin), ".".join(map(str, loc)))
         where = origin.get(key, BASE)
-        if prefix and first["type"] == "missing" and is_network(method := str(tree["objects"]["method"])):
+        if (
+            prefix
+            and first["type"] == "missing"
+            and is_network_file(method := str(tree["objects"]["method"]))
+        ):
             raise UserError(
                 _unfit_network(origin.get("objects.method", where), method, key, params)
             ) from None
         is_complete = first["type"] in ("wrong_unit", "missing", COMPLETE_SENTENCE)
-        value = f" (given: {shown(first['input'])})" if not is_complete else ""
+        value = f" (given: {short_repr(first['input'])})" if not is_complete else ""
         description = keys().get(key) or params.get(key, "")
         hint = f"; it is: {description}" if description else ""
         stated_unit = f", in {unit(key)}" if unit(key) and not is_complete else ""
@@ -136,7 +140,7 @@ def load(
     return loaded
 
 
-def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:
+def changed_config(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:
     """Return the configuration with some values changed.
 
     Args:
@@ -150,7 +154,7 @@ def revised(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> 
     return load(settings=[_setting(setting, trust) for setting in settings], base=config)
 
 
-def received(settings: Iterable[str], where: str = "", trust: Trust = RECEIVED) -> list[Layer]:
+def untrusted_layers(settings: Iterable[str], where: str = "", trust: Trust = RECEIVED) -> list[Layer]:
     """Read settings that the user has not typed, for ``load``. Functions among them do not run.
 
     Args:
@@ -169,7 +173,7 @@ def _setting(text: str, trust: Trust, where: str = "") -> Layer:
     key, sep, value = text.partition("=")
     if not sep:
         raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
-    parsed = yaml_value(value, f"--set {text}") if value.strip() else ""
+    parsed = parse_yaml(value, f"--set {text}") if value.strip() else ""
     if isinstance(parsed, int) and _is_text(key.strip()):  # The text 0001 is a name, not the number 1.
         parsed = value.strip()
     return Layer(where or f"--set {text}", {key.strip(): parsed}, trust)
@@ -200,10 +204,10 @@ def _functions(
     granted = {function: folder for functions in running_functions for function, folder in functions.items()}
     for key, value, layer in entries:
         section, _, name = key.partition(".")
-        if layer.trust.granted and name == STAGES.get(section) and isinstance(value, str):
+        if layer.trust.granted and name == METHOD_KEYS.get(section) and isinstance(value, str):
             granted[section, value] = layer.trust.folder
     in_force: dict[tuple[str, str], str] = {}
-    for section, name in STAGES.items():
+    for section, name in METHOD_KEYS.items():
         key = f"{section}.{name}"
         method = stated.get(key)
         if not isinstance(method, str) or not names_function(section, method):
@@ -228,7 +232,7 @@ def _unfit_network(where: str, method: str, key: str, descriptions: Mapping[str,
 
 def _alike(method: Any, other: Any) -> bool:
     """Return whether two methods take the same parameters. Two network files do."""
-    return is_network(str(method)) and is_network(str(other))
+    return is_network_file(str(method)) and is_network_file(str(other))
 
 
 def _is_text(key: str) -> bool:
@@ -241,7 +245,7 @@ def _is_text(key: str) -> bool:
 def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions) -> dict[str, str]:
     """Return dotted keys and descriptions of the parameters of the named plugins and networks."""
     descriptions: dict[str, str] = {}
-    for section, key in STAGES.items():
+    for section, key in METHOD_KEYS.items():
         method = stated.get(f"{section}.{key}")
         if not isinstance(method, str):
             continue
@@ -259,7 +263,7 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Fun
 
 def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tuple[str, type[BaseModel]]]:
     """Yield each section whose function or network has parameters, with the model of these parameters."""
-    for section, key in STAGES.items():
+    for section, key in METHOD_KEYS.items():
         model = params_model(section, str(tree.get(section, {}).get(key, "")), functions)
         if model is not None:
             yield section, model

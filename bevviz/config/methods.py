@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pydantic_core import PydanticCustomError
 
 from bevviz.config import plugins
-from bevviz.config.pillars import is_network
+from bevviz.config.pillars import is_network_file
 
 
 @dataclass(frozen=True, slots=True)
-class Methods:
+class StageMethods:
     """Allowed methods of a stage: built-in, ``module:function``, a registered name, or ``topic:NAME``."""
 
     ours: tuple[str, ...]
@@ -24,7 +24,7 @@ class Methods:
         value = self.former.get(value, value)
         if value in self.ours or ":" in value or value in plugins.registered():
             return value
-        if self.networks and is_network(value):
+        if self.networks and is_network_file(value):
             return value
         registered = f", {', '.join(plugins.registered())} (registered)" if plugins.registered() else ""
         raise PydanticCustomError(
@@ -38,12 +38,12 @@ class Methods:
         )
 
 
-GROUND = Methods(("polar", "plane"), {"ransac": "plane"})
-CLUSTERING = Methods(("dbscan",))
-OBJECTS = Methods(("frustum",), networks=True)
-OURS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+GROUND = StageMethods(("polar", "plane"), {"ransac": "plane"})
+CLUSTERING = StageMethods(("dbscan",))
+OBJECTS = StageMethods(("frustum",), networks=True)
+BUILTIN_METHODS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
 CLASS_LISTS = ("coco", "coco91")  # values of detector.names that name no file
-STAGES = {  # section -> key that names the function
+METHOD_KEYS = {  # section -> key that names the function
     "ground": "method",
     "clustering": "method",
     "detector": "model",

@@ -222,6 +222,6 @@ INPUT_PARAMS = (
 """Parameters that decide the input of the network. With equal ones its output is the same."""
 
 
-def is_network(method: str) -> bool:
+def is_network_file(method: str) -> bool:
     """Return whether ``objects.method`` names a network file, and not a function or a topic."""
     return method.lower().endswith(SUFFIX) and ":" not in method

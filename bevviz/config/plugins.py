@@ -31,8 +31,18 @@ TOPIC = "topic:"
 PARAMS = "Params"  # name of the pydantic model of the parameters, in the function's module
 POSITIONAL = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
 # Allowed names of a stage's first parameter.
-CLOUDS = ("points", "cloud", "point_cloud", "pointcloud", "pts", "xyz", "xyzi", "voxels", "obstacles")
-IMAGES = ("image", "img", "bgr", "frame", "picture")
+CLOUD_PARAMETER_NAMES = (
+    "points",
+    "cloud",
+    "point_cloud",
+    "pointcloud",
+    "pts",
+    "xyz",
+    "xyzi",
+    "voxels",
+    "obstacles",
+)
+IMAGE_PARAMETER_NAMES = ("image", "img", "bgr", "frame", "picture")
 _ARRAY_ANNOTATION = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
 STAGE_HINT = "write a function whose first parameter is 'points' or 'image' (docs/stages.md)"
 
@@ -79,13 +89,13 @@ def registered() -> dict[str, str]:
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
-def is_foreign(method: str) -> bool:
+def is_user_function(method: str) -> bool:
     """Return whether a method names a user-defined function, and not a built-in method or a topic."""
     return ":" in method and not method.startswith(TOPIC)
 
 
 @cache
-def find(name: str, folder: str | None = "") -> Plugin:
+def load_plugin(name: str, folder: str | None = "") -> Plugin:
     """Import the function or class ``module:name``.
 
     Args:
@@ -120,7 +130,7 @@ def find(name: str, folder: str | None = "") -> Plugin:
 
 
 def _import_module(name: str, folder: str | None) -> ModuleType:
-    """Import a module for ``find``."""
+    """Import a module for ``load_plugin``."""
     try:
         with _importing_from(name, folder):
             return importlib.import_module(name)
@@ -186,7 +196,9 @@ def _signature_fault(function: Any, skipped: int, additional: int) -> str:
     if not names:
         return f"it takes no array; {STAGE_HINT}"
     array = names[0]
-    if array.name not in (*CLOUDS, *IMAGES) and not _ARRAY_ANNOTATION.search(str(array.annotation)):
+    if array.name not in (*CLOUD_PARAMETER_NAMES, *IMAGE_PARAMETER_NAMES) and not _ARRAY_ANNOTATION.search(
+        str(array.annotation)
+    ):
         return f"its first parameter is '{array.name}'; {STAGE_HINT}"
     fault = _missing_argument(function, skipped + 1, skipped + 1 + additional)
     return f"{fault}; {STAGE_HINT}" if fault else ""
@@ -337,7 +349,7 @@ class _SourceLoader(SourceFileLoader):
 
 @contextmanager
 def _importing_from(module: str, folder: str | None) -> Iterator[None]:
-    """Let modules be found in a folder, see ``find``."""
+    """Let modules be found in a folder, see ``load_plugin``."""
     if folder is None:
         yield
     elif folder:

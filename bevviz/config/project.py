@@ -22,21 +22,21 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from bevviz.config import (
-    OURS,
+    BUILTIN_METHODS,
     TUTORIAL_NAMES,
     Config,
     Layer,
     Preset,
-    flattened,
+    flatten,
     plugins,
     read_layer,
 )
-from bevviz.config.files import toml_tree
+from bevviz.config.files import read_toml
 from bevviz.config.methods import CLASS_LISTS
-from bevviz.config.pillars import is_network
+from bevviz.config.pillars import is_network_file
 from bevviz.config.trust import USER, NamedCode, trust_in
 from bevviz.errors import UserError
-from bevviz.support.text import did_you_mean, shown
+from bevviz.support.text import did_you_mean, short_repr
 
 NAME = "bevviz.toml"
 MODEL = "BEVVIZ_MODEL"
@@ -57,13 +57,13 @@ class ProjectFile(BaseModel):
     preset: Preset | None = Field(None, description="as --preset")
 
 
-def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[Layer]:
+def read_project_layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[Layer]:
     """Return the layers of a folder's project, the weakest first.
 
     Raises:
         UserError: the project file, or a file that it names, cannot be used.
     """
-    path = find(folder)
+    path = find_project_file(folder)
     project_layers: list[Layer] = []
     if path is not None:
         file_layers = _read_layers(path)
@@ -74,7 +74,7 @@ def layers(folder: Path, environment: Mapping[str, str] = os.environ) -> list[La
     return project_layers
 
 
-def find(folder: Path) -> Path | None:
+def find_project_file(folder: Path) -> Path | None:
     """Find the nearest project file, in the folder or above.
 
     Raises:
@@ -110,21 +110,21 @@ def _named_code(path: Path, file_layers: Sequence[Layer]) -> NamedCode:
 def _read_layers(path: Path) -> list[Layer]:
     """Read the YAML files that a project file names, and then the project file itself."""
     try:
-        project = ProjectFile.model_validate(toml_tree(path, f"{path}: cannot read the project file"))
+        project = ProjectFile.model_validate(read_toml(path, f"{path}: cannot read the project file"))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(item) for item in first["loc"])
         description = ProjectFile.model_fields[str(first["loc"][0])].description
         message = first["msg"].replace("Input should be", "must be")
         raise UserError(
-            f"{path}: {key} {message} (given: {shown(first['input'])}); it is {description}"
+            f"{path}: {key} {message} (given: {short_repr(first['input'])}); it is {description}"
         ) from None
     sections = project.model_extra or {}
     known = [*ProjectFile.model_fields, *Config.model_fields, *TUTORIAL_NAMES]
     for name in sections:
         if name not in known and "." not in name:
             raise UserError(f"{path}: unknown key '{name}'{did_you_mean(name, known)}")
-    own_values = flattened(sections)
+    own_values = flatten(sections)
     if project.preset is not None:
         own_values["preset"] = project.preset
     if project.model:
@@ -133,7 +133,7 @@ def _read_layers(path: Path) -> list[Layer]:
         if isinstance(own_values.get(key), str):
             own_values[key] = _relative_to(path.parent, key, own_values[key])
     for key in ("objects.method", "objects.encoder", "objects.params.encoder"):
-        if is_network(str(own_values.get(key, ""))):
+        if is_network_file(str(own_values.get(key, ""))):
             own_values[key] = str(path.parent / own_values[key])
     yaml_layers = [read_layer(path.parent / name, pipe=False) for name in project.config]
     return [*yaml_layers, Layer(str(path), own_values)]
@@ -141,5 +141,5 @@ def _read_layers(path: Path) -> list[Layer]:
 
 def _relative_to(folder: Path, key: str, value: str) -> str:
     """Return a file name relative to a folder. A name that is no file stays as it is."""
-    known = (*OURS, *plugins.registered()) if key == "detector.model" else CLASS_LISTS
+    known = (*BUILTIN_METHODS, *plugins.registered()) if key == "detector.model" else CLASS_LISTS
     return value if not value or value in known or ":" in value else str(folder / value)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bevviz.config import Config, Layer, Preset, load, received
+from bevviz.config import Config, Layer, Preset, load, untrusted_layers
 from bevviz.config.trust import MESSAGE
 
-AT_START = (
+FIXED_KEYS = (
     "source.",
     "sync.",
     "live.log_queue",
@@ -20,7 +20,7 @@ AT_START = (
 )  # Keys that stay fixed while the program runs.
 
 
-class Settings:
+class ReloadableConfig:
     """Sources of a live configuration: preset, project, file, and ``key=value`` settings. Later ones win.
 
     Functions run if the user has named them here, or has trusted the file that names them. Functions that
@@ -82,9 +82,9 @@ class Settings:
     def _settings_with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
         """Return the settings with some added and some taken back."""
         newest_first = self._settings[::-1]
-        for setting in received(without, trust=MESSAGE):
+        for setting in untrusted_layers(without, trust=MESSAGE):
             newest_first.remove(setting)
-        return [*newest_first[::-1], *received(more, trust=MESSAGE)]
+        return [*newest_first[::-1], *untrusted_layers(more, trust=MESSAGE)]
 
     def _stat(self) -> tuple[int, int, int] | None:
         """Return time, size and inode of the file, or None while it is missing.

@@ -17,7 +17,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from bevviz.config.class_sizes import SIZES, ClassSize, with_default_sizes
+from bevviz.config.class_sizes import CLASS_SIZES, ClassSize, with_default_sizes
 from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
 from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
 
@@ -213,7 +213,7 @@ class ObjectsConfig(StageSection):
         "names; or topic:/objects of the robot",
     )
     sizes: Annotated[Mapping[str, ClassSize | None], BeforeValidator(with_default_sizes)] = Field(
-        SIZES,
+        CLASS_SIZES,
         description="frustum: by class, mean length, width, height in metres and the spread of each; "
         "a class that is stated changes alone, null: it has none",
     )

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from bevviz.config import plugins
 from bevviz.errors import UserError
-from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save
+from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ def trust_in(code: NamedCode) -> Trust:
     )
 
 
-def allow(code: NamedCode) -> None:
+def grant_trust(code: NamedCode) -> None:
     """Trust a file with its current content.
 
     Raises:
@@ -139,10 +139,10 @@ def allow(code: NamedCode) -> None:
         raise UserError(f"{folder}: cannot keep what is trusted: {error.strerror}") from None
     _check(folder)
     content = {"path": str(code.path), "sha256": code.digest(), "functions": list(code.functions)}
-    save(folder / _name(code.path), json.dumps(content, indent=1) + "\n", "trust")
+    save_text(folder / _name(code.path), json.dumps(content, indent=1) + "\n", "trust")
 
 
-def revoke(path: Path) -> bool:
+def revoke_trust(path: Path) -> bool:
     """Withdraw the trust in a file. Return whether it was trusted.
 
     Raises:
@@ -158,7 +158,7 @@ def revoke(path: Path) -> bool:
     return True
 
 
-def records() -> Iterator[TrustRecord]:
+def trust_records() -> Iterator[TrustRecord]:
     """Iterate over all files that the user has trusted, by path."""
     folder = _folder()
     all_records = [record for file in folder.glob("*.json") if (record := _read(file)) is not None]

@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from bevviz.config import plugins
-from bevviz.config.methods import OURS, STAGES
-from bevviz.config.pillars import PillarParams, is_network
+from bevviz.config.methods import BUILTIN_METHODS, METHOD_KEYS
+from bevviz.config.pillars import PillarParams, is_network_file
 from bevviz.config.plugins import TOPIC
 from bevviz.config.sections import Config, Functions
 from bevviz.errors import UserError
@@ -22,12 +22,12 @@ def plugin_of(config: Config, section: str) -> plugins.Plugin | None:
     Raises:
         UserError: the function cannot be loaded.
     """
-    return _plugin(section, getattr(getattr(config, section), STAGES[section]), config.functions)
+    return _plugin(section, getattr(getattr(config, section), METHOD_KEYS[section]), config.functions)
 
 
 def names_function(section: str, method: str) -> bool:
     """Return whether a stage's section names ``module:function``."""
-    if not plugins.is_foreign(method):
+    if not plugins.is_user_function(method):
         return False
     return section != "detector" or not Path(method).exists()
 
@@ -38,33 +38,35 @@ def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin |
     name = method
     if names_function(section, method):
         if (section, method) not in functions:  # ``load`` did not build this configuration.
-            raise UserError(f"{section}.{STAGES[section]} {method}: no function that the user has named")
+            raise UserError(f"{section}.{METHOD_KEYS[section]} {method}: no function that the user has named")
         folder = functions[section, method]
     else:
-        is_builtin = method in OURS or (section == "detector" and Path(method).exists())
+        is_builtin = method in BUILTIN_METHODS or (section == "detector" and Path(method).exists())
         name = "" if is_builtin else plugins.registered().get(method, "")
     if not name:
         return None
     try:
-        return plugins.find(name, folder)
+        return plugins.load_plugin(name, folder)
     except UserError as error:
-        raise UserError(f"{section}.{STAGES[section]} {method}: {error}") from error.__cause__
+        raise UserError(f"{section}.{METHOD_KEYS[section]} {method}: {error}") from error.__cause__
 
 
 def stage_topics(config: Config) -> dict[str, str]:
     """Return the robot's topics that replace stages, by the dotted key that names each."""
-    methods = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in STAGES.items()}
+    methods = {f"{s}.{key}": str(getattr(getattr(config, s), key)) for s, key in METHOD_KEYS.items()}
     return {key: name.removeprefix(TOPIC) for key, name in methods.items() if name.startswith(TOPIC)}
 
 
-def object_network(config: Config) -> PillarParams | None:
+def object_network_params(config: Config) -> PillarParams | None:
     """Return the parameters of the 3D detector file that ``objects.method`` names, or None."""
-    return PillarParams.model_validate(config.objects.params) if is_network(config.objects.method) else None
+    return (
+        PillarParams.model_validate(config.objects.params) if is_network_file(config.objects.method) else None
+    )
 
 
 def object_files(config: Config) -> dict[str, str]:
     """Return the files of the 3D detector, by the dotted key that names each."""
-    params = object_network(config)
+    params = object_network_params(config)
     if params is None:
         return {}
     files = {"objects.method": config.objects.method, "objects.params.encoder": params.encoder}
@@ -90,7 +92,7 @@ def params_model(section: str, method: str, functions: Functions) -> type[BaseMo
         method: method that the section names.
         functions: ``Config.functions``.
     """
-    if section == "objects" and is_network(method):
+    if section == "objects" and is_network_file(method):
         return PillarParams
     plugin = _plugin(section, method, functions)
     return None if plugin is None else plugin.params
@@ -98,7 +100,7 @@ def params_model(section: str, method: str, functions: Functions) -> type[BaseMo
 
 def params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
     """Return the additional parameters of a stage: those of a function or of a network on pillars."""
-    if section not in STAGES:
+    if section not in METHOD_KEYS:
         return {}
-    model = params_model(section, getattr(getattr(config, section), STAGES[section]), config.functions)
+    model = params_model(section, getattr(getattr(config, section), METHOD_KEYS[section]), config.functions)
     return {} if model is None else model.model_fields

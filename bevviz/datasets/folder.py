@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.config.files import yaml_value
+from bevviz.config.files import parse_yaml
 from bevviz.datasets.columns import are_whole
 from bevviz.datasets.dataset import (
     CLOUDS,
@@ -32,8 +32,8 @@ from bevviz.datasets.dataset import (
 )
 from bevviz.datasets.pcd import read_pcd
 from bevviz.datasets.ply import read_ply
-from bevviz.datasets.stamps import sensors_of, stamps_in, told_by
-from bevviz.datasets.unread_files import unread
+from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
+from bevviz.datasets.unread_files import describe_unread
 from bevviz.errors import UserError, first_line
 from bevviz.messages.encode import (
     POINT_FIELD,
@@ -101,7 +101,7 @@ class Folder(Dataset):
         if sequence:
             raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
         about = self._calibration()
-        others = unread(path)
+        others = describe_unread(path)
         lidars, cameras = self._sensors(about)
         if not lidars:
             raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
@@ -165,7 +165,7 @@ class Folder(Dataset):
         self, sensor: str, files: Sequence[Path], stated: Collection[str]
     ) -> dict[str, list[Path]]:
         """Split the files of a folder by sensor. File names may show several sensors in one folder."""
-        groups = sensors_of(files)
+        groups = group_by_sensor(files)
         if len(groups) > 1 and sensor not in stated:
             groups = {f"{sensor}_{name}" if name else sensor: members for name, members in groups.items()}
             self.warn(f"by the names of their files there are {', '.join(groups)}")
@@ -177,7 +177,7 @@ class Folder(Dataset):
         file = self.path / CALIBRATION
         if not file.is_file():
             return {}
-        about = yaml_value(read_text(file, CONFIG_LIMIT), str(file)) or {}
+        about = parse_yaml(read_text(file, CONFIG_LIMIT), str(file)) or {}
         if not isinstance(about, dict) or not all(
             isinstance(about.get(k, {}), dict) for k in ("lidars", "cameras")
         ):
@@ -276,7 +276,7 @@ class Folder(Dataset):
         if (self.path / STAMPS).is_file():
             return self._read_stamps(self.path / STAMPS, [files for _, _, files in all_sensors])
         lead = max(sensors["lidars"].items(), key=lambda item: len(item[1]))
-        leading = told_by(lead[1])
+        leading = file_times(lead[1])
         if leading is None:
             self.warn(
                 f"names without a number: the files are taken in their order, at {_rate(about):g} a second"
@@ -289,7 +289,7 @@ class Folder(Dataset):
         lead_values = leading.values if leading else dict.fromkeys(lead[1], 0)
         stamped = dict[Path, int]()
         for kind, name, files in all_sensors:
-            times = told_by(files)
+            times = file_times(files)
             stated = about.get(kind, {}).get(name, {})
             rate = _rate(about, stated)
             if leading and times and times.frames == leading.frames:

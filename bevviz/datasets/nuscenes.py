@@ -24,7 +24,7 @@ from bevviz.messages.encode import (
     encode_transforms,
 )
 from bevviz.model import geometry
-from bevviz.model.class_names import CATEGORIES, NOT_DETECTED
+from bevviz.model.class_names import NUSCENES_CLASSES, NUSCENES_WITHOUT_CLASS
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
 from bevviz.support import progress
 from bevviz.support.files import open_regular
@@ -214,7 +214,9 @@ class NuScenes(Dataset):
                 for row in labelled[sample]
             ]
             labelled_rows = [
-                (row, CATEGORIES.get(name, name)) for row, name in rows if name not in NOT_DETECTED
+                (row, NUSCENES_CLASSES.get(name, name))
+                for row, name in rows
+                if name not in NUSCENES_WITHOUT_CLASS
             ]
             boxes = Boxes3D(
                 np.array([_numbers(row["translation"], 3) for row, _ in labelled_rows]).reshape(-1, 3),

@@ -44,7 +44,7 @@ class FileTimes:
     note: str = ""
 
 
-def told_by(files: Sequence[Path]) -> FileTimes | None:
+def file_times(files: Sequence[Path]) -> FileTimes | None:
     """Return the times in the names of one sensor's files; None if the names have none."""
     dates = {file: date[1] for file in files if (date := _find_date(file))}
     if 2 * len(dates) > len(files) and not _have_frame_steps(dates.values()):
@@ -55,7 +55,7 @@ def told_by(files: Sequence[Path]) -> FileTimes | None:
     return times if times and max(times.values.values()) < MAX_STAMP else None
 
 
-def sensors_of(files: Sequence[Path]) -> dict[str, list[Path]]:
+def group_by_sensor(files: Sequence[Path]) -> dict[str, list[Path]]:
     """Group files by the words in which their names differ, without the time. One group means one sensor.
 
     Several groups are several sensors if each has about as many files. In addition, the words must not be

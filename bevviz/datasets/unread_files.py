@@ -21,7 +21,7 @@ ADVICE = {
 MAX_FILES = 10_000  # files examined in each folder
 
 
-def unread(folder: Path) -> str:
+def describe_unread(folder: Path) -> str:
     """Return a clause about the most frequent unread type in a folder and its subfolders; empty: none."""
     folders = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
     files = [f for place in folders for f, _ in zip(place.iterdir(), range(MAX_FILES), strict=False)]

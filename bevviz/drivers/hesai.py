@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.drivers.calibration_file import read_calibration
-from bevviz.drivers.packets import Packets, split
+from bevviz.drivers.packets import ScanPackets, split
 from bevviz.errors import UserError
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
@@ -104,7 +104,7 @@ MODELS = (
 RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3, 0x3E: 2}
 
 
-def decode(packets: Packets, angles: Path | None = None) -> Any:
+def decode(packets: ScanPackets, angles: Path | None = None) -> Any:
     """Decode a scan into a sensor_msgs/PointCloud2, as Hesai's driver does: y points to azimuth 0.
 
     ``ring`` is the channel number from 0. ``time`` is in seconds after the stamp of the scan, by the sensor's
@@ -161,7 +161,7 @@ def decode(packets: Packets, angles: Path | None = None) -> Any:
     return encode_points(packets.stamp, packets.frame_id, points, announced)
 
 
-def _model_of(packets: Packets) -> tuple[Model, I64]:
+def _model_of(packets: ScanPackets) -> tuple[Model, I64]:
     """Return the model of most packets, and the row numbers of its complete packets."""
     rows = np.zeros(0, np.int64)
     best = None
@@ -184,7 +184,7 @@ def _model_of(packets: Packets) -> tuple[Model, I64]:
     return best, whole
 
 
-def _times(packets: Packets, usable: I64, model: Model, returns: int) -> F32:
+def _times(packets: ScanPackets, usable: I64, model: Model, returns: int) -> F32:
     """Return the (N, directions) seconds after the scan's stamp.
 
     The sensor's clock may be set wrongly. Only its differences are used, from the time at which the first

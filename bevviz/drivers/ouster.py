@@ -19,13 +19,13 @@ from bevviz.messages.encode import encode_points
 from bevviz.model.frame import F32, U8
 
 FRAME = "os_lidar"  # frame of the clouds that Ouster's driver publishes
-LACKS = (
+NO_METADATA = (
     "packets of an Ouster without its metadata: record its metadata topic (std_msgs/String) with them, "
     "--set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its driver"
 )
 SMALLEST = 1000  # bytes; packets of the IMU have 48
 MINUTE = 60_000_000_000
-Packet = tuple[int, bytes | memoryview]  # time of receipt in nanoseconds, and the bytes
+ReceivedPacket = tuple[int, bytes | memoryview]  # time of receipt in nanoseconds, and the bytes
 POINT = np.dtype(
     [(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("reflectivity", "<u2"), ("ring", "<u2")]
 )
@@ -123,7 +123,7 @@ class Sensor:
         return int.from_bytes(packet[at : at + 2], "little")
 
 
-class Scans:
+class ScanCollector:
     """Collector that groups the packets of a sensor into scans.
 
     A scan is complete with its last packet. If packets are lost, it ends when the next scan begins. Late and
@@ -134,9 +134,9 @@ class Scans:
         self.sensor = sensor
         self._current = -1
         self._finished: deque[int] = deque(maxlen=2)  # numbers of the previous scans
-        self._packets: dict[int, Packet] = {}  # packets of the current scan by their first column
+        self._packets: dict[int, ReceivedPacket] = {}  # packets of the current scan by their first column
 
-    def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[Packet, ...]]:
+    def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[ReceivedPacket, ...]]:
         """Add a packet. Yield each scan that it ends.
 
         Args:
@@ -153,7 +153,7 @@ class Scans:
         if len(self._packets) == self.sensor.sent:
             yield from self.rest()
 
-    def rest(self) -> Iterator[tuple[Packet, ...]]:
+    def rest(self) -> Iterator[tuple[ReceivedPacket, ...]]:
         """Yield the incomplete scan. Its further packets are then too late."""
         if self._packets:
             packets, self._packets = tuple(self._packets.values()), {}
@@ -167,15 +167,15 @@ def is_packet(msgtype: str) -> bool:
     return declared_decoder(msgtype) is DECODER
 
 
-def metadata_of(topic: str) -> str:
+def metadata_topic(topic: str) -> str:
     """Return the topic of the metadata (std_msgs/String), for a topic of packets."""
     return f"{topic.rpartition('/')[0]}/metadata"
 
 
-def waits(topic: str) -> str:
+def waiting_note(topic: str) -> str:
     """Return the note on a live topic of packets whose metadata have not arrived yet."""
     return (
-        f"packets of an Ouster whose metadata are waited for on {metadata_of(topic)} (std_msgs/String); "
+        f"packets of an Ouster whose metadata are waited for on {metadata_topic(topic)} (std_msgs/String); "
         f"--set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from a file"
     )
 
@@ -233,7 +233,7 @@ def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
     return memoryview(data)[at + 4 : at + 4 + length]
 
 
-def decode(sensor: Sensor, packets: Sequence[Packet]) -> Any:
+def decode(sensor: Sensor, packets: Sequence[ReceivedPacket]) -> Any:
     """Decode the packets of one scan into a sensor_msgs/PointCloud2 in the frame os_lidar.
 
     The stamp is that of the first column, by the sensor's clock if this is within a minute of the time of
@@ -303,5 +303,5 @@ DECODER = Decoder(
     types=_TYPES,
     kind="PointCloud2",
     definitions=DEFINITIONS,
-    metadata_topic=metadata_of,
+    metadata_topic=metadata_topic,
 )

@@ -17,7 +17,7 @@ SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Packets:
+class ScanPackets:
     """Packets of one scan.
 
     Attributes:
@@ -37,7 +37,7 @@ class Packets:
     lost: int
 
 
-def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Packets:
+def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> ScanPackets:
     """Split a message into its packets.
 
     The message has a header and a list of packets, each with a stamp and ``size`` bytes.
@@ -74,7 +74,7 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Pa
     if not complete:
         raise ValueError(f"none of the {count} packets is whole" if count else "there are no packets in it")
     rows = np.ndarray((complete,), packet, data, at, (step,))
-    return Packets(
+    return ScanPackets(
         stamp=sec * SECOND + nanosec,
         frame_id=frame_id,
         received=rows["sec"].astype(np.int64) * SECOND + rows["nanosec"],

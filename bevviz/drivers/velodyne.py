@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.drivers.packets import Packets, split
+from bevviz.drivers.packets import ScanPackets, split
 from bevviz.errors import UserError, first_line
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
@@ -17,7 +17,7 @@ MODEL = 1205  # offset of the byte that states the model
 FAR = 1000.0  # metres; no model measures farther
 
 
-def decode(packets: Packets) -> Any:
+def decode(packets: ScanPackets) -> Any:
     """Decode a scan into a sensor_msgs/PointCloud2, as velodyne_pointcloud does.
 
     The packets state the model. The nominal angles of the model are used. ``time`` is in seconds after the

@@ -30,7 +30,7 @@ _CODECS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class VideoPacket:
     """Packet of a video: one encoded picture.
 
     Attributes:
@@ -66,7 +66,7 @@ def is_video(message: Any) -> bool:
     return bytes(message.data[:4]).startswith(ANNEX_B)
 
 
-def decode_packet(msg: Any, topic: str, received: int) -> Packet:
+def decode_packet(msg: Any, topic: str, received: int) -> VideoPacket:
     """Make a packet from a foxglove CompressedVideo, an FFMPEGPacket, a Theora Packet or a CompressedImage.
 
     Raises:
@@ -80,7 +80,9 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
         first, key = data[:1] >= b"\x80", is_key("theora", data)
         frame_id = frame_name(header.frame_id)
         number = int(msg.packetno)
-        return Packet(topic, received, stamp, frame_id, "theora", data, key, is_header=first, number=number)
+        return VideoPacket(
+            topic, received, stamp, frame_id, "theora", data, key, is_header=first, number=number
+        )
     form = str(getattr(msg, "encoding", "") or getattr(msg, "format", ""))
     codec = next((name for name, words in _CODECS if words.search(form)), "")
     if not codec:
@@ -90,7 +92,7 @@ def decode_packet(msg: Any, topic: str, received: int) -> Packet:
         )
     if codec in ("h264", "h265") and not data.startswith(ANNEX_B):
         raise MessageError(f"{topic}: {len(data)} bytes of '{form}' are no {codec.upper()} in Annex B's form")
-    return Packet(topic, received, stamp, frame_name(header.frame_id), codec, data, is_key(codec, data))
+    return VideoPacket(topic, received, stamp, frame_name(header.frame_id), codec, data, is_key(codec, data))
 
 
 DECODERS = tuple(

@@ -9,14 +9,14 @@ from bevviz.evaluate.ground_truth import (
     truth_of,
     truth_source,
 )
-from bevviz.evaluate.matching import Matches, Score, judge, match, pair_in_order
+from bevviz.evaluate.matching import Matches, ObjectScore, judge, match, pair_in_order
 
 __all__ = [
     "MAX_DISTANCE",
     "MIN_HITS",
     "RANGE",
     "Matches",
-    "Score",
+    "ObjectScore",
     "Truth",
     "judge",
     "match",

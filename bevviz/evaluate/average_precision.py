@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.evaluate.matching import Classes, accepts
+from bevviz.evaluate.matching import AcceptedNames, accepts
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import FrameResult
@@ -26,7 +26,7 @@ RECALL_POINTS = 40
 COUNTS, IGNORED, OTHER = 0, 1, -1  # role of a label or detection for a class and difficulty
 
 Roles = NDArray[np.int8]  # one of the three values for each label or detection
-Key: TypeAlias = tuple[str, float, str, str]  # view, overlap, class, difficulty
+CurveKey: TypeAlias = tuple[str, float, str, str]  # view, overlap, class, difficulty
 
 
 class Difficulty(NamedTuple):
@@ -52,7 +52,7 @@ KITTI_CLASSES = {  # label -> labels that count neither as right nor as wrong, n
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ScoredObjects:
     """Objects of a frame, or detections in its image, compared with the ground truth."""
 
     names: tuple[str, ...]  # (D,) in lower case
@@ -62,7 +62,7 @@ class Found:
     excused: dict[str, F32]  # (D,) by view, largest share in a region without labels
 
 
-def found_objects(result: FrameResult, truth: Truth) -> Found:
+def scored_objects(result: FrameResult, truth: Truth) -> ScoredObjects:
     """Compare the fused objects of a frame with the ground truth."""
     objects = result.objects
     assert objects is not None
@@ -73,7 +73,7 @@ def found_objects(result: FrameResult, truth: Truth) -> Found:
         if row >= 0 and (camera_detections := detections.get(camera)) is not None:
             height[j] = camera_detections.xyxy[row, 3] - camera_detections.xyxy[row, 1]
     names = tuple(name.lower() for name in objects.names)
-    return Found(names, objects.score, height, {"bev": above, "3d": volume}, {})
+    return ScoredObjects(names, objects.score, height, {"bev": above, "3d": volume}, {})
 
 
 @dataclass
@@ -86,7 +86,7 @@ class Curve:
     def __post_init__(self) -> None:
         self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
 
-    def add(self, objects: Found, det: Roles, label: Roles) -> None:
+    def add(self, objects: ScoredObjects, det: Roles, label: Roles) -> None:
         """Add a frame.
 
         Args:
@@ -200,11 +200,11 @@ class AveragePrecision:
 
     def __init__(self, views: Sequence[str] = VIEWS) -> None:
         self._views = views
-        self._curves: dict[Key, Curve] = {}
-        self._frames: list[tuple[Found, Truth]] = []  # frames with labels other than KITTI's
-        self._judged = Classes()  # classes of these frames
+        self._curves: dict[CurveKey, Curve] = {}
+        self._frames: list[tuple[ScoredObjects, Truth]] = []  # frames with labels other than KITTI's
+        self._judged = AcceptedNames()  # classes of these frames
 
-    def add(self, objects: Found, truth: Truth) -> None:
+    def add(self, objects: ScoredObjects, truth: Truth) -> None:
         """Add a frame."""
         if truth.image is None:
             self._judged.add(truth)
@@ -223,12 +223,12 @@ class AveragePrecision:
                 det = _roles(has_name & ~small, has_name | small)
                 self._add(self._curves, (kind.lower(), name), objects, det, label)
 
-    def _by_label(self) -> dict[Key, Curve]:
+    def _by_label(self) -> dict[CurveKey, Curve]:
         """Return the curves of labels other than KITTI's.
 
         The class of a detection is known when all labels are known. So these curves are made at the end.
         """
-        curves: dict[Key, Curve] = {}
+        curves: dict[CurveKey, Curve] = {}
         names = {label.lower() for _, truth in self._frames for label in truth.labels}
         for objects, truth in self._frames:
             labels = np.array([label.lower() for label in truth.labels], object)
@@ -245,7 +245,12 @@ class AveragePrecision:
         return curves
 
     def _add(
-        self, curves: dict[Key, Curve], group: tuple[str, str], objects: Found, det: Roles, label: Roles
+        self,
+        curves: dict[CurveKey, Curve],
+        group: tuple[str, str],
+        objects: ScoredObjects,
+        det: Roles,
+        label: Roles,
     ) -> None:
         for view in self._views:
             for overlap in OVERLAPS:
@@ -259,7 +264,7 @@ class AveragePrecision:
         counts |= Counter((truth.labels[k].lower(), "") for k, truth in to_find)
         return {group: count for group, count in counts.items() if count}
 
-    def results(self) -> dict[Key, float]:
+    def results(self) -> dict[CurveKey, float]:
         """Return (view, overlap, class, difficulty) -> average precision, for curves with labels to be found.
 
         The kit samples at most one score for each true positive. With 40 labels or fewer it has fewer than 40
@@ -273,7 +278,7 @@ def _roles(counts: Bool, ignored: Bool) -> Roles:
     return np.where(counts, COUNTS, np.where(ignored, IGNORED, OTHER)).astype(np.int8)
 
 
-def _object_classes(objects: Found, truth: Truth, judged: Classes) -> list[str | None]:
+def _object_classes(objects: ScoredObjects, truth: Truth, judged: AcceptedNames) -> list[str | None]:
     """Return the class of each detection.
 
     It is the class of the label with the largest overlap, among the labels that accept the detection's name.

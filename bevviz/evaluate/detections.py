@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 import numpy as np
 
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.evaluate.matching import Classes, accepts, pair_in_order
+from bevviz.evaluate.matching import AcceptedNames, accepts, pair_in_order
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import CameraResult
@@ -22,7 +22,7 @@ class DetectionScore:
         self._labels: dict[str, Counter[str]] = defaultdict(Counter)
         self._false: Counter[str] = Counter()
 
-    def classes(self, judged: Classes) -> dict[str, Counter[str]]:
+    def classes(self, judged: AcceptedNames) -> dict[str, Counter[str]]:
         """Return the counts ``true``, ``false`` and ``missed`` of each class."""
         return judged.with_false(self._labels, self._false, "false")
 

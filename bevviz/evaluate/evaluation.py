@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.evaluate.average_precision import AveragePrecision, found_objects
+from bevviz.evaluate.average_precision import AveragePrecision, scored_objects
 from bevviz.evaluate.detections import DetectionScore
 from bevviz.evaluate.ground_score import count_ground
-from bevviz.evaluate.ground_truth import Truth, Truths
-from bevviz.evaluate.matching import Matches, Score, share
+from bevviz.evaluate.ground_truth import Truth, TruthLookup
+from bevviz.evaluate.matching import Matches, ObjectScore, share
 from bevviz.evaluate.metric_names import base_of, ranges
 from bevviz.evaluate.tracking_score import TrackScore
 from bevviz.model.frame import Boxes3D, Frame
@@ -53,13 +53,13 @@ class Evaluation(Observer[FrameResult]):
         >>> evaluation.metrics["recall.person"]
     """
 
-    def __init__(self, truth: Truths) -> None:
+    def __init__(self, truth: TruthLookup) -> None:
         self._truth = truth
         self.judged: list[JudgedFrame] = []
         self.without = 0  # frames without ground truth
         self.unusable: list[str] = []  # one sentence for each label that cannot be used
         self.last: tuple[FrameResult, Truth, Matches] | None = None
-        self._score = Score()
+        self._score = ObjectScore()
         self._rows: list[tuple[str, str, float]] = []  # outcome, class, distance in metres
         self._precision = AveragePrecision()
         self._tracks = TrackScore()
@@ -82,7 +82,7 @@ class Evaluation(Observer[FrameResult]):
         self.judged.append(_judged_frame(result.frame, objects, truth, matches))
         self._store_positions(objects, truth, matches)
         if result.objects is not None:
-            self._precision.add(found_objects(result, truth), truth)
+            self._precision.add(scored_objects(result, truth), truth)
         self._tracks.add(result, truth, self._score.judged)
         for camera in result.cameras:
             self._detections.add(camera, truth)
@@ -253,7 +253,7 @@ def _plain(value: float) -> float | None:
 
 def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> JudgedFrame:
     def label_text(k: int) -> str:
-        return f"{truth.labels[k].lower()} {place(truth.boxes, k)}"
+        return f"{truth.labels[k].lower()} {position_text(truth.boxes, k)}"
 
     return JudgedFrame(
         frame.index,
@@ -261,13 +261,13 @@ def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches
         tuple(label_text(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
         tuple(label_text(k) for k in np.flatnonzero(matches.missed).tolist()),
         tuple(
-            (objects.names[j].lower(), f"{objects.names[j].lower()} {place(objects.boxes, j)}")
+            (objects.names[j].lower(), f"{objects.names[j].lower()} {position_text(objects.boxes, j)}")
             for j in np.flatnonzero(matches.false).tolist()
         ),
     )
 
 
-def place(boxes: Boxes3D, row: int) -> str:
+def position_text(boxes: Boxes3D, row: int) -> str:
     """Return the position relative to the points' origin, as ``at 12.3 m, 4° left``."""
     x, y = boxes.center[row, :2].tolist()
     angle = math.degrees(math.atan2(y, x))

@@ -27,7 +27,7 @@ class Limit:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class LimitResult:
     """Outcome of a limit. ``reason`` says why it is not kept and is empty if it is."""
 
     limit: Limit
@@ -65,23 +65,23 @@ def _limit(side: Literal["min", "max"], text: str) -> Limit:
     return Limit(name, side, value)
 
 
-def check(limits: Sequence[Limit], metrics: Mapping[str, float]) -> list[Kept]:
+def check(limits: Sequence[Limit], metrics: Mapping[str, float]) -> list[LimitResult]:
     """Compare the metrics with the limits. A limit whose metric could not be measured is not kept."""
     return [_check_limit(limit, metrics) for limit in limits]
 
 
-def _check_limit(limit: Limit, metrics: Mapping[str, float]) -> Kept:
+def _check_limit(limit: Limit, metrics: Mapping[str, float]) -> LimitResult:
     value = metrics.get(limit.metric, math.nan)
     if math.isnan(value):
         base, ranged = base_of(limit.metric), "@" in limit.metric
         measured = [name for name in metrics if base_of(name) == base and (ranged or "@" not in name)]
         reason = f"measured were {', '.join(measured)}" if measured else f"nothing there has a {base}"
-        return Kept(limit, value, f"{limit.metric} could not be measured: {reason}")
+        return LimitResult(limit, value, f"{limit.metric} could not be measured: {reason}")
     kept = value >= limit.value if limit.side == "min" else value <= limit.value
-    return Kept(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
+    return LimitResult(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
 
 
-def write_junit(path: Path, suites: Mapping[str, list[Kept] | str]) -> None:
+def write_junit(path: Path, suites: Mapping[str, list[LimitResult] | str]) -> None:
     """Write a test suite for each drive with a test case for each limit.
 
     Args:

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from bevviz.model.results import FrameResult
-from bevviz.stages.voxel import of_points
+from bevviz.stages.voxel import spread_to_points
 
 # Numbers of SemanticKITTI's classes (Behley et al. 2019), stored in the field ``label`` of a cloud.
 GROUND_LABELS = (40, 44, 48, 49, 60, 72)  # road, parking, pavement, other ground, marking, terrain
@@ -22,7 +22,7 @@ def count_ground(counts: Counter[str], result: FrameResult) -> None:
         return
     kind = labels.astype(np.int64) & 0xFFFF
     known = ~np.isin(kind, UNLABELLED)
-    is_ground = of_points(result.ground.mask, result.voxels.inverse)
+    is_ground = spread_to_points(result.ground.mask, result.voxels.inverse)
     ground_points, object_points = np.isin(kind, GROUND_LABELS), np.isin(kind, OBJECT_LABELS)
     counts["true"] += int((is_ground & ground_points).sum())
     counts["false"] += int((is_ground & ~ground_points & known).sum())

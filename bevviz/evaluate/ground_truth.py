@@ -11,22 +11,22 @@ import numpy as np
 
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.errors import UserError
-from bevviz.messages.foreign_boxes import name_box
+from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles
 from bevviz.model import geometry
-from bevviz.model.class_names import ACCEPTED
+from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.stages.robot_results import in_points_frame
 
 if TYPE_CHECKING:
-    from bevviz.model.protocols import Frames
+    from bevviz.model.protocols import FrameSource
 
 MIN_HITS = 10  # least number of LiDAR points on an object to be found
 MAX_DISTANCE = 2.0  # metres between the centres of a box and its object, on the ground plane
 RANGE = 40.0  # metres, largest distance of an object to be found
 
 
-Truths: TypeAlias = "Callable[[Frame], Truth | None]"
+TruthLookup: TypeAlias = "Callable[[Frame], Truth | None]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Truth:
         return np.asarray(np.any(inside, axis=1), bool)
 
 
-def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> Truths | None:
+def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> TruthLookup | None:
     """Return a function that returns the ground truth of a frame. None: the bag has no ground truth.
 
     Args:
@@ -97,7 +97,7 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
     return of_topic
 
 
-def truth_in(frames: Frames, topic: str | None = None, kitti: Path | None = None) -> Truths:
+def truth_in(frames: FrameSource, topic: str | None = None, kitti: Path | None = None) -> TruthLookup:
     """Return a function that returns the ground truth of a drive's frames.
 
     Args:
@@ -143,10 +143,10 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]
     flat = [
-        f"{name_box(k, labelled.labels[k], '')}: a side of it is 0 m long"
+        f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
     ]
-    accepted = {label: ACCEPTED.get(label, frozenset((label.lower(),))) for label in labelled.labels}
+    accepted = {label: ACCEPTED_NAMES.get(label, frozenset((label.lower(),))) for label in labelled.labels}
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
         boxes,

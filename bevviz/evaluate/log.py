@@ -11,14 +11,14 @@ import rerun as rr
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import Truth
 from bevviz.evaluate.tables import page
-from bevviz.model.colors import TRUTH
+from bevviz.model.colors import TRUTH_COLORS
 from bevviz.model.frame import Boxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.labels import log_spoken, log_spoken_looks, named_in_space
+from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
 from bevviz.recording.primitives import boxes3d, document, transform
-from bevviz.recording.writer import WAIT, Writer
+from bevviz.recording.writer import SCALAR_WAIT, Writer
 from bevviz.support.text import markdown
 
 # Outcome, boxes, rows with this outcome, names of all boxes.
@@ -35,14 +35,14 @@ class EvaluationRecorder(Observer[FrameResult]):
 
     def __init__(self, recording: rr.RecordingStream, evaluation: Evaluation) -> None:
         self._evaluation = evaluation
-        self._writer = Writer(recording, wait=WAIT)
+        self._writer = Writer(recording, wait=SCALAR_WAIT)
 
     def begin(self, items: Items[object]) -> None:
         """Log the colours and the names of the plots."""
-        for outcome, color in TRUTH.items():
+        for outcome, color in TRUTH_COLORS.items():
             looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
             self._writer.static(entities.judged(outcome), looks)
-            log_spoken_looks(self._writer, entities.judged(outcome))
+            log_box_label_style(self._writer, entities.judged(outcome))
             series = rr.SeriesLines(colors=[color], names=[outcome], widths=[2])
             self._writer.static(entities.judged_count(outcome), series)
 
@@ -86,7 +86,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         wrong = np.repeat(
             [outcome != "true" for outcome, *_ in groups], [len(rows) for *_, rows, _ in groups]
         )
-        named = iter((named_in_space(centers, wrong) & wrong).tolist() if len(wrong) else [])
+        named = iter((choose_named_in_3d(centers, wrong) & wrong).tolist() if len(wrong) else [])
         for outcome, boxes, rows, names in groups:
             chosen, path = boxes.chosen(rows), entities.judged(outcome)
             labels = [f"{outcome}: {names[row]}" for row in rows]
@@ -97,7 +97,9 @@ class EvaluationRecorder(Observer[FrameResult]):
             descriptions = [
                 f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)
             ]
-            log_spoken(self._writer, path, chosen, visible_labels, descriptions, [TRUTH[outcome]] * len(rows))
+            log_box_labels(
+                self._writer, path, chosen, visible_labels, descriptions, [TRUTH_COLORS[outcome]] * len(rows)
+            )
 
     def end(self) -> None:
         """Log the tables of the whole run."""

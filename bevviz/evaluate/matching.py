@@ -28,7 +28,7 @@ class Matches:
     missed: Bool  # (K,) had to be found, but was not
 
 
-class Classes:
+class AcceptedNames:
     """Labels of the frames so far, with the names that they accept."""
 
     def __init__(self) -> None:
@@ -68,10 +68,10 @@ class Classes:
 
 
 @dataclass
-class Score:
+class ObjectScore:
     """Counts of objects over frames. A name that no label accepts in any frame is not judged."""
 
-    judged: Classes = field(default_factory=Classes)
+    judged: AcceptedNames = field(default_factory=AcceptedNames)
     errors: list[float] = field(default_factory=list)  # metres, of the true ones
     _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     _false: Counter[str] = field(default_factory=Counter)  # by name

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.evaluate.ground_truth import MAX_DISTANCE, Truth
-from bevviz.evaluate.matching import Classes, accepts
+from bevviz.evaluate.matching import AcceptedNames, accepts
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I32
 from bevviz.model.results import FrameResult
@@ -32,7 +32,7 @@ HINT = "MOTA and IDF1 need py-motmetrics: pip install 'bevviz[evaluate]'"
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class TrackedFrame:
     """Objects and tracks of one class in one frame, with the distances between them."""
 
     objects: I32  # (G,) numbers of the objects
@@ -41,11 +41,11 @@ class Step:
 
 
 @dataclass
-class Identities:
+class ClassTracks:
     """Frames of one class of a drive."""
 
     def __post_init__(self) -> None:
-        self.steps: list[Step] = []
+        self.steps: list[TrackedFrame] = []
         self._objects: dict[str, int] = {}
         self._tracks: dict[int, int] = {}
 
@@ -59,7 +59,7 @@ class Identities:
         """
         shape = len(objects), len(tracks)
         self.steps.append(
-            Step(
+            TrackedFrame(
                 np.array([self._objects.setdefault(name, len(self._objects)) for name in objects], np.int32),
                 np.array([self._tracks.setdefault(name, len(self._tracks)) for name in tracks], np.int32),
                 np.where(distance <= MAX_DISTANCE, distance, np.inf).reshape(shape),
@@ -124,9 +124,9 @@ class TrackScore:
     """
 
     def __init__(self) -> None:
-        self.classes: dict[str, Identities] = defaultdict(Identities)
+        self.classes: dict[str, ClassTracks] = defaultdict(ClassTracks)
 
-    def add(self, result: FrameResult, truth: Truth, judged: Classes) -> None:
+    def add(self, result: FrameResult, truth: Truth, judged: AcceptedNames) -> None:
         """Add a frame, unless its objects have no ids or there are no tracks."""
         tracks = result.tracks
         if tracks is None or not truth.ids:

@@ -68,7 +68,7 @@ class FolderExport(Observer[FrameResult]):
             raise UserError(f"{self._folder}: cannot be {what}: {error.strerror}") from None
 
 
-def rectified(bgr: U8, intrinsics: Intrinsics) -> U8:
+def rectify(bgr: U8, intrinsics: Intrinsics) -> U8:
     """Return the (H, W, 3) image as a camera with the same K and no distortion would take it."""
     if not intrinsics.distortion_model:
         return bgr

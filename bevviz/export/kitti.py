@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from bevviz.export.folder import FolderExport, rectified
+from bevviz.export.folder import FolderExport, rectify
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
 from bevviz.model.results import FrameResult, Objects
@@ -58,10 +58,10 @@ class KittiExport(FolderExport):
         points[:, :3] = frame.points
         if intensity is not None:
             points[:, 3] = intensity
-        lines = [] if result.objects is None else labels(result.objects, intrinsics, camera_from_points)
+        lines = [] if result.objects is None else label_lines(result.objects, intrinsics, camera_from_points)
         with self._saving():
             points.tofile(self._folder / "velodyne" / f"{name}.bin")
-            if not cv2.imwrite(str(self._folder / "image_2" / f"{name}.png"), rectified(bgr, intrinsics)):
+            if not cv2.imwrite(str(self._folder / "image_2" / f"{name}.png"), rectify(bgr, intrinsics)):
                 raise OSError(0, "the image cannot be written")
             (self._folder / "calib" / f"{name}.txt").write_text(calibration(intrinsics.K, camera_from_points))
             (self._folder / "label_2" / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
@@ -78,7 +78,7 @@ def calibration(K: F64, camera_from_points: F64) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def labels(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) -> list[str]:
+def label_lines(objects: Objects, intrinsics: Intrinsics, camera_from_points: F64) -> list[str]:
     """Return a line for each object in the image: KITTI's fifteen columns and the score.
 
     Occlusion is unknown and stated as 0.

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevviz.export.folder import FolderExport, rectified
+from bevviz.export.folder import FolderExport, rectify
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Camera, Frame
 from bevviz.model.protocols import Items
@@ -128,7 +128,7 @@ class NuScenesExport(FolderExport):
         if image.media_type == "image/jpeg" and image.encoded and not intrinsics.distortion_model:
             data = image.encoded
         else:
-            flat = rectified(image.bgr, intrinsics)
+            flat = rectify(image.bgr, intrinsics)
             done, encoded = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             if not done:
                 raise OSError(0, "the image cannot be written")

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock the folder for one batch. Delete the unfinished files of an interrupted batch before and after.
 
     Raises:
@@ -41,17 +41,19 @@ def claimed(folder: Path) -> Iterator[None]:
             pass  # Some network file systems cannot lock folders.
         remove = partial(shutil.rmtree, folder / PARTIAL, ignore_errors=True)
         remove()
-        cleanup.remember(folder, remove)
+        cleanup.register(folder, remove)
         try:
             yield
         finally:
             remove()
-            cleanup.forget(folder)
+            cleanup.unregister(folder)
     finally:
         os.close(handle)
 
 
-def left_to_do(jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = lambda _: None) -> list[Job]:
+def unfinished_jobs(
+    jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = lambda _: None
+) -> list[Job]:
     """Return the jobs without a complete, up-to-date result. The largest bags come first.
 
     The order keeps a worker from running a large bag alone at the end. The table of a damaged result is
@@ -69,7 +71,7 @@ def left_to_do(jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = l
     return sorted((job for job in jobs if not job.complete()), key=lambda job: -job.size)
 
 
-def whole_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
+def intact_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
     """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
     results: list[tuple[Path, RunInfo]] = []
     unchecked = 0

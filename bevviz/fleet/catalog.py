@@ -13,10 +13,10 @@ from bevviz.fleet.table import RunInfo
 from bevviz.recording import blueprints, entities, rerun_cli
 from bevviz.recording.ports import (
     LOOPBACK,
+    allowed_origins,
     check_port,
     free_port,
     host_for,
-    origins,
     own_address,
 )
 from bevviz.recording.sinks import APPLICATION
@@ -72,7 +72,7 @@ def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], bluep
 
 
 @contextmanager
-def served(port: int, bind: str = LOOPBACK) -> Iterator[tuple[str, str]]:
+def serve_catalog(port: int, bind: str = LOOPBACK) -> Iterator[tuple[str, str]]:
     """Start a catalog server and a web viewer, and yield their addresses.
 
     Raises:
@@ -83,9 +83,9 @@ def served(port: int, bind: str = LOOPBACK) -> Iterator[tuple[str, str]]:
     web_port, host = free_port(9090, but=port), host_for(address)
     url = f"rerun+http://{host}:{port}"
     arguments = ["server", "--host", address, "--port", str(port)]
-    for origin in origins(address, web_port):
+    for origin in allowed_origins(address, web_port):
         arguments += ["--cors-allow-origin", origin]
     with ExitStack() as stack:
-        stack.callback(rerun_cli.end, rerun_cli.start(arguments, address, port))
-        stack.callback(rerun_cli.end, rerun_cli.page(address, web_port, url))
+        stack.callback(rerun_cli.stop, rerun_cli.start(arguments, address, port))
+        stack.callback(rerun_cli.stop, rerun_cli.start_web_viewer(address, web_port, url))
         yield url, f"http://{host}:{web_port}"

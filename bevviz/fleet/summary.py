@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from bevviz.fleet.page import BagTotals, page
 from bevviz.fleet.table import SCHEMA, SEVERITIES, RunInfo, severity
-from bevviz.support.files import save, written
+from bevviz.support.files import atomic_write, save_text
 
 NAME = "summary"
 
@@ -91,7 +91,7 @@ def write_summary(
     frames, bags = collect(results, link)
     path = folder / f"{NAME}.html"
     text = page(folder.resolve().name, bags, head(frames, top), failed, viewer)
-    with written(folder / f"{NAME}.parquet", "summary") as file:
+    with atomic_write(folder / f"{NAME}.parquet", "summary") as file:
         pq.write_table(frames, file.path)
-    save(path, text, "-o")
+    save_text(path, text, "-o")
     return path

@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
 from bevviz.config import Config
-from bevviz.model.counts import counts_of
+from bevviz.model.counts import count_results
 from bevviz.model.frame import Scene
 from bevviz.model.results import Decision, DetectionState, FrameResult
-from bevviz.recording.decisions import remarks
+from bevviz.recording.decisions import decision_log_lines
 from bevviz.recording.provenance import file_hash
 
 # Decisions that are possible for a kept detection.
@@ -118,7 +118,7 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     """
     frame = result.frame
     counts: Counter[str] = Counter(dict.fromkeys(_integers, 0))
-    counts.update(counts_of(result))
+    counts.update(count_results(result))
     if result.ground is not None:
         counts["ground_points"] = int(result.ground.mask.sum())
     if result.clusters is not None:
@@ -160,12 +160,13 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
         "tf_age_ms": None if tf_age is None else 1e3 * tf_age,
         **{f"time_ms_{s}": 1e3 * result.timings[s] for s in STAGES if s in result.timings},
         "unmatched": unmatched,
-        "remarks": [text for _, text in remarks(result)] + [anomaly.text for anomaly in result.anomalies],
+        "remarks": [text for _, text in decision_log_lines(result)]
+        + [anomaly.text for anomaly in result.anomalies],
         "badness": round(badness, 6),
     }
 
 
-def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
+def add_judgement(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
     """Add the results of the evaluation to the row of a frame.
 
     Args:
@@ -183,7 +184,7 @@ def judged(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) 
     }
 
 
-def write(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:
     """Write a table with checksums of its pages and of ``info``. ``find_damage`` verifies them."""
     table = pa.Table.from_pylist([dict(r) for r in rows], schema=SCHEMA)
     about = _INFO.dump_json(info)

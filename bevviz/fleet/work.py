@@ -19,16 +19,16 @@ from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.fleet.engine.task import JobResult
 from bevviz.fleet.jobs import PARTIAL, Job
-from bevviz.fleet.table import RunInfo, judged, row, write
+from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import file_hash
 from bevviz.recording.recorder import DiskWatch, Recorder
-from bevviz.recording.sinks import Sinks, open_recording
-from bevviz.report.pictures import ahead, camera_picture, jpeg, shrink
-from bevviz.support.contexts import Closing
+from bevviz.recording.sinks import OpenRecording, open_recording
+from bevviz.report.pictures import camera_picture, crop_ahead, jpeg, shrink
+from bevviz.support.contexts import Closable
 from bevviz.support.files import unfinished_files
 from bevviz.support.text import path_text
 
@@ -77,7 +77,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     detector = job.config.detector
     detector = detector.model_copy(update={"threads": detector.threads or threads})
     config = job.config.model_copy(update={"detector": detector})  # used by the stages only
-    with Output(job) as output:
+    with JobOutput(job) as output:
         try:
             with job.selection.source([job.bag], job.config) as source:
                 session = Session(config)
@@ -91,7 +91,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
             return output.failed(error)
 
 
-class Output(Closing):
+class JobOutput(Closable):
     """Unfinished results of a bag. They are deleted if they do not get complete.
 
     Deleting the unfinished recording ends the job.
@@ -109,7 +109,7 @@ class Output(Closing):
         for path in (self._recording, *unfinished_files(self._recording), self._table):
             path.unlink(missing_ok=True)
 
-    def opened(self, source: BagSource) -> AbstractContextManager[Sinks]:
+    def opened(self, source: BagSource) -> AbstractContextManager[OpenRecording]:
         """Open the recording."""
         self._recording.parent.mkdir(parents=True, exist_ok=True)
         return open_recording(
@@ -124,10 +124,10 @@ class Output(Closing):
     def observers(
         self,
         source: BagSource,
-        sinks: Sinks,
+        sinks: OpenRecording,
         recorder: Recorder,
         on_frame: Callable[[], None],
-        pictures: Pictures,
+        pictures: PictureMaker,
     ) -> list[Observer[FrameResult]]:
         """Return the observers of the run.
 
@@ -181,14 +181,14 @@ class Output(Closing):
             self._recording.stat().st_size,
             file_hash(self._recording),
         )
-        write(self._table, self._rows.rows, info)
+        write_table(self._table, self._rows.rows, info)
         job.table.unlink(missing_ok=True)  # An older table must not vouch for the new recording.
         self._recording.replace(job.recording)
         self._table.replace(job.table)
         return JobResult(job.name, info.frames, info.seconds)
 
 
-Pictures: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
+PictureMaker: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
 
 WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's-eye view's
 
@@ -200,7 +200,7 @@ def pictures(result: FrameResult) -> Mapping[str, bytes]:
     if (picture := next((c for c in cameras if c is not None), None)) is not None:
         jpegs["picture"] = jpeg(picture)
     if result.bev is not None:
-        jpegs["above"] = jpeg(shrink(ahead(result.bev), ABOVE)[0])
+        jpegs["above"] = jpeg(shrink(crop_ahead(result.bev), ABOVE)[0])
     return jpegs
 
 
@@ -209,7 +209,7 @@ class _WorstPictures:
 
     COUNT = 12
 
-    def __init__(self, pictures: Pictures) -> None:
+    def __init__(self, pictures: PictureMaker) -> None:
         self._pictures = pictures
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
@@ -236,7 +236,7 @@ class _RowCollector(Observer[FrameResult]):
         recording: Path,
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
-        pictures: Pictures,
+        pictures: PictureMaker,
     ) -> None:
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
@@ -247,7 +247,7 @@ class _RowCollector(Observer[FrameResult]):
         values = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             judgement = self._evaluation.now
-            values = judged(values, judgement["missed"], judgement["false"])
+            values = add_judgement(values, judgement["missed"], judgement["false"])
         self._worst.see(values["badness"], len(self.rows), result)
         self.rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Literal
 
-from bevviz.sync.unusable_messages import Damage
+from bevviz.sync.unusable_messages import UnusableMessages
 
 SILENCE = 2.0  # seconds without a message that are reported, unless five usual steps are longer
 STREAM = 5  # messages after which a topic counts as a stream that should continue
@@ -40,7 +40,7 @@ class Watch:
         self.tell, self._clock = tell, clock
         self._told: set[str] = set()
         self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
-        self._damage = Damage()
+        self._damage = UnusableMessages()
         self._notes: dict[str, str] = {}  # subject -> its sentence, while it holds
 
     # --- messages ------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bevviz.errors import UserError
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 from bevviz.support.files import check_owned
 
 ANSWER = 5.0  # seconds that a healthy process needs at most to acknowledge a request
@@ -24,7 +24,7 @@ LONGEST = 1 << 16  # bytes, longest request or answer
 _CREDENTIALS = struct.Struct("3i")  # SO_PEERCRED of a socket: process, user, group
 
 
-class Control(Closing):
+class Control(Closable):
     """Server that answers requests to save until it is closed.
 
     A request is a line of JSON, ``{"path": "FILE.rrd"}``. The first line of the answer comes at once. The

@@ -19,12 +19,12 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
 from bevviz.live.robot_comparison import AgainstRobot, Compared
 from bevviz.live.thinning import is_cloud, thin_cloud
-from bevviz.model.frame import LateResult, Scene
+from bevviz.model.frame import LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
-from bevviz.recording.frame_logger import Context, Logger
+from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.recording.sinks import APPLICATION
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 WHOLE = 1.0  # seconds from one whole packet to the next
 
@@ -38,7 +38,7 @@ class Packet:
 
     data: bytes
     whole: bool
-    context: Context
+    context: RecordingContext
     time: float  # seconds, monotonic
     thinned: bytes | None = None  # the same frame with fewer points, for viewers; None: viewers get ``data``
 
@@ -48,7 +48,7 @@ class Packet:
         return self.data if self.thinned is None else self.thinned
 
 
-class _Stream(Closing):
+class _Stream(Closable):
     """Recording in a memory file whose bytes are read back as they are written."""
 
     def __init__(self, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None) -> None:
@@ -77,7 +77,7 @@ class _Stream(Closing):
         return data
 
 
-class _FrameLogger(Logger):
+class _FrameLogger(FrameLogger):
     """Logger that sets large clouds aside. The encoder writes each once in full and once thinned."""
 
     def __init__(self, recording: rr.RecordingStream, config: Config, scene: Scene, network: str) -> None:
@@ -139,7 +139,7 @@ class Encoder:
         self._stream.close()
 
     @property
-    def context(self) -> Context:
+    def context(self) -> RecordingContext:
         """Static context that the prelude of the next packet needs."""
         return self._logger.context
 
@@ -149,11 +149,11 @@ class Encoder:
         scene: Scene,
         health: Mapping[str, float],
         notes: Sequence[tuple[str, str]],
-        late: Sequence[LateResult] = (),
+        late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
         compared: Sequence[Compared] = (),
     ) -> Packet:
-        """Encode one frame, with changes of the configuration or scene since the last. See ``Logger.log``.
+        """Encode one frame, with changes of the configuration or scene since the last. See ``FrameLogger``.
 
         ``compared``: differences from the robot's results, for this frame and earlier ones.
         """
@@ -190,7 +190,7 @@ class Encoder:
     def encode_meanwhile(
         self, seconds: float, notes: Sequence[tuple[str, str]], states: Mapping[str, str]
     ) -> Packet:
-        """Encode notes and states while no frame comes. See ``Logger.log_meanwhile``."""
+        """Encode notes and states while no frame comes. See ``FrameLogger.log_meanwhile``."""
         with self._lock:
             self._logger.log_meanwhile(seconds, notes, states)
             return Packet(self._stream.read(), False, self._logger.context, self.clock())
@@ -215,11 +215,11 @@ class Encoder:
         for comparison in compared:
             self._differences.log(comparison.found, comparison.received, comparison.world_from_points)
 
-    def prelude(self, context: Context, *, blueprint: bool = True) -> bytes:
+    def prelude(self, context: RecordingContext, *, blueprint: bool = True) -> bytes:
         """Return the beginning of a recording whose first packet has this context. Any thread may call it."""
         layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
         with _Stream(self.recording_id, layout) as stream:
-            logger = Logger(stream.recording, context.config, context.scene, network=self._network)
+            logger = FrameLogger(stream.recording, context.config, context.scene, network=self._network)
             logger.log_context(context)
             if self._against is not None:
                 DifferenceLogger(stream.recording, self._against.names, "")

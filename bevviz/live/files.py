@@ -18,7 +18,7 @@ from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
 from bevviz.recording import rerun_cli
-from bevviz.support.files import create, is_locked, lock, rename_new, write_all
+from bevviz.support.files import create_file, is_locked, lock_file, rename_new, write_all
 
 MEGABYTE = 1_000_000
 INDEX = ".bevviz-index-"  # followed by eight hex digits: suffix of a file while its index is made
@@ -55,12 +55,22 @@ class Indexer:
     def _index(self, path: Path) -> None:
         """Write an indexed copy and replace the file with it."""
         indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
-        optimize = ["nice", "-n", "19", rerun_cli.program(), "rrd", "optimize", str(path), "-o", str(indexed)]
-        handle = create(indexed)
+        optimize = [
+            "nice",
+            "-n",
+            "19",
+            rerun_cli.rerun_program(),
+            "rrd",
+            "optimize",
+            str(path),
+            "-o",
+            str(indexed),
+        ]
+        handle = create_file(indexed)
         try:
-            lock(handle, f"{indexed}: another process is writing it")
+            lock_file(handle, f"{indexed}: another process is writing it")
             done = subprocess.run(
-                rerun_cli.tied(optimize),
+                rerun_cli.ending_with_parent(optimize),
                 capture_output=True,
                 check=False,
                 env=rerun_cli.environment(),
@@ -93,7 +103,7 @@ def remove_leftovers(folder: Path) -> None:
         with suppress(OSError, UserError):
             handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
-                lock(handle, "")
+                lock_file(handle, "")
                 path.unlink()
             finally:
                 os.close(handle)
@@ -228,7 +238,7 @@ class Saver(Output):
         if path.exists() and not path.is_file():
             self._file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)  # a device
         else:
-            self._file = create(path)
+            self._file = create_file(path)
         self.paths.append(path)
         self._written = self._whole = 0
 

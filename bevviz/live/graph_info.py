@@ -14,10 +14,10 @@ from bevviz.live.graph import PublishedTopic, describe_qos
 from bevviz.live.source import LiveSource
 from bevviz.model.frame import Frame
 from bevviz.pipeline.bag_info import (
-    Contents,
+    TopicContents,
     TopicInfo,
     find_missing,
-    networks_of,
+    network_providers,
     render_contents,
 )
 
@@ -26,7 +26,7 @@ PATIENCE = 10.0  # seconds until the topics found so far are shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LiveInfo(Contents):
+class LiveInfo(TopicContents):
     """Content of ``bevviz info --live``."""
 
     domain: int
@@ -58,7 +58,7 @@ def describe(
         counts, volume = source.received - before, source.volume - volume
         absent = source.missing
         missing = [absent] if absent else find_missing(source.roles, frame, config)
-        networks, lacking = networks_of(config)
+        networks, lacking = network_providers(config)
         missing += lacking
         return LiveInfo(
             domain=source.domain,

@@ -25,7 +25,7 @@ class LiveMessage:
     received: int  # nanoseconds, time of receipt by the middleware
     data: bytes  # CDR
     sensor: ouster.Sensor | None = None  # the Ouster whose packets make a scan
-    packets: tuple[ouster.Packet, ...] = ()
+    packets: tuple[ouster.ReceivedPacket, ...] = ()
 
     def header(self) -> tuple[int, str]:
         """Return the stamp in nanoseconds and the frame id of the header."""

@@ -8,10 +8,10 @@ from typing import Any
 
 from bevviz.errors import UserError
 from bevviz.live.environment import load_rclpy
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 
-class Node(Closing):
+class Node(Closable):
     """One context with two nodes. Each is spun by its own thread from ``start`` to ``close``.
 
     ``node`` is the node that users see. It has the name, the parameters and the services, and it publishes.

@@ -22,7 +22,7 @@ class Ousters:
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}  # topic of packets -> its metadata
-        self._scans: dict[str, ouster.Scans] = {}
+        self._scans: dict[str, ouster.ScanCollector] = {}
         self._imus: set[str] = set()  # topics whose packets are too small for a LiDAR
         self._beside: dict[str, set[str]] = {}  # topic of metadata -> topics of packets
 
@@ -59,15 +59,15 @@ class Ousters:
             if name not in self._scans:
                 self._add(name, read_calibration(Path(file)), f"source.lidar_calibration: {file}")
         else:
-            self._beside.setdefault(ouster.metadata_of(name), set()).add(name)
+            self._beside.setdefault(ouster.metadata_topic(name), set()).add(name)
         if name in self._scans:
             return replace(topic, scans=True, frame_id=ouster.FRAME)
-        return replace(topic, aside=ouster.waits(name))
+        return replace(topic, aside=ouster.waiting_note(name))
 
     def _add(self, topic: str, text: str, where: str) -> None:
         """Set the metadata of a topic of packets."""
         if self._texts.get(topic) != text:
-            self._scans[topic] = ouster.Scans(ouster.read_sensor(text, where))
+            self._scans[topic] = ouster.ScanCollector(ouster.read_sensor(text, where))
             self._texts[topic] = text
 
     def add_metadata(self, topic: str, text: str) -> bool:
@@ -89,7 +89,9 @@ class Ousters:
         """Return the sensor of a topic of packets."""
         return self._scans[topic].sensor
 
-    def add_packet(self, topic: str, received: int, data: bytes) -> Iterator[tuple[ouster.Packet, ...]]:
+    def add_packet(
+        self, topic: str, received: int, data: bytes
+    ) -> Iterator[tuple[ouster.ReceivedPacket, ...]]:
         """Yield the scans that are complete with this message.
 
         Raises:

@@ -13,12 +13,12 @@ from bevviz.errors import UserError
 from bevviz.live.files import MEGABYTE
 from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import RawMessage, RawRecorder, define
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 WAITING = 200 * MEGABYTE  # bytes of messages that may wait for a slow disk
 
 
-class RawSaver(Closing):
+class RawSaver(Closable):
     """Writer of every message to a bag. It begins with the messages that the recorder holds.
 
     A part in progress is NAME.partial-XXXXXXXX.mcap. It begins with the earlier messages that are still valid

@@ -15,12 +15,12 @@ from bevviz.compare.differences import (
     Difference,
     FrameDifferences,
     ImageBoxes,
-    Seen,
+    SideResult,
     differences,
     seen,
 )
-from bevviz.compare.log import place
-from bevviz.compare.sides import published, robot_topic
+from bevviz.compare.log import position_text
+from bevviz.compare.sides import published_result, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.model import geometry
@@ -40,7 +40,7 @@ class Ours:
     stamp: int
     received: int
     world_from_points: F64
-    seen: Seen
+    seen: SideResult
     images: Mapping[str, ImageBoxes]  # by camera, the robot's image boxes that came with the frame
 
 
@@ -119,7 +119,7 @@ class AgainstRobot:
                 self._add_images(stamp, labelled_boxes)
         self._late |= {stamp: boxes for stamp, boxes in in_space.items() if boxes.topic == self.topic}
         compared = []
-        theirs = published(frame, self.topic, result.config) if self.topic else None
+        theirs = published_result(frame, self.topic, result.config) if self.topic else None
         if theirs is not None and frame.stamp in self._waiting:
             compared.append(self._compare(self._waiting.pop(frame.stamp), seen(theirs)))
         for stamp in sorted(self._late.keys() & self._waiting.keys()):
@@ -156,7 +156,7 @@ class AgainstRobot:
         except UserError as error:
             self.topic, self.problem = "", str(error)
 
-    def _compare(self, ours: Ours, theirs: Seen) -> Compared:
+    def _compare(self, ours: Ours, theirs: SideResult) -> Compared:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
@@ -172,7 +172,7 @@ class AgainstRobot:
             lasted = (ours.stamp - self._since) / SECOND
             if lasted >= self.config.robot_time:
                 self._fired = True
-                words = ", ".join(f"{_words(d)} {place(d, frame_differences)}" for d in different[:3])
+                words = ", ".join(f"{_words(d)} {position_text(d, frame_differences)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 with self._lock:
                     self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
@@ -207,8 +207,8 @@ def _image_boxes(found: LabelledBoxes2D) -> ImageBoxes:
     return ImageBoxes(found.xyxy, found.labels)
 
 
-def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> Seen:
+def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> SideResult:
     """Move the robot's boxes to the points frame of an earlier frame."""
     world = np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
-    boxes = geometry.moved(labelled.boxes, geometry.inverse(world_from_points) @ world)
-    return Seen(boxes, labelled.labels, labelled.scores)
+    boxes = geometry.transform_boxes(labelled.boxes, geometry.inverse(world_from_points) @ world)
+    return SideResult(boxes, labelled.labels, labelled.scores)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bevviz.config import Config
-from bevviz.config.reloading import AT_START, Settings
+from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
@@ -36,10 +36,10 @@ from bevviz.live.thinning import Thinned
 from bevviz.live.triggers import Triggers
 from bevviz.live.viewers import LATE, Viewer, remote, server, window
 from bevviz.live.warm_up import warm_up
-from bevviz.model.frame import Around, Frame, Scene, Source
+from bevviz.model.frame import Frame, RobotContext, Scene, Source
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.run import Dropping, run
+from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording import entities
@@ -96,7 +96,7 @@ class Live:
     def __init__(
         self,
         source: Source,
-        settings: Settings,
+        settings: ReloadableConfig,
         outputs: Outputs,
         notes: Notes,
         *,
@@ -140,7 +140,7 @@ class Live:
         self._snapshots = Snapshots(self.flight, raw, notes)
         self._triggers = Triggers(live)
         self.health = Health()
-        self._dropping = Dropping()
+        self._dropping = DropPolicy()
 
         programs = [remote(url, self.encoder.recording_id) for url in outputs.connect]
         if outputs.serve is not None:
@@ -348,7 +348,7 @@ class Live:
         lost = [mark for mark in self._source.marks(frame.index) if mark.index < frame.index]
         if not lost:
             return result
-        around = frame.around or Around()
+        around = frame.around or RobotContext()
         texts = [
             f"{mark.text} ({(frame.stamp - mark.stamp) * 1e-9:.2f} s before this frame)" for mark in lost
         ]
@@ -450,7 +450,7 @@ class Live:
         for key, change in changed.items():
             if ".params." in key and "absent" in (change.before, change.after):
                 continue  # the change of the method is reported instead
-            late = "; takes effect at the next start" if key.startswith(AT_START) else ""
+            late = "; takes effect at the next start" if key.startswith(FIXED_KEYS) else ""
             self.notes.info(f"configuration: {key} {change}{late}")
 
     def _nice(self, nice: int) -> None:

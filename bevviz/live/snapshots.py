@@ -13,10 +13,10 @@ from bevviz.live.health import give_way
 from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import RawMessage, RawRecorder, write_bag
 from bevviz.recording import entities
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 
-class Snapshots(Closing):
+class Snapshots(Closable):
     """Writer of snapshots. ``save`` waits for the disk; ``save_soon`` uses its own thread.
 
     Args:

@@ -35,13 +35,13 @@ from bevviz.messages.definitions import store_of
 from bevviz.messages.foreign_boxes import holds_boxes
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import MARK, Roles, find_roles
-from bevviz.messages.topics import Topic, foreign
-from bevviz.model.frame import Frame, Intrinsics, LateResult, Mark, Scene
-from bevviz.pipeline.run import BURST
-from bevviz.support.contexts import Closing
+from bevviz.messages.topics import Topic, unsupported_reason
+from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
+from bevviz.pipeline.run import MAX_BURST
+from bevviz.support.contexts import Closable
 from bevviz.support.queues import NewestQueue
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
-from bevviz.sync.report import blindness
+from bevviz.sync.report import why_no_images
 from bevviz.sync.surroundings import MARKS
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
@@ -76,7 +76,7 @@ class _Subscription:
     qos: Any
 
 
-class LiveSource(Closing):
+class LiveSource(Closable):
     """Source of a robot's frames as they become complete, until ``stop``.
 
     One thread receives, decodes and synchronises the messages. It passes frames through a short queue. The
@@ -122,12 +122,12 @@ class LiveSource(Closing):
         self._settled = threading.Event()
         self._complete = False  # whether the scene is known
         self._knowledge = threading.RLock()  # guards the state that the receiving thread changes
-        self._handover: NewestQueue[Frame] = NewestQueue(BURST, catch_up=True)
+        self._handover: NewestQueue[Frame] = NewestQueue(MAX_BURST, catch_up=True)
         self._iterated = False
         self._unasked = 0  # frames dropped before the first iteration
         self._frames = 0
         self._numbers: deque[tuple[int, int]] = deque(maxlen=OVERTAKEN)  # stamp and index of recent frames
-        self._marks: deque[Mark] = deque(maxlen=MARKS)  # marks that no call of ``marks`` has returned
+        self._marks: deque[UserMark] = deque(maxlen=MARKS)  # marks that no call of ``marks`` has returned
         self._ended = False
 
         self._node = Node(arguments, on_end=self.stop, name=name)
@@ -244,7 +244,7 @@ class LiveSource(Closing):
                 for topic, count in self.lost.items()
             ]
             report = self._sync.report
-            blind = blindness(self.config, self.roles, report) if self._complete else []
+            blind = why_no_images(self.config, self.roles, report) if self._complete else []
             return [*self._watch.warnings, *lost, *blind, *report.warnings()]
 
     @property
@@ -272,7 +272,7 @@ class LiveSource(Closing):
                 {name: name in self.topics for name in self._subscriptions.keys() - shown}
             )
 
-    def overtaken(self) -> tuple[LateResult, ...]:
+    def overtaken(self) -> tuple[LateBoxes, ...]:
         """Return the robot's results that no frame took, since the last call. Any thread may call it."""
         with self._knowledge:
             numbers = dict(self._numbers)
@@ -282,7 +282,7 @@ class LiveSource(Closing):
                 if late.frame_stamp in numbers
             )
 
-    def marks(self, index: int) -> tuple[Mark, ...]:
+    def marks(self, index: int) -> tuple[UserMark, ...]:
         """Return the marks of frames up to this index since the last call, including dropped frames."""
         with self._knowledge:
             marks = tuple(mark for mark in self._marks if mark.index <= index)
@@ -357,7 +357,7 @@ class LiveSource(Closing):
                 continue
             self._numbers.append((frame.stamp, self._frames))
             for text in frame.around.marks if frame.around else ():
-                self._marks.append(Mark(text, self._frames, frame.stamp))
+                self._marks.append(UserMark(text, self._frames, frame.stamp))
             self._handover.put(replace(frame, index=self._frames))
             self._frames += 1
 
@@ -371,7 +371,7 @@ class LiveSource(Closing):
         known.setdefault(self._mark.name, self._mark)
         of_boxes = resolved(self.config.source, self._node.resolve).boxes.get("topic")
         packets = [name for name, topic in self.topics.items() if ouster.is_packet(topic.type)]
-        besides = {of_boxes, *map(ouster.metadata_of, packets)}
+        besides = {of_boxes, *map(ouster.metadata_topic, packets)}
         self._known = known | {
             name: topic for name, topic in self.topics.items() if _concerns(topic) or name in besides
         }
@@ -561,5 +561,5 @@ def _concerns(topic: PublishedTopic) -> bool:
         topic.type in KINDS
         or declared_decoder(topic.type) is not None
         or holds_boxes(topic.type)
-        or bool(foreign(Topic(topic.name, topic.type, None, "")))
+        or bool(unsupported_reason(Topic(topic.name, topic.type, None, "")))
     )

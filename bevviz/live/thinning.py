@@ -11,7 +11,7 @@ import pyarrow as pa
 import rerun as rr
 
 from bevviz.config import Config
-from bevviz.model.frame import I64, Frame, LateResult, Mark, Scene, Source
+from bevviz.model.frame import I64, Frame, LateBoxes, Scene, Source, UserMark
 from bevviz.recording.color_by import ColoredPoints
 
 
@@ -55,12 +55,12 @@ class Thinned:
         """State of each topic, if the source has topics."""
         return getattr(self._source, "states", {})
 
-    def overtaken(self) -> tuple[LateResult, ...]:
+    def overtaken(self) -> tuple[LateBoxes, ...]:
         """Return the robot's results that came too late for their frames, since the last call."""
         overtaken = getattr(self._source, "overtaken", None)
         return () if overtaken is None else tuple(overtaken())
 
-    def marks(self, index: int) -> tuple[Mark, ...]:
+    def marks(self, index: int) -> tuple[UserMark, ...]:
         """Return the users' marks up to the frame of this index, since the last call."""
         marks = getattr(self._source, "marks", None)
         return () if marks is None else tuple(marks(index))

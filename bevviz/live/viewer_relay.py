@@ -21,8 +21,8 @@ from typing import BinaryIO, NoReturn
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from bevviz.recording.blueprints import Saved
-from bevviz.recording.ports import answers
+from bevviz.recording.blueprints import SavedBlueprint
+from bevviz.recording.ports import is_listening
 from bevviz.recording.sinks import APPLICATION, check_viewer
 
 PROBE = 2.0  # seconds between two checks of the viewer
@@ -60,7 +60,7 @@ def _forward(data: bytes, recording: rr.RecordingStream) -> None:
         path = Path(f"/proc/self/fd/{file}")
         reader = RrdReader(path)
         if reader.blueprints():
-            recording.send_blueprint(Saved(path))
+            recording.send_blueprint(SavedBlueprint(path))
         for store in reader.recordings():
             recording.send_chunks(reader.stream(store=store))
     finally:
@@ -69,7 +69,7 @@ def _forward(data: bytes, recording: rr.RecordingStream) -> None:
 
 def _watch(host: str, port: int) -> None:
     """End this process when the viewer no longer answers."""
-    while answers(host, port):
+    while is_listening(host, port):
         time.sleep(PROBE)
     os._exit(1)
 

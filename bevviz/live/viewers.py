@@ -12,15 +12,15 @@ from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.notes import Notes
 from bevviz.live.output import Output
 from bevviz.recording import rerun_cli
-from bevviz.recording.frame_logger import Context
+from bevviz.recording.frame_logger import RecordingContext
 from bevviz.recording.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
-    answers,
+    allowed_origins,
     check_port,
     free_port,
     host_for,
-    origins,
+    is_listening,
     own_address,
     viewer_address,
 )
@@ -47,7 +47,7 @@ class Program:
 
 def window() -> Program:
     """Return the program of the viewer window on this machine."""
-    command = [rerun_cli.program(), "-", "--bind", LOOPBACK, "--port", "auto"]
+    command = [rerun_cli.rerun_program(), "-", "--bind", LOOPBACK, "--port", "auto"]
     command += ["--memory-limit", "50%", "--hide-welcome-screen"]
     return Program("window", command, lasting=False)
 
@@ -63,11 +63,13 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
     address = own_address(bind)
     check_port(port)
     data_port = free_port(FIRST_DATA_PORT, but=port)
-    command = [rerun_cli.program(), "-", "--serve-web", "--bind", address, "--port", str(data_port)]
+    command = [rerun_cli.rerun_program(), "-", "--serve-web", "--bind", address, "--port", str(data_port)]
     command += ["--web-viewer-port", str(port), "--server-memory-limit", f"{memory:.0f}MB", "--newest-first"]
-    for origin in origins(address, port):
+    for origin in allowed_origins(address, port):
         command += ["--cors-allow-origin", origin]
-    return Program("web", rerun_cli.tied(command)), viewer_address(host_for(address), port, data_port)
+    return Program("web", rerun_cli.ending_with_parent(command)), viewer_address(
+        host_for(address), port, data_port
+    )
 
 
 def remote(url: str, recording_id: str) -> Program:
@@ -78,7 +80,7 @@ def remote(url: str, recording_id: str) -> Program:
     """
     host, port = check_viewer(url)
     command = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, recording_id]
-    return Program("remote", command, framed=True, is_ready=lambda: answers(host, port))
+    return Program("remote", command, framed=True, is_ready=lambda: is_listening(host, port))
 
 
 class Viewer(Output):
@@ -156,13 +158,13 @@ class Viewer(Output):
             return self._recover(packet.context)
         return self._send(packet.shown) or self._recover(packet.context)
 
-    def _begin(self, context: Context) -> bool:
+    def _begin(self, context: RecordingContext) -> bool:
         """Send the beginning of a recording."""
         if self._program.framed and not self._send(self._encoder.header):
             return False
         return self._send(self._encoder.prelude(context))
 
-    def _recover(self, context: Context) -> bool:
+    def _recover(self, context: RecordingContext) -> bool:
         """Wait for the viewer to come back, unless the user has closed it. Return False: a gap follows."""
         if self._ended.is_set():
             return False

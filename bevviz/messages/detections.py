@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bevviz.messages.decoding import either, frame_name, stamp_ns
-from bevviz.messages.foreign_boxes import decode_objects, name_box, turned_boxes, why_unusable
+from bevviz.messages.foreign_boxes import box_name, decode_objects, turned_boxes, why_unusable
 from bevviz.model.frame import (
     F32,
     F64,
@@ -132,7 +132,7 @@ def _rows(
     rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
     reasons = [why(values) for values, *_ in rows]
     unusable = [
-        f"{name_box(number, label, identity)}: {reason}"
+        f"{box_name(number, label, identity)}: {reason}"
         for number, ((_, label, _, identity, _), reason) in enumerate(zip(rows, reasons, strict=True))
         if reason
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.messages.decoding import frame_name, stamp_ns
-from bevviz.messages.guard import field_names, kind_of
+from bevviz.messages.guard import describe_kind, field_names
 from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def holds_boxes(msgtype: str) -> bool:
     return TYPES.search(msgtype) is not None
 
 
-def check(stated: Mapping[str, str]) -> None:
+def check_boxes_setting(stated: Mapping[str, str]) -> None:
     """Check the setting ``source.boxes``.
 
     Raises:
@@ -116,7 +116,7 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
         label = _label(item, where.label) if where.label else ""
         identity = _identity(_follow(item, where.id)[1]) if _has(item, where.id) else ""
         if why := why_unusable(row):
-            unusable.append(f"{name_box(number, label, identity)}: {why}")
+            unusable.append(f"{box_name(number, label, identity)}: {why}")
             continue
         rows.append(row)
         item_header = getattr(item, "header", None)
@@ -216,7 +216,7 @@ def why_unusable(row: Sequence[float]) -> str:
     return ""
 
 
-def name_box(number: int, label: str, identity: str) -> str:
+def box_name(number: int, label: str, identity: str) -> str:
     """Return a name for a box of a message: ``box 3 (Car, id 17)``. Numbers count from 0."""
     words = [label, f"id {identity}" if identity else ""]
     about = ", ".join(filter(None, words))
@@ -270,7 +270,7 @@ def _read(kind: Callable[[Any], T], item: Any, path: str) -> T:
     try:
         return kind(value)
     except (TypeError, ValueError, AttributeError):
-        raise ValueError(f"the field '{path}' cannot be used: it is {kind_of(value)}") from None
+        raise ValueError(f"the field '{path}' cannot be used: it is {describe_kind(value)}") from None
 
 
 def _has(item: Any, path: str) -> bool:

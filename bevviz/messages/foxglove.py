@@ -43,7 +43,7 @@ _LABELS = ("category", "label", "class", "class_name", "type", "name")
 _MODELS = {"kannala_brandt": "equidistant"}
 
 
-def short_of(msgtype: str) -> str:
+def foxglove_type(msgtype: str) -> str:
     """Return ``PointCloud`` for ``foxglove.PointCloud`` and ``foxglove_msgs/msg/PointCloud``; else ""."""
     match = TYPE.match(msgtype)
     return match.group(1) if match and match.group(1) in KINDS else ""
@@ -104,18 +104,18 @@ class _Fields(SimpleNamespace):
         return None
 
 
-def as_ros(message: Any, msgtype: str) -> Any:
+def to_ros(message: Any, msgtype: str) -> Any:
     """Convert a message of Foxglove to the ROS message of the same meaning.
 
     Raises:
         ValueError: a field that the ROS message needs is missing or wrong.
     """
-    return _CONVERT[short_of(msgtype)](message)
+    return _CONVERT[foxglove_type(msgtype)](message)
 
 
 def header(message: Any, msgtype: str) -> tuple[int, str]:
     """Return stamp (nanoseconds) and frame_id; those of the first part if the message has several."""
-    kind = short_of(msgtype)
+    kind = foxglove_type(msgtype)
     if kind in ("FrameTransforms", "SceneUpdate"):
         first = next(
             iter((message.transforms if kind == "FrameTransforms" else message.entities) or ()), None

@@ -8,13 +8,13 @@ import numpy as np
 
 from bevviz.messages.decoding import MessageError
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, Surface
+from bevviz.model.frame import F32, F64, HeightMap
 
 HEIGHT = "elevation"  # name of the layer with heights
 LARGEST = 250_000  # cells that are shown; larger maps are reduced to every n-th row and column
 
 
-def decode_grid_map(msg: Any, pose: F64, topic: str) -> Surface | None:
+def decode_grid_map(msg: Any, pose: F64, topic: str) -> HeightMap | None:
     """Decode a layer of a map: ``elevation`` as heights, or the first layer as colours of a plane.
 
     Rows of a layer run against x and columns against y, from the corner where both are greatest. The map is a
@@ -58,7 +58,7 @@ def _layer(array: Any, what: str) -> F32:
     return cells if dims[0].label == "row_index" else cells.T
 
 
-def _surface(values: F32, x: F64, y: F64, pose: F64, *, flat: bool) -> Surface | None:
+def _surface(values: F32, x: F64, y: F64, pose: F64, *, flat: bool) -> HeightMap | None:
     known = np.isfinite(values)
     if not known.any():
         return None
@@ -73,4 +73,4 @@ def _surface(values: F32, x: F64, y: F64, pose: F64, *, flat: bool) -> Surface |
     both = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     triangles = both[(both >= 0).all(axis=1)].astype(np.uint32)
     vertices = geometry.apply(pose, local.astype(np.float32))
-    return Surface(vertices, triangles, values[known])
+    return HeightMap(vertices, triangles, values[known])

@@ -151,13 +151,13 @@ def _wrong_values(values: Iterable[Any], kind: tuple[Any, Any], path: str) -> It
     for value in values:
         if node == Nodetype.NAME:
             if field_names(value) is None:
-                yield f"the field '{path}' is {kind_of(value)}, not a {about}"
+                yield f"the field '{path}' is {describe_kind(value)}, not a {about}"
             yield from _wrong_fields(value, about, f"{path}.")
         elif node == Nodetype.BASE:
             if not _is_base(value, about[0]):
-                yield f"the field '{path}' is {kind_of(value)}, not a {about[0]}"
+                yield f"the field '{path}' is {describe_kind(value)}, not a {about[0]}"
         elif not isinstance(value, list | tuple | np.ndarray | bytes):
-            yield f"the field '{path}' is {kind_of(value)}, not a list"
+            yield f"the field '{path}' is {describe_kind(value)}, not a list"
         elif isinstance(value, np.ndarray):
             if about[0][0] != Nodetype.BASE or about[0][1][0] == "string":
                 yield f"the field '{path}' is a list of {value.dtype} numbers, not of {_name_of(about[0])}"
@@ -179,7 +179,7 @@ def _is_base(value: Any, name: str) -> bool:
     return isinstance(value, Integral | np.bool_)
 
 
-def kind_of(value: Any) -> str:
+def describe_kind(value: Any) -> str:
     """Return the name of a value's kind, for the middle of a sentence."""
     if field_names(value) is not None:
         return f"a {_type_of(value) or 'message'}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from bevviz.messages.decoding import MessageError
 from bevviz.model import geometry
-from bevviz.model.frame import F64, MeshFile, Shape, Solids
+from bevviz.model.frame import F64, MeshFile, PlacedShape, SolidShapes
 
 JOINT = 0.02  # metres; half of the size of the mark for a link without simple geometry
 
@@ -22,7 +22,7 @@ MESHES = {".stl", ".dae", ".obj", ".glb", ".gltf", ".ply"}  # formats that the v
 LARGEST = 50_000_000  # bytes of the largest mesh
 
 
-def links(text: str, topic: str) -> Iterator[Shape]:
+def parse_links(text: str, topic: str) -> Iterator[PlacedShape]:
     """Yield the solids and meshes of each link of a URDF; a small mark for a link without both.
 
     See http://wiki.ros.org/urdf/XML/link. Meshes are files of the robot. Only those that are on this machine
@@ -44,13 +44,13 @@ def links(text: str, topic: str) -> Iterator[Shape]:
         except ValueError as error:
             raise MessageError(f"{topic}: link '{name}': {error}") from None
         if meshes and not parts:
-            yield Shape(f"{topic}/{name}", name, 0, meshes=meshes)
+            yield PlacedShape(f"{topic}/{name}", name, 0, meshes=meshes)
             continue
         poses = np.stack([pose for pose, _ in parts]) if parts else np.eye(4)[None]
         half = np.array([half for _, half in parts] or [(JOINT, JOINT, JOINT)], np.float32)
         turns = np.stack([geometry.quaternion(pose) for pose in poses]).astype(np.float32)
-        solids = Solids(poses[:, :3, 3].astype(np.float32), half, turns, round=not parts)
-        yield Shape(f"{topic}/{name}", name, 0, solids=solids, meshes=meshes)
+        solids = SolidShapes(poses[:, :3, 3].astype(np.float32), half, turns, round=not parts)
+        yield PlacedShape(f"{topic}/{name}", name, 0, solids=solids, meshes=meshes)
 
 
 def _visual(visual: ElementTree.Element) -> tuple[F64, tuple[float, ...]] | None:

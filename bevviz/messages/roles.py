@@ -12,19 +12,19 @@ from typing import Literal
 
 from bevviz.config import SourceConfig
 from bevviz.errors import UserError
-from bevviz.messages.foreign_boxes import check
-from bevviz.messages.foxglove import short_of
+from bevviz.messages.foreign_boxes import check_boxes_setting
+from bevviz.messages.foxglove import foxglove_type
 from bevviz.messages.sensors import CameraRole, camera_role, find_images, find_lidars
 from bevviz.messages.topics import (
     IMAGES,
     Topic,
     entity_name,
-    foreign,
     names_of,
-    note,
     of_kind,
+    set_note,
     stated_topic,
     unique_names,
+    unsupported_reason,
 )
 from bevviz.model.frame import Scene
 
@@ -158,13 +158,13 @@ def find_roles(
     """
     topics = sorted(topics, key=lambda t: t.name)  # topics of a bag or graph have no fixed order
     topics = _with_boxes(topics, config)
-    notes = {t.name: f"not used: {foreign(t) or f'nothing here reads {t.type}'}" for t in topics}
+    notes = {t.name: f"not used: {unsupported_reason(t) or f'nothing here reads {t.type}'}" for t in topics}
     staged = {key: stated_topic(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     for name in config.lidar_calibration:
         stated_topic(name, topics, "source.lidar_calibration", "PointCloud2")
     metadata = {t.metadata_topic for t in topics}
-    note(notes, [t for t in topics if t.name in metadata], "metadata of the LiDAR")
+    set_note(notes, [t for t in topics if t.name in metadata], "metadata of the LiDAR")
     lidars = find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = find_images(topics, config, notes)
     names = unique_names(
@@ -182,28 +182,30 @@ def find_roles(
 
     transforms = [t for t in topics if t.kind.lower() == "tfmessage"]
     others = [t for t in transforms if _of_another_robot(t, topics, [*lidars, *images])]
-    note(notes, others, "not used: transforms of another robot, whose sensors are not")
+    set_note(notes, others, "not used: transforms of another robot, whose sensors are not")
     transforms = [t for t in transforms if t not in others]
     static = [t for t in transforms if t.name.endswith("tf_static")]
     moving = [t for t in transforms if t not in static]
-    note(notes, static, "static transforms")
-    note(notes, moving, "transforms")
+    set_note(notes, static, "static transforms")
+    set_note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
     imus = [topic for topic in of_kind(topics, "Imu") if topic.count != 0]
-    note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
+    set_note(notes, imus, "plotted; gravity, where the transforms have no upright frame")
     boxes = of_kind(topics, "Detection3DArray")
     truth = [t for t in boxes if t.name.endswith("ground_truth") and t not in staged.values()][:1]
     boxes = [t for t in boxes if t not in truth]
     detections = of_kind(topics, "Detection2DArray")
-    note(notes, truth, "ground truth, by its name")
-    note(notes, [*boxes, *detections], "the robot's own result")
+    set_note(notes, truth, "ground truth, by its name")
+    set_note(notes, [*boxes, *detections], "the robot's own result")
     for key, topic in staged.items():
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
-    around = [(t.name, kind, t.kind) for t in topics if (kind := kind_of(t.name, t.kind)) is not None]
+    around = [
+        (t.name, kind, t.kind) for t in topics if (kind := surroundings_kind(t.name, t.kind)) is not None
+    ]
     if results:
         unused = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]
         around += [(t.name, "shape", t.kind) for t in unused if RESULTS[t.kind].search(t.name)]
-    helps = {t.name: f"; no LiDAR: {why}" if (why := foreign(t, "LiDAR")) else "" for t in topics}
+    helps = {t.name: f"; no LiDAR: {why}" if (why := unsupported_reason(t, "LiDAR")) else "" for t in topics}
     notes.update({name: f"shown: {_AROUND[kind]}{helps[name]}" for name, kind, _ in around})
     return Roles(
         boxes=config.boxes,
@@ -213,7 +215,7 @@ def find_roles(
         cameras=cameras,
         tf=names_of(moving),
         tf_static=names_of(static),
-        tf_held=names_of(t for t in moving if short_of(t.type)),
+        tf_held=names_of(t for t in moving if foxglove_type(t.type)),
         odometry=odometry,
         imus=names_of(imus),
         robot_detections_2d=names_of(detections),
@@ -240,7 +242,7 @@ def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topi
 
 def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
     """Mark the topic that ``source.boxes`` names."""
-    check(config.boxes)
+    check_boxes_setting(config.boxes)
     name = config.boxes.get("topic", "")
     if name and name not in names_of(topics):
         near = difflib.get_close_matches(name, names_of(topics), n=3, cutoff=0.4)
@@ -251,7 +253,7 @@ def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:
 
 def _no_lidar(topics: Sequence[Topic]) -> str:
     summary = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
-    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "LiDAR"))]:
+    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := unsupported_reason(t, "LiDAR"))]:
         return f"{summary}; {'; '.join(unsupported)}"
     if clouds := names_of(of_kind(topics, "PointCloud2")):
         return f"no LiDAR: {', '.join(clouds)} is the result of a stage"
@@ -262,7 +264,7 @@ def _no_lidar(topics: Sequence[Topic]) -> str:
 
 def _no_camera(topics: Sequence[Topic]) -> str:
     images = of_kind(topics, *IMAGES)
-    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := foreign(t, "camera"))]:
+    if unsupported := [f"{t.name} holds {why}" for t in topics if (why := unsupported_reason(t, "camera"))]:
         return f"no camera that can be read: {'; '.join(unsupported)}"
     if with_messages := names_of(t for t in images if t.count != 0):
         return f"no camera among the images: --set source.camera_topics=[{with_messages[0]}]"
@@ -282,7 +284,7 @@ def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[st
         return ""
     else:
         chosen = min(candidates, key=lambda t: (t.count == 0, t.name.count("/"), t.name))
-    note(notes, candidates, f"not used: {chosen.name} is")
+    set_note(notes, candidates, f"not used: {chosen.name} is")
     notes[chosen.name] = "odometry, where the transforms have no fixed frame"
     return chosen.name
 
@@ -290,7 +292,7 @@ def _find_odometry(topics: Sequence[Topic], config: SourceConfig, notes: dict[st
 # --- around perception -------------------------------------------------------------------------
 
 
-def kind_of(topic: str, short: str) -> Kind | None:
+def surroundings_kind(topic: str, short: str) -> Kind | None:
     """Return the kind of a topic around perception, by its name and its type without the package."""
     if short == "String" and _MARK.search(topic):
         return "mark"

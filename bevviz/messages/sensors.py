@@ -12,9 +12,9 @@ from bevviz.messages.topics import (
     IMAGES,
     TRANSPORT,
     Topic,
-    device,
-    note,
+    device_parts,
     of_kind,
+    set_note,
     stated_topic,
 )
 
@@ -58,15 +58,17 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
     clouds = of_kind(topics, "PointCloud2")
     if config.lidar_topics:
         chosen = [stated_topic(t, topics, "source.lidar_topics", "PointCloud2") for t in config.lidar_topics]
-        note(notes, clouds, "not used: not in source.lidar_topics")
-        note(notes, chosen, "LiDAR, by source.lidar_topics")
+        set_note(notes, clouds, "not used: not in source.lidar_topics")
+        set_note(notes, chosen, "LiDAR, by source.lidar_topics")
         return chosen
     tiers = {topic: _lidar_tier(topic, config.base_frame) for topic in clouds}
     best = min(tiers.values(), default=0)
-    note(notes, clouds, "not used: looks like a result, a radar's or a depth camera's cloud, not a LiDAR's")
+    set_note(
+        notes, clouds, "not used: looks like a result, a radar's or a depth camera's cloud, not a LiDAR's"
+    )
     moved = [t for t in clouds if tiers[t] == 1 and _is_moved(t, config.base_frame)]
-    note(notes, moved, "not used: in the robot's own frame, to which points of others were moved")
-    note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
+    set_note(notes, moved, "not used: in the robot's own frame, to which points of others were moved")
+    set_note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
     if best in (2, 3):
         candidates = candidates[:1]  # results are not merged like sensors
@@ -127,8 +129,8 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
         stated_topic(name, topics, "source.camera_info_topics", *IMAGES)
     if config.camera_topics:
         chosen = [stated_topic(t, topics, "source.camera_topics", *IMAGES) for t in config.camera_topics]
-        note(notes, images, "not used: not in source.camera_topics")
-        note(notes, chosen, "camera, by source.camera_topics")
+        set_note(notes, images, "not used: not in source.camera_topics")
+        set_note(notes, chosen, "camera, by source.camera_topics")
         return chosen
     usable = []
     for topic in images:
@@ -159,7 +161,7 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
 
 def _stem(topic: str) -> str:
     """Return the common part of the topics of a camera's images, without raw, rect, gray, color and mono."""
-    return "/".join(re.sub(r"_(raw|rect|gray|color|mono)$", "", part) for part in device(topic))
+    return "/".join(re.sub(r"_(raw|rect|gray|color|mono)$", "", part) for part in device_parts(topic))
 
 
 def camera_role(

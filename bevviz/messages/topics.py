@@ -90,7 +90,7 @@ _FOREIGN = (  # sensor, type, and what would help: points or pixels in forms tha
 )
 
 
-def foreign(topic: Topic, sensor: str = "") -> str:
+def unsupported_reason(topic: Topic, sensor: str = "") -> str:
     """Return what an unsupported topic holds and what would help; empty if that is not known.
 
     Args:
@@ -115,7 +115,7 @@ def names_of(topics: Iterable[Topic]) -> tuple[str, ...]:
     return tuple(topic.name for topic in topics)
 
 
-def note(notes: dict[str, str], topics: Iterable[Topic], text: str) -> None:
+def set_note(notes: dict[str, str], topics: Iterable[Topic], text: str) -> None:
     """Set the same note for several topics."""
     notes.update({topic.name: text for topic in topics})
 
@@ -136,7 +136,7 @@ def stated_topic(name: str, topics: Sequence[Topic], key: str, *kinds: str) -> T
         if topic.name == name:
             if topic in fitting:
                 return topic
-            why = foreign(topic)
+            why = unsupported_reason(topic)
             helps = f"; it holds {why}" if why else ""
             raise UserError(f"{key}: {name} is a {topic.type}, but must be {' or '.join(kinds)}{helps}")
     near = difflib.get_close_matches(name, names_of(fitting), n=3, cutoff=0.4) or names_of(fitting)
@@ -168,12 +168,12 @@ def entity_name(topic: str, frame_id: str = "") -> str:
     """
     if frame_id:
         return _clean(frame_id)
-    parts = device(topic)
+    parts = device_parts(topic)
     weak = parts[-1] in _WEAK and len(parts) > 1 and parts[-2] != parts[-1]
     return _clean("_".join(parts[-2:] if weak else parts[-1:]))
 
 
-def device(topic: str) -> list[str]:
+def device_parts(topic: str) -> list[str]:
     """Return the parts of a topic that name a device."""
     parts = TRANSPORT.sub("", topic).strip("/").split("/")
     kept = [part.removesuffix("_node") for part in parts if not _IMAGE_WORDS.fullmatch(part)]
@@ -191,7 +191,7 @@ def unique_names(named: Sequence[tuple[str, Topic]]) -> list[str]:
     unique: list[str] = []
     for name, topic in named:
         if short.count(name) > 1 or name in RESERVED:
-            name = _clean("_".join(device(topic.name)))
+            name = _clean("_".join(device_parts(topic.name)))
         number, free = 2, name
         while free in unique or free in RESERVED:
             free, number = f"{name}_{number}", number + 1

@@ -35,7 +35,7 @@ VIEW_OF_DELFT = {  # Palffy et al. 2022, classes that COCO lacks
     "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
     "motor": frozenset({"motor", "motorcycle"}),
 }
-CATEGORIES = {  # nuScenes' category -> class of its detection task, which leaves the other categories out
+NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which omits the other categories
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
     "vehicle.bicycle": "bicycle",
@@ -51,7 +51,7 @@ CATEGORIES = {  # nuScenes' category -> class of its detection task, which leave
     "human.pedestrian.construction_worker": "pedestrian",
     "human.pedestrian.police_officer": "pedestrian",
 }
-NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of the detection task
+NUSCENES_WITHOUT_CLASS = frozenset(  # categories of nuScenes that belong to no class of the detection task
     {
         "animal",
         "human.pedestrian.personal_mobility",
@@ -64,10 +64,10 @@ NOT_DETECTED = frozenset(  # categories of nuScenes that belong to no class of t
         "vehicle.emergency.police",
     }
 )
-ACCEPTED = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
+ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
 
-_SYNONYMS = {label.lower(): names for label, names in ACCEPTED.items()} | {
-    "cyclist": ACCEPTED["Cyclist"] | {"rider"}
+_SYNONYMS = {label.lower(): names for label, names in ACCEPTED_NAMES.items()} | {
+    "cyclist": ACCEPTED_NAMES["Cyclist"] | {"rider"}
 }
 
 
@@ -81,10 +81,10 @@ def accepted_names(label: str, known: Iterable[str]) -> frozenset[str]:
         label: label of a data set.
         known: class names of the detector.
     """
-    label = CATEGORIES.get(label, label)
+    label = NUSCENES_CLASSES.get(label, label)
     name = label.lower()
-    if label in ACCEPTED:
-        return frozenset(ACCEPTED[label] | _SYNONYMS[name])
+    if label in ACCEPTED_NAMES:
+        return frozenset(ACCEPTED_NAMES[label] | _SYNONYMS[name])
     if any(name == other.lower() for other in known):
         return frozenset({name})
     return frozenset({name, *_SYNONYMS.get(name, ())})

@@ -31,7 +31,7 @@ CLASS_COLORS: dict[str, Color] = {
 }
 
 
-class State(Enum):
+class StateColor(Enum):
     """Colour of each state that a result can have."""
 
     GOOD = (86, 180, 233)
@@ -43,26 +43,26 @@ class State(Enum):
 
 # Colours of the comparison with ground truth, of the two sides of a comparison, of opinions on an object, and
 # of the stages at which points are lost.
-TRUTH: dict[str, Color] = {
-    "true": State.GOOD.value,
-    "missed": State.DOUBTFUL.value,
-    "false": State.BAD.value,
+TRUTH_COLORS: dict[str, Color] = {
+    "true": StateColor.GOOD.value,
+    "missed": StateColor.DOUBTFUL.value,
+    "false": StateColor.BAD.value,
 }
-SIDES: dict[str, Color] = {
+SIDE_COLORS: dict[str, Color] = {
     "same": (125, 135, 140),
     "moved": (240, 228, 66),
     "class": (214, 120, 190),
     "only A": (230, 110, 30),
     "only B": (70, 170, 240),
 }
-OPINIONS: dict[str, Color] = {
-    "contradicted": State.BAD.value,
-    "named otherwise": State.OTHER.value,
-    "missed": State.DOUBTFUL.value,
-    "confirmed": State.GOOD.value,
-    "unseen": State.UNKNOWN.value,
+OPINION_COLORS: dict[str, Color] = {
+    "contradicted": StateColor.BAD.value,
+    "named otherwise": StateColor.OTHER.value,
+    "missed": StateColor.DOUBTFUL.value,
+    "confirmed": StateColor.GOOD.value,
+    "unseen": StateColor.UNKNOWN.value,
 }
-FATES: dict[str, Color] = {
+FATE_COLORS: dict[str, Color] = {
     "ground": (150, 120, 95),
     "noise": (215, 70, 40),
     "set aside": (240, 145, 70),
@@ -75,7 +75,7 @@ FATES: dict[str, Color] = {
 # Colours of curves in one plot: the ten of Petroff (arXiv 2107.02270), with red and purple lighter for a dark
 # background. Any two are at least 10 apart in CAM02-UCS, also for people who lack one of the three kinds of
 # cones.
-SERIES: tuple[Color, ...] = (
+SERIES_COLORS: tuple[Color, ...] = (
     *((63, 144, 218), (255, 169, 14), (205, 40, 15), (148, 164, 162), (150, 70, 205)),
     *((169, 107, 89), (231, 99, 0), (185, 172, 112), (113, 117, 129), (146, 218, 221)),
 )
@@ -120,7 +120,7 @@ def turbo(size: int = 256) -> U8:
     return colors
 
 
-def bins(values: F32, low: float, high: float, size: int) -> NDArray[np.uint16]:
+def color_rows(values: F32, low: float, high: float, size: int) -> NDArray[np.uint16]:
     """Return the (N,) rows of a colour map of ``size`` colours.
 
     A value outside low ... high gets the colour at the end.

@@ -12,7 +12,7 @@ from bevviz.model.results import Decision, FrameResult, Opinion
 OPINIONS = ("confirmed", "named_otherwise", "contradicted", "unseen", "missed")
 
 
-def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
+def count_results(result: FrameResult, last: Frame | None = None) -> Mapping[str, int]:
     """Return the number of points, clusters, detections ... by name. A stage that did not run has no number.
 
     Args:
@@ -38,11 +38,11 @@ def counts_of(result: FrameResult, last: Frame | None = None) -> Mapping[str, in
             counts["detections"] += int(camera.detections.kept.sum())
         if camera.fusion is not None:
             counts["matches"] += int((camera.fusion.detection_decision == Decision.MATCHED).sum())
-    counts.update(opinions_in(result))
+    counts.update(count_opinions(result))
     return counts
 
 
-def opinions_in(result: FrameResult) -> Mapping[str, int]:
+def count_opinions(result: FrameResult) -> Mapping[str, int]:
     """Return the number of objects for each opinion of cameras. Objects of our fusion have no opinions."""
     if (opinions := result.opinions) is None:
         return {}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.config import OURS, Config
+from bevviz.config import BUILTIN_METHODS, Config
 from bevviz.config.plugins import TOPIC
 from bevviz.model.results import (
     CameraResult,
@@ -127,7 +127,7 @@ def _detection(
     else:
         evidence = (
             f"{_points(pair.points)} of cluster {k} in its frustum at {pair.depth:.1f} m, IoU {pair.iou:.2f}"
-            + in_mask(fusion, d, config)
+            + mask_evidence(fusion, d, config)
         )
     if decision is Decision.MATCHED:
         is_matched = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
@@ -141,7 +141,7 @@ def _detection(
     return f"no match: {evidence}, {_rule(decision, d, fusion, detections, config)}"
 
 
-def in_mask(fusion: Fusion, d: int, config: Config) -> str:
+def mask_evidence(fusion: Fusion, d: int, config: Config) -> str:
     """Return how many points in a detection's frustum its mask covers, as the end of a sentence.
 
     The text is empty without a mask.
@@ -180,7 +180,7 @@ def _unclustered(
 def _noise(config: Config) -> str:
     """Return the parameter or the method that decided what is noise."""
     method_name = config.clustering.method
-    if method_name in OURS:
+    if method_name in BUILTIN_METHODS:
         return f"clustering.min_points is {config.clustering.min_points}"
     return f"by {method_name.removeprefix(TOPIC)}"
 

@@ -83,7 +83,7 @@ class Intrinsics:
 
 
 @dataclass(frozen=True, slots=True)
-class Clip:
+class VideoClip:
     """Packets of a video up to a picture: the group with its key frame, and the group before that."""
 
     codec: Codec
@@ -107,7 +107,7 @@ class Image:
     media_type: str = ""
     topic: str = ""
     received: int = 0
-    clip: Clip | None = None
+    clip: VideoClip | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,7 @@ class LabelledBoxes2D:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class ComponentStatus:
     """State of one component of the robot, from its diagnostics."""
 
     name: str
@@ -222,7 +222,7 @@ class Status:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class OccupancyGrid:
     """An occupancy grid: cells from 0 (free) to 100 (occupied), -1 for unknown."""
 
     cells: NDArray[np.int8]  # (rows, columns)
@@ -231,7 +231,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class Solids:
+class SolidShapes:
     """Boxes, or the ellipsoids inscribed in them."""
 
     center: F32  # (N, 3)
@@ -241,7 +241,7 @@ class Solids:
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class HeightMap:
     """A map of heights, or of other values on a plane: triangles between the centres of its known cells."""
 
     vertices: F32  # (V, 3)
@@ -259,7 +259,7 @@ class MeshFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ImuSamples:
     """Samples of an IMU since the previous frame, in its own frame. NaN if it measures none."""
 
     topic: str
@@ -270,7 +270,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class PlacedShape:
     """Geometry in the coordinates of ``frame_id``."""
 
     topic: str  # also the namespace and id of a marker
@@ -278,10 +278,10 @@ class Shape:
     stamp: int
     points: F32 | None = None  # (N, 3)
     strips: tuple[F32, ...] = ()  # (N, 3) each
-    solids: Solids | None = None
+    solids: SolidShapes | None = None
     axes: F64 | None = None  # (4, 4) frame_id from a pose
-    grid: Grid | None = None
-    surface: Surface | None = None
+    grid: OccupancyGrid | None = None
+    surface: HeightMap | None = None
     meshes: tuple[MeshFile, ...] = ()
     fix: tuple[float, float] | None = None  # latitude and longitude in degrees
     picture: U8 | None = None  # (H, W, 3) BGR
@@ -291,17 +291,17 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class RobotContext:
     """Other topics of the robot beside perception, at the time of a frame."""
 
     marks: tuple[str, ...] = ()  # marks that people set at this frame
-    statuses: tuple[Status, ...] = ()
-    shapes: tuple[Shape, ...] = ()
-    motions: tuple[Motion, ...] = ()
+    statuses: tuple[ComponentStatus, ...] = ()
+    shapes: tuple[PlacedShape, ...] = ()
+    motions: tuple[ImuSamples, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class UserMark:
     """A note that a person took, and its frame."""
 
     text: str
@@ -310,7 +310,7 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class LateResult:
+class LateBoxes:
     """Boxes of the robot that came after their frame was processed. Only live runs have them."""
 
     boxes: LabelledBoxes2D | LabelledBoxes3D
@@ -347,7 +347,7 @@ class Frame:
     truth: LabelledBoxes3D | None = None
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
-    around: Around | None = None
+    around: RobotContext | None = None
 
     @property
     def pose(self) -> F64:

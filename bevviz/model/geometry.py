@@ -122,7 +122,7 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
     inv = np.full(len(p), np.nan, p.dtype if p.dtype.kind == "f" else np.float64)
     np.divide(1.0, p[:, 2], out=inv, where=p[:, 2] > MIN_DEPTH)
     x, y = p[:, 0] * inv, p[:, 1] * inv
-    if is_bent(intrinsics):
+    if has_distortion(intrinsics):
         x, y = _distort(x, y, intrinsics)
     k = intrinsics.K
     uv = np.empty((len(p), 2), np.float32)
@@ -131,7 +131,7 @@ def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
     return uv, depth
 
 
-def is_bent(intrinsics: Intrinsics) -> bool:
+def has_distortion(intrinsics: Intrinsics) -> bool:
     """Return whether straight lines are curved in the image.
 
     An equidistant lens curves them even without coefficients.
@@ -244,7 +244,7 @@ def corners(boxes: Boxes3D) -> F32:
     return np.asarray(turned + boxes.center[:, None], np.float32)
 
 
-def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
+def transform_boxes(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
     """Transform upright boxes from frame a to frame b, which is also upright.
 
     Frame a may be a map with its origin far away.
@@ -254,7 +254,7 @@ def moved(boxes: Boxes3D, b_from_a: F64) -> Boxes3D:
     return Boxes3D(center.astype(np.float32), boxes.size, turned)
 
 
-def upright(center: F64, size: F32, turns: F64) -> Boxes3D:
+def upright_boxes(center: F64, size: F32, turns: F64) -> Boxes3D:
     """Convert boxes of any rotation to upright ones, which have the same axes up to a lean.
 
     The axis nearest to the vertical is the height. The heading is that of x, or of y if x is the height.

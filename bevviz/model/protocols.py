@@ -35,7 +35,7 @@ class Items(Protocol[T_co]):
     def __iter__(self) -> Iterator[T_co]: ...
 
 
-class Frames(Protocol):
+class FrameSource(Protocol):
     """Source whose frames can be read in order and one by one."""
 
     @property

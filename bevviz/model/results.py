@@ -274,7 +274,7 @@ class CameraResult:
     depth: F32 | None = None  # (P,) metres along the optical axis
 
 
-SIDES = ("front", "back", "left", "right")  # sides of a box: +x, -x, +y, -y
+BOX_SIDES = ("front", "back", "left", "right")  # sides of a box: +x, -x, +y, -y
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from bevviz.config import (
     Config,
     DetectorConfig,
     ObjectsConfig,
-    object_network,
+    object_network_params,
     stage_topics,
     stated_lines,
 )
@@ -57,7 +57,7 @@ class TopicInfo:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Contents:
+class TopicContents:
     """Topics, sensors and transforms of a bag or of a ROS graph."""
 
     topics: tuple[TopicInfo, ...]
@@ -74,7 +74,7 @@ class Contents:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BagInfo(Contents):
+class BagInfo(TopicContents):
     """Output of ``bevviz info``. Times are log times in nanoseconds."""
 
     paths: tuple[str, ...]
@@ -90,7 +90,7 @@ class BagInfo(Contents):
         return (self.end - self.start) / SECOND
 
 
-def describe(paths: Sequence[Path], config: Config) -> BagInfo:
+def describe_bag(paths: Sequence[Path], config: Config) -> BagInfo:
     """Read the index of a bag, and synchronise one scan.
 
     Raises:
@@ -118,7 +118,7 @@ def _describe(
     source: BagSource | None = None,
 ) -> BagInfo:
     """Collect the summary of an open bag."""
-    networks, missing_networks = networks_of(config)
+    networks, missing_networks = network_providers(config)
     missing = [*missing, *missing_networks]
     return BagInfo(
         paths=tuple(map(str, recording.paths)),
@@ -141,7 +141,7 @@ def _describe(
     )
 
 
-def network_of(config: Config) -> str:
+def network_provider(config: Config) -> str:
     """Return the provider of the detector's network, or the reason why it does not run.
 
     The text is empty without a network.
@@ -154,16 +154,16 @@ def network_of(config: Config) -> str:
     return network(path, config.detector.provider)
 
 
-def networks_of(config: Config) -> tuple[dict[str, str], list[str]]:
+def network_providers(config: Config) -> tuple[dict[str, str], list[str]]:
     """Return the providers of the networks of the sections ``detector`` and ``objects``.
 
     Returns:
         The provider of each, or the reason why it does not run, or an empty text without a network. Then the
         missing requirements of a full run: a detector, or a file that can be used.
     """
-    runs_on = {"detector": network_of(config), "objects": ""}
+    runs_on = {"detector": network_provider(config), "objects": ""}
     missing = [] if config.detector.model else ["no detector: --model FILE.onnx"]
-    named_files = {"detector": model_path(config), "objects": object_network(config)}
+    named_files = {"detector": model_path(config), "objects": object_network_params(config)}
     for section in [section for section, file in named_files.items() if file is not None]:
         try:
             provider = _alone(config, section).provider
@@ -252,7 +252,7 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
     return [*missing, *frame.problems]
 
 
-def as_tree(info: Contents) -> dict[str, Any]:
+def contents_tree(info: TopicContents) -> dict[str, Any]:
     """Return the contents as a tree for JSON, without images and clouds."""
     values = {
         f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")
@@ -280,7 +280,7 @@ def _camera_tree(camera: Camera) -> dict[str, Any]:
     }
 
 
-def render(info: BagInfo) -> str:
+def render_bag_info(info: BagInfo) -> str:
     """Return the summary of a bag as text for a terminal of 100 columns."""
     kinds = sorted(set(info.formats))
     files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
@@ -292,7 +292,7 @@ def render(info: BagInfo) -> str:
     return render_contents(header, info)
 
 
-def render_contents(header: Mapping[str, str], info: Contents) -> str:
+def render_contents(header: Mapping[str, str], info: TopicContents) -> str:
     """Return the contents as text, below some lines about the whole.
 
     Args:
@@ -379,7 +379,7 @@ def _camera(camera: Camera) -> str:
     return " ".join(words).replace(" ,", ",")
 
 
-def _tree(info: Contents) -> Iterator[str]:
+def _tree(info: TopicContents) -> Iterator[str]:
     """Yield the transforms as an indented tree."""
     children: dict[str, list[str]] = {}
     for child, parent in sorted(info.tree.items()):

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bevviz.errors import UserError
-from bevviz.support.files import read_text, written
+from bevviz.support.files import atomic_write, read_text
 
 SUFFIX = ".notes.json"
 LONGEST = 2000  # most characters of a note
@@ -102,7 +102,7 @@ class Notes:
             self.path.unlink(missing_ok=True)
             return
         text = json.dumps({"notes": [asdict(note) for note in notes]}, indent=1, ensure_ascii=False)
-        with written(self.path, "notes") as file:
+        with atomic_write(self.path, "notes") as file:
             try:
                 file.path.write_bytes(f"{text}\n".encode(errors="replace"))
             except OSError as error:

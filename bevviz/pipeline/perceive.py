@@ -32,15 +32,15 @@ from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages import robot_results, user_stages
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
-from bevviz.stages.frustum import claim
+from bevviz.stages.frustum import claim_clusters
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.opinions import opinions
 from bevviz.stages.pillars import ObjectNetwork
-from bevviz.stages.user_stages import Foreign
+from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
-from bevviz.stages.voxel import of_points, voxel_grid
-from bevviz.support.kernel import clock, common_clock
+from bevviz.stages.voxel import spread_to_points, voxel_grid
+from bevviz.support.kernel import common_clock, thread_clock
 
 
 def perceive(
@@ -95,7 +95,9 @@ def perceive(
         height = None if ground is None else ground.height.compress(~ground.mask)
         camera_results = tuple(cameras)
         sections = config.fusion, config.objects, config.clustering
-        split_clusters = log.run("fusion", claim, obstacles, height, clusters, camera_results, *sections)
+        split_clusters = log.run(
+            "fusion", claim_clusters, obstacles, height, clusters, camera_results, *sections
+        )
         if split_clusters is not None:
             clusters, claims, splits = split_clusters
     for i, (result, camera_claims) in enumerate(zip(cameras, claims, strict=True)):
@@ -134,7 +136,7 @@ def perceive(
     )
 
 
-def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
+def add_explanations(result: FrameResult, *, seen: bool = True) -> FrameResult:
     """Add the bird's-eye view and the explanations to a result.
 
     Args:
@@ -142,10 +144,10 @@ def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
         seen: whether the bird's-eye view is needed.
     """
     config, frame, log = result.config, result.frame, StageLog()
-    start = clock()
+    start = thread_clock()
     raw_ground = image = None
     if seen and result.voxels is not None and result.ground is not None:
-        raw_ground = log.run("bev", of_points, result.ground.mask, result.voxels.inverse)
+        raw_ground = log.run("bev", spread_to_points, result.ground.mask, result.voxels.inverse)
     if seen and frame.lidar:
         image = log.run(
             "bev",
@@ -168,7 +170,7 @@ def describe(result: FrameResult, *, seen: bool = True) -> FrameResult:
         result.objects,
         result.opinions,
     )
-    wall = clock() - start
+    wall = thread_clock() - start
     return replace(
         result,
         bev=image,
@@ -227,7 +229,7 @@ def _detect(log: StageLog, frame: Frame, camera: Camera, config: Config, stages:
         return None
     if not image.bgr.size:
         return Detections.empty()
-    if isinstance(network, Foreign):
+    if isinstance(network, UserStage):
         return log.guard(
             "detector",
             lambda: user_stages.detections_of(
@@ -292,10 +294,10 @@ def _objects(
         def detect() -> Objects:
             answer = log.call(network.network.infer, frame.points, intensity)
             boxes, score, names = network.interpret(answer)
-            return user_stages.placed(boxes, names, score, obstacles, clusters)
+            return user_stages.make_objects(boxes, names, score, obstacles, clusters)
 
         return log.guard("objects", detect)
-    if isinstance(function := stages.objects, Foreign):
+    if isinstance(function := stages.objects, UserStage):
         cloud = user_stages.with_intensity(frame.points, frame.fields.get("intensity"))
         return log.guard(
             "objects",

@@ -22,13 +22,13 @@ T_contra = TypeVar("T_contra", contravariant=True)
 R = TypeVar("R")
 R_contra = TypeVar("R_contra", contravariant=True)
 
-DEPTH = 2  # frames read ahead of the frame that the observers see
-BURST = 3  # frames that may arrive together without a loss
+LOOKAHEAD = 2  # frames read ahead of the frame that the observers see
+MAX_BURST = 3  # frames that may arrive together without a loss
 TICK = 0.2  # seconds between two checks whether the run is over
 PATIENCE = 10.0  # seconds that an observer with its own thread may take to end
 
 
-class Dropping:
+class DropPolicy:
     """Drop policy for live runs: a slow consumer gets the newest result, since a robot cannot wait.
 
     Args:
@@ -36,7 +36,7 @@ class Dropping:
         results: results that may wait for the observers.
     """
 
-    def __init__(self, incoming: int = BURST, results: int = BURST) -> None:
+    def __init__(self, incoming: int = MAX_BURST, results: int = MAX_BURST) -> None:
         self.incoming_size, self.results_size = incoming, results
         self._queues: dict[str, NewestQueue[Any]] = {}
 
@@ -70,8 +70,8 @@ def run(
     processor: Processor[T, R],
     observers: Sequence[Observer[R]] = (),
     *,
-    dropping: Dropping | None = None,
-    depth: int = DEPTH,
+    dropping: DropPolicy | None = None,
+    depth: int = LOOKAHEAD,
     stop: threading.Event | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> RunEnd:
@@ -146,11 +146,11 @@ def _stop(items: object) -> None:
         stop()
 
 
-def results(items: Iterable[T], processor: Processor[T, R]) -> Generator[R, None, None]:
+def iterate_results(items: Iterable[T], processor: Processor[T, R]) -> Generator[R, None, None]:
     """Yield the result of each item, in order. Closing the iterator ends its threads."""
     with (
         ThreadPoolExecutor(1, "network") as network,
-        closing(overlapped(items, lambda item: processor.perceive(item, network), DEPTH)) as perceived,
+        closing(map_ahead(items, lambda item: processor.perceive(item, network), LOOKAHEAD)) as perceived,
     ):
         yield from map(processor.finish, perceived)
 
@@ -163,7 +163,7 @@ class _Loop(Generic[T, R]):
         items: Items[T],
         processor: Processor[T, R],
         observers: Sequence[Observer[R]],
-        dropping: Dropping | None,
+        dropping: DropPolicy | None,
         depth: int,
         stop: threading.Event,
     ) -> None:
@@ -179,7 +179,7 @@ class _Loop(Generic[T, R]):
         if not self.admission.get():
             return
         try:
-            with few_collections(), ExitStack() as stack:
+            with rare_garbage_collections(), ExitStack() as stack:
                 network = stack.enter_context(ThreadPoolExecutor(1, "network"))
                 observers = [stack.enter_context(self._observing(observer)) for observer in self._observers]
                 for result in stack.enter_context(closing(self._results(network))):
@@ -201,7 +201,7 @@ class _Loop(Generic[T, R]):
             return self._processor.perceive(item, network)
 
         if self._dropping is None:
-            return overlapped(self._until_stopped(), work, self._depth)
+            return map_ahead(self._until_stopped(), work, self._depth)
         return _newest(self._items, work, self._dropping, self._stop)
 
     def _until_stopped(self) -> Iterator[T]:
@@ -248,7 +248,7 @@ class _Loop(Generic[T, R]):
             thread.join(PATIENCE)
 
 
-def overlapped(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generator[R, None, None]:
+def map_ahead(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generator[R, None, None]:
     """Yield the result of each item, in order. A thread works on it while the caller makes the next items.
 
     One thread beside the caller's is faster than two, which would wait for Python's lock most of the time.
@@ -284,7 +284,7 @@ def overlapped(items: Iterable[T], work: Callable[[T], R], depth: int) -> Genera
 
 
 def _newest(
-    items: Iterable[T], work: Callable[[T], R], dropping: Dropping, stop: threading.Event
+    items: Iterable[T], work: Callable[[T], R], dropping: DropPolicy, stop: threading.Event
 ) -> Generator[R, None, None]:
     """Yield the results of the newest items. Input, work and caller have a thread each."""
     incoming: NewestQueue[T] = dropping.queue("incoming", dropping.incoming_size, catch_up=True)
@@ -330,7 +330,7 @@ def _newest(
 
 
 @contextmanager
-def few_collections() -> Iterator[None]:
+def rare_garbage_collections() -> Iterator[None]:
     """Make garbage collections rare.
 
     Frames make many objects and few cycles, and collections would take a tenth of the time.

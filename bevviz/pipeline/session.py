@@ -9,10 +9,10 @@ from bevviz.anomalies import AnomalyDetector
 from bevviz.config import Config, ParameterChange, changes
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import describe, perceive
-from bevviz.pipeline.stage_loader import Detect, StageLoader, Stages
+from bevviz.pipeline.perceive import add_explanations, perceive
+from bevviz.pipeline.stage_loader import DetectFunction, StageLoader, Stages
 from bevviz.pipeline.stage_log import Memo, StageLog
-from bevviz.stages.fusion import in_view
+from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 
 
@@ -35,7 +35,7 @@ class Session:
     def __init__(
         self,
         config: Config,
-        detect: Detect | None = None,
+        detect: DetectFunction | None = None,
         *,
         loader: StageLoader | None = None,
         memo: Memo | None = None,
@@ -74,11 +74,11 @@ class Session:
     def alone(self, frame: Frame) -> FrameResult:
         """Return the result of any single frame, without tracks and anomalies, which need earlier frames."""
         config, stages = self._in_force
-        return describe(perceive(frame, config, stages, self._memo))
+        return add_explanations(perceive(frame, config, stages, self._memo))
 
     def explained(self, frame: Frame) -> FrameResult:
         """Return the result of the next frame with explanations, without bird's-eye view and anomalies."""
-        return describe(self.perceive(frame), seen=False)
+        return add_explanations(self.perceive(frame), seen=False)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """Run the stages on the next frame, and update the tracks."""
@@ -87,7 +87,7 @@ class Session:
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
-        return self.watch(describe(result))
+        return self.watch(add_explanations(result))
 
     def watch(self, result: FrameResult) -> FrameResult:
         """Add the anomalies of the drive to the next result."""
@@ -99,7 +99,7 @@ class Session:
         if clusters is None or config.method == "none":
             return result
         log = StageLog()
-        is_in_view = in_view(result.cameras, len(clusters))
+        is_in_view = clusters_in_view(result.cameras, len(clusters))
         tracks = log.run(
             "tracking", self._tracker.update, result.frame, clusters, is_in_view, result.objects, config
         )

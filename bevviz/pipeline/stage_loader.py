@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.config import Config, DetectorConfig, object_network
+from bevviz.config import Config, DetectorConfig, object_network_params
 from bevviz.config.pillars import INPUT_PARAMS
 from bevviz.config.plugins import TOPIC
 from bevviz.model.frame import Camera
@@ -14,9 +14,9 @@ from bevviz.model.results import Detections
 from bevviz.stages import user_stages
 from bevviz.stages.detector import Detector
 from bevviz.stages.pillars import ObjectNetwork, PillarNetwork
-from bevviz.stages.user_stages import Foreign
+from bevviz.stages.user_stages import UserStage
 
-Detect = Callable[[Camera], Detections | None]
+DetectFunction = Callable[[Camera], Detections | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,12 +32,12 @@ class Stages:
         detect: function that replaces both.
     """
 
-    ground: Foreign | None = None
-    clustering: Foreign | None = None
-    objects: Foreign | ObjectNetwork | None = None
-    network: Detector | Foreign | None = None
+    ground: UserStage | None = None
+    clustering: UserStage | None = None
+    objects: UserStage | ObjectNetwork | None = None
+    network: Detector | UserStage | None = None
     detector: Detector | None = None
-    detect: Detect | None = None
+    detect: DetectFunction | None = None
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -57,10 +57,10 @@ class StageLoader:
 
     def __init__(self) -> None:
         self._networks: dict[tuple[str, str, str, int], Detector] = {}
-        self._foreign: dict[tuple[str, str, str], Foreign | None] = {}
+        self._foreign: dict[tuple[str, str, str], UserStage | None] = {}
         self._pillars: dict[tuple[object, ...], PillarNetwork] = {}
 
-    def load(self, config: Config, detect: Detect | None = None) -> Stages:
+    def load(self, config: Config, detect: DetectFunction | None = None) -> Stages:
         """Return the stages of a configuration. ``detect`` replaces its detector.
 
         Raises:
@@ -77,16 +77,16 @@ class StageLoader:
             detect=detect,
         )
 
-    def _function(self, config: Config, section: str) -> Foreign | None:
+    def _function(self, config: Config, section: str) -> UserStage | None:
         """Return the user-defined function of a section, or None."""
         key = section, getattr(config, section).model_dump_json(), str(config.functions)
         if key not in self._foreign:
-            self._foreign[key] = user_stages.foreign(config, section)
+            self._foreign[key] = user_stages.load_user_stage(config, section)
         return self._foreign[key]
 
-    def _objects(self, config: Config) -> Foreign | ObjectNetwork | None:
+    def _objects(self, config: Config) -> UserStage | ObjectNetwork | None:
         """Return the 3D detector or the user-defined function that makes the objects, or None."""
-        params = object_network(config)
+        params = object_network_params(config)
         if params is None:
             return self._function(config, "objects")
         runs_on = config.detector.provider, config.detector.threads

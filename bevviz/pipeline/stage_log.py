@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from bevviz.config import Config
 from bevviz.errors import StageError, UserError, interrupt_in
 from bevviz.model.results import Failure
-from bevviz.support.kernel import clock
+from bevviz.support.kernel import thread_clock
 from bevviz.support.loggers import logger
 
 T = TypeVar("T")
@@ -54,9 +54,9 @@ class Memo:
             self._results.move_to_end(key)
             self._local.seconds_saved = self.seconds_saved + seconds
             return cast(T, result_before)
-        start, before = clock(), self.seconds_saved
+        start, before = thread_clock(), self.seconds_saved
         result = function(*args)
-        seconds = clock() - start + self.seconds_saved - before
+        seconds = thread_clock() - start + self.seconds_saved - before
         # Keeping the arguments prevents other objects from getting their ids.
         self._results[key] = args, result, seconds
         if len(self._results) > self._size:
@@ -95,7 +95,7 @@ class StageLog:
     def guard(self, stage: str, work: Callable[[], T]) -> T | None:
         """Run a stage as ``run`` does, but without a look-up of its own result."""
         memo = self._memo
-        start, saved_before = clock(), memo.seconds_saved if memo else 0.0
+        start, saved_before = thread_clock(), memo.seconds_saved if memo else 0.0
         try:
             return work()
         except (UserError, StageError) as error:
@@ -106,7 +106,7 @@ class StageLog:
             self._failed(stage, f"{type(error).__name__}: {error}", error)
         finally:
             saved = memo.seconds_saved - saved_before if memo else 0.0
-            self.timings[stage] = self.timings.get(stage, 0.0) + clock() - start + saved
+            self.timings[stage] = self.timings.get(stage, 0.0) + thread_clock() - start + saved
             self.seconds_saved += saved
         return None
 

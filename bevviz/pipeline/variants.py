@@ -54,7 +54,7 @@ class Variants:
             self._frame, self._still = frame, None
         if config.sync.motion_compensation:
             return frame
-        self._still = self._still or without_motion(frame)
+        self._still = self._still or without_motion_compensation(frame)
         return self._still
 
     def perceive(self, frame: Frame, config: Config, network: Executor | None = None) -> FrameResult:
@@ -69,7 +69,7 @@ class Variants:
         return perceive(self.frame(frame, config), config, stages, self._memo, network=network)
 
 
-class Sessions:
+class SessionGroup:
     """Several sessions on the same frames as one processor. A result is a tuple of theirs."""
 
     def __init__(self, configs: Sequence[Config]) -> None:
@@ -110,7 +110,7 @@ def common_frames(configs: Iterable[Config]) -> Config:
     return next((config for config in configs if config.sync.motion_compensation), configs[0])
 
 
-def without_motion(frame: Frame) -> Frame:
+def without_motion_compensation(frame: Frame) -> Frame:
     """Return the frame as with ``sync.motion_compensation`` off: the cameras have their mounting pose."""
 
     def still(camera: Camera) -> Camera:

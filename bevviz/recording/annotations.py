@@ -10,7 +10,7 @@ from bevviz.recording import entities
 from bevviz.recording.entities import ClassId
 from bevviz.recording.writer import Writer
 
-FAINT = (150, 150, 160, 110)
+FAINT_COLOR = (150, 150, 160, 110)
 
 
 def log_world(to: Writer) -> None:
@@ -22,8 +22,8 @@ def class_annotations() -> rr.AnnotationContext:
     """Return the names and colours of the class ids of points and boxes."""
     classes: list[tuple[int, str, tuple[int, ...]]] = [
         (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
-        (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT),
-        (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", FAINT),
+        (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT_COLOR),
+        (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", FAINT_COLOR),
         (entities.CLUSTER_CLASS[ClusterState.TOO_SMALL], "too small", (120, 120, 130)),
         (entities.CLUSTER_CLASS[ClusterState.TOO_LARGE], "too large", (140, 100, 100)),
     ]

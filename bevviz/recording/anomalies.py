@@ -13,7 +13,7 @@ from bevviz.recording import entities
 from bevviz.recording.writer import Writer
 
 
-def log_anomalies_looks(to: Writer) -> None:
+def log_anomaly_style(to: Writer) -> None:
     """Log the static names of the anomaly count curves."""
     to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
 

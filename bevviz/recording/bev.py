@@ -25,7 +25,7 @@ def log_bev(to: Writer, bev: Bev, config: Config) -> None:
 
     The reference style is logged as PNG, so that pixels equal those of the tutorial. The others are JPEG.
     """
-    quality = config.logging.jpeg_quality if retention.is_whole(config) else retention.BEV_QUALITY
+    quality = config.logging.jpeg_quality if retention.keeps_everything(config) else retention.BEV_QUALITY
     is_reference = config.bev.style == "reference"
     to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
     for name, grid in bev.channels.items():
@@ -69,7 +69,7 @@ def _grid_style(rows: int, columns: int, resolution: float) -> rr.GridMap:
     )
 
 
-def seen_from_above(config: BevConfig, points_from_frame: F64, positions: F32) -> F32:
+def bev_pixels(config: BevConfig, points_from_frame: F64, positions: F32) -> F32:
     """Project (..., 3) positions to (..., 2) pixels of the bird's-eye image."""
     reach = np.array([config.range_x, config.range_y], np.float32)
     xy = geometry.apply(points_from_frame, positions.reshape(-1, 3))[:, :2]
@@ -77,6 +77,6 @@ def seen_from_above(config: BevConfig, points_from_frame: F64, positions: F32) -
     return np.asarray(pixels, np.float32).reshape(*positions.shape[:-1], 2)
 
 
-def footprints(corners: F32) -> F32:
+def ground_outlines(corners: F32) -> F32:
     """Return (K, 5, 3) closed outlines on the ground for (K, 8, 3) box corners."""
     return corners[:, [0, 1, 2, 3, 0]]

@@ -13,7 +13,7 @@ from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.model.frame import Scene
 from bevviz.recording.decoding import check_decodes
-from bevviz.recording.retention import is_whole
+from bevviz.recording.retention import keeps_everything
 from bevviz.support.text import did_you_mean
 
 PACKAGE = Path(__file__).parents[1]
@@ -48,7 +48,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
         UserError: the name is unknown, the file does not exist, or it does not make a layout.
     """
     if config is not None:
-        is_complete, logging = is_whole(config), config.logging
+        is_complete, logging = keeps_everything(config), config.logging
         color_by = logging.color_by if is_complete and logging.raw_cloud else ()
         scene = replace(scene, above=_bounds_ahead(config.bev), raw=is_complete, color_by=color_by)
     if name_or_path in names():
@@ -64,7 +64,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
     if path.suffix == ".py":
         return _from_python(path, scene)
     check_decodes(path)
-    return Saved(path)
+    return SavedBlueprint(path)
 
 
 def _bounds_ahead(config: BevConfig) -> tuple[float, float, float, float]:
@@ -90,7 +90,7 @@ def _from_python(path: Path, scene: Scene) -> rrb.Blueprint:
     return layout
 
 
-class Saved(rrb.Blueprint):
+class SavedBlueprint(rrb.Blueprint):
     """Layout that the viewer saved as .rbl. It is sent unchanged."""
 
     def __init__(self, path: Path) -> None:

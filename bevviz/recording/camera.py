@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import bins, class_color
+from bevviz.model.colors import class_color, color_rows
 from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import (
     CameraResult,
@@ -21,12 +21,12 @@ from bevviz.model.results import (
     Masks,
 )
 from bevviz.recording import entities, retention
-from bevviz.recording.annotations import FAINT, depth_annotations
+from bevviz.recording.annotations import FAINT_COLOR, depth_annotations
 from bevviz.recording.labels import (
     IN_IMAGE,
-    apart,
-    log_spoken_in_image,
-    log_spoken_looks_in_image,
+    choose_named,
+    log_image_box_label_style,
+    log_image_box_labels,
 )
 from bevviz.recording.primitives import CORNER, boxes2d, encode_image, scored, texts_by_row, transform
 from bevviz.recording.writer import Writer
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from bevviz.recording.video import VideoEncoder
 
 
-def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
+def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
     """Log the static style of detections, labels and projected points of each camera."""
     for camera in cameras:
         to.static(
@@ -44,26 +44,26 @@ def log_camera_looks(to: Writer, cameras: Iterable[str]) -> None:
             rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
         )
         to.static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False))
-        log_spoken_looks_in_image(to, entities.detections(camera), 31.0)
+        log_image_box_label_style(to, entities.detections(camera), 31.0)
         if to.root:
-            log_shared_image(to, camera)
+            log_over_shared_image(to, camera)
         to.static(
             entities.weak(camera),
             rr.Boxes2D.from_fields(
-                colors=[FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
+                colors=[FAINT_COLOR], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
             ),
         )
 
 
-def log_shared_image(to: Writer, camera: str) -> None:
+def log_over_shared_image(to: Writer, camera: str) -> None:
     """Draw the results of a run under a root over the main run's image. There is only one image."""
     boxes = entities.detections(camera)
     paths = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
     for path in (*paths, entities.weak(camera)):
-        to.static(path, over_image(camera))
+        to.static(path, image_frame(camera))
 
 
-def over_image(camera: str) -> rr.CoordinateFrame:
+def image_frame(camera: str) -> rr.CoordinateFrame:
     """Return the coordinate frame of the camera's image. An entity with it is drawn over the image."""
     return rr.CoordinateFrame(entities.space(entities.image(camera)))
 
@@ -79,7 +79,7 @@ def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
 
 
 def log_camera(
-    to: Writer, frame: Frame, result: CameraResult, quality: int, videos: Videos | None = None
+    to: Writer, frame: Frame, result: CameraResult, quality: int, videos: VideoEncoders | None = None
 ) -> None:
     """Log pose and image of a camera. The intrinsics are static, see ``log_intrinsics``.
 
@@ -125,7 +125,7 @@ def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
         to.put(path, encode_image(image, quality))
 
 
-class Videos:
+class VideoEncoders:
     """Encoders of camera images as H.264 streams, one for each camera."""
 
     def __init__(self) -> None:
@@ -182,8 +182,8 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         size = _size(result.camera)
         label_positions = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
         # The tallest boxes come first, as they are usually the nearest.
-        has_name = apart(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, unmatched)
-        log_spoken_in_image(
+        has_name = choose_named(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, unmatched)
+        log_image_box_labels(
             to,
             entities.detections(name),
             xyxy,
@@ -244,9 +244,12 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
         return
     visible = np.isfinite(result.uv[:, 0])
     if visible.any():
-        depth = bins(result.depth[visible], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
+        depth = color_rows(result.depth[visible], 0, entities.DEPTH_RANGE, entities.DEPTH_BINS)
         uv = result.uv[visible] + CORNER
         if packed:
-            rows = retention.sorted_rows(uv, retention.PIXEL)
-            uv, depth = np.rint(uv[rows] * retention.PIXEL) / np.float32(retention.PIXEL), depth[rows]
+            rows = retention.sorted_rows(uv, retention.PIXEL_STEPS)
+            uv, depth = (
+                np.rint(uv[rows] * retention.PIXEL_STEPS) / np.float32(retention.PIXEL_STEPS),
+                depth[rows],
+            )
         to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))

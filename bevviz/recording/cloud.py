@@ -16,12 +16,12 @@ from bevviz.recording import color_by, entities, retention
 from bevviz.recording.entities import ClassId
 from bevviz.recording.primitives import rounded, transform
 from bevviz.recording.writer import Writer
-from bevviz.stages.voxel import of_points
+from bevviz.stages.voxel import spread_to_points
 
 RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each point
 
 
-def log_cloud_looks(to: Writer, lidars: Iterable[str]) -> None:
+def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:
     """Log the static style of the points of each LiDAR."""
     for lidar in lidars:
         radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
@@ -61,7 +61,7 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
     class_ids = np.zeros(len(frame.points), np.uint16)
     if result.voxels is not None and result.ground is not None:
         voxel_ids = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
-        class_ids = of_points(voxel_ids, result.voxels.inverse)
+        class_ids = spread_to_points(voxel_ids, result.voxels.inverse)
     if len(frame.clouds) <= 1:
         return [(entities.points(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
     clouds, end = [], 0
@@ -85,15 +85,15 @@ def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bo
         return
     ground = result.voxels.points.compress(result.ground.mask, axis=0)
     if packed:
-        scale = retention.step(voxel_size, retention.COARSE)
-        ground = coarse(ground.take(retention.sorted_rows(ground, scale), axis=0), scale)
+        scale = retention.rounding_scale(voxel_size, retention.OTHER_STEPS)
+        ground = round_points(ground.take(retention.sorted_rows(ground, scale), axis=0), scale)
     else:
-        ground = quantised(ground, voxel_size)
+        ground = round_voxels(ground, voxel_size)
     _log_class(to, entities.ground(result.frame.lidar), ground, ClassId.GROUND)
 
 
 def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
-    """Log the obstacle points. ``quantised`` has rounded them."""
+    """Log the obstacle points. ``round_voxels`` has rounded them."""
     _log_class(to, entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
 
 
@@ -102,7 +102,7 @@ def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
         to.put(path, rr.Points3D(points, class_ids=class_id))
 
 
-def quantised(points: F32, voxel_size: float) -> F32:
+def round_voxels(points: F32, voxel_size: float) -> F32:
     """Round voxel points, which halves their compressed size. With a voxel size of 0, return them unchanged.
 
     The step is a power of two of a metre, from an eighth to a quarter of a voxel. No coordinate moves by more
@@ -113,6 +113,6 @@ def quantised(points: F32, voxel_size: float) -> F32:
     return rounded(points, 2.0 ** np.floor(np.log2(8 / voxel_size)))
 
 
-def coarse(points: F32, scale: float) -> F32:
+def round_points(points: F32, scale: float) -> F32:
     """Round points to the nearest 1 / scale. With a scale of 0, return them unchanged."""
     return rounded(points, scale) if scale else points

@@ -12,12 +12,12 @@ from bevviz.config import ClusteringConfig
 from bevviz.model.frame import F32, I32, I64, Bool, Frame
 from bevviz.model.results import Clusters, ClusterState, Tracks
 from bevviz.recording import entities, retention, tracks
-from bevviz.recording.cloud import coarse
+from bevviz.recording.cloud import round_points
 from bevviz.recording.primitives import OUTLINE, boxes3d
 from bevviz.recording.writer import Writer
 
 
-def log_clusters_looks(to: Writer, lidars: Iterable[str]) -> None:
+def log_cluster_style(to: Writer, lidars: Iterable[str]) -> None:
     """Log the static style of the clusters of each LiDAR."""
     for lidar in lidars:
         to.static(
@@ -52,11 +52,11 @@ def log_clusters(
     boxes = clusters.boxes(config)
     kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
     if len(kept):
-        member = in_kept(clusters)
+        member = in_kept_clusters(clusters)
         points, labels = obstacles.compress(member, axis=0), clusters.labels.compress(member)
         if packed is not None:
             rows = retention.sorted_rows(points, packed, labels)
-            points, labels = coarse(points.take(rows, axis=0), packed), labels.take(rows)
+            points, labels = round_points(points.take(rows, axis=0), packed), labels.take(rows)
         point_ids, box_ids = _colors(clusters, tracked, labels, kept)
         to.put(
             entities.clusters(frame.lidar),
@@ -76,7 +76,7 @@ def log_clusters(
         )
 
 
-def in_kept(clusters: Clusters) -> Bool:
+def in_kept_clusters(clusters: Clusters) -> Bool:
     """Return the (P,) mask of obstacle points in kept clusters."""
     return np.append(clusters.kept, False).take(clusters.labels)  # the label -1 is noise
 
@@ -85,5 +85,5 @@ def _colors(
     clusters: Clusters, tracked: Tracks | None, labels: I32, kept: I64
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
     """Return class ids of the points with these labels, and of the boxes of the kept clusters."""
-    colors = tracks.class_ids(tracks.of_clusters(tracked, len(clusters)))
+    colors = tracks.class_ids(tracks.track_ids_of_clusters(tracked, len(clusters)))
     return colors.take(labels), colors[kept]

@@ -22,17 +22,17 @@ from bevviz.model.frame import F32, RING_FIELDS
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.annotations import point_classes
-from bevviz.stages.voxel import of_points
+from bevviz.stages.voxel import spread_to_points
 
 ClassIds: TypeAlias = NDArray[np.unsignedinteger]
 
 COMPONENTS = "ColorBy"  # archetype of the components
-FIELDS: dict[Quantity, tuple[str, ...]] = {  # names of a quantity in clouds
+FIELD_NAMES: dict[Quantity, tuple[str, ...]] = {  # names of a quantity in clouds
     "intensity": ("intensity", "reflectivity", "i"),
     "ring": RING_FIELDS,
     "time": ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset"),
 }
-TALLEST = 4.0  # metres above the ground, end of the colour scale
+HEIGHT_RANGE = 4.0  # metres above the ground, end of the colour scale
 
 _ABSENT = 3  # class id of a missing field
 _HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each scale
@@ -76,7 +76,9 @@ def class_ids(
         elif name == "distance":
             distances = np.sqrt(np.einsum("ij,ij->i", points, points))
             ids_by_quantity[name] = _scaled(distances, 0.0, entities.DEPTH_RANGE, _DISTANCE, _DEPTHS)
-        elif (values := next((fields[field] for field in FIELDS[name] if field in fields), None)) is None:
+        elif (
+            values := next((fields[field] for field in FIELD_NAMES[name] if field in fields), None)
+        ) is None:
             ids_by_quantity[name] = np.array([_ABSENT], np.uint8)
         elif name == "intensity":
             ids_by_quantity[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
@@ -95,11 +97,11 @@ def height_ids(result: FrameResult) -> NDArray[np.uint8]:
     Without a ground, the height is measured from the lowest points.
     """
     if result.voxels is not None and result.ground is not None:
-        voxel_ids = _scaled(result.ground.height, 0.0, TALLEST, _HEIGHT, _STEPS)
-        return of_points(voxel_ids, result.voxels.inverse)
+        voxel_ids = _scaled(result.ground.height, 0.0, HEIGHT_RANGE, _HEIGHT, _STEPS)
+        return spread_to_points(voxel_ids, result.voxels.inverse)
     z = result.frame.points[:, 2]
     lowest = float(np.percentile(z[:: len(z) // 5_000 + 1], 1)) if len(z) else 0.0
-    return _scaled(z, lowest, lowest + TALLEST, _HEIGHT, _STEPS)
+    return _scaled(z, lowest, lowest + HEIGHT_RANGE, _HEIGHT, _STEPS)
 
 
 def annotation_context() -> rr.AnnotationContext:
@@ -109,7 +111,7 @@ def annotation_context() -> rr.AnnotationContext:
     rings = palette().tolist()
     scales = [
         *(
-            _info(_HEIGHT + step, f"{step * TALLEST / _STEPS:.1f} m high", color)
+            _info(_HEIGHT + step, f"{step * HEIGHT_RANGE / _STEPS:.1f} m high", color)
             for step, color in enumerate(steps)
         ),
         *(

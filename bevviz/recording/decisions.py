@@ -21,11 +21,11 @@ _COUNTED_STATES = {"out_of_view", "too_small", "too_large"}  # clusters that are
 
 def log_decisions(to: Writer, result: FrameResult) -> None:
     """Log the page of the frame's decisions and its log lines."""
-    to.put(entities.EXPLAIN, document(page(result)))
-    to.lines(entities.EXPLAIN_LOG, remarks(result))
+    to.put(entities.EXPLAIN, document(decision_page(result)))
+    to.lines(entities.EXPLAIN_LOG, decision_log_lines(result))
 
 
-def page(result: FrameResult) -> str:
+def decision_page(result: FrameResult) -> str:
     """Return the frame's decisions as Markdown: problems, detections by camera, clusters.
 
     Detections and clusters without a match come first.
@@ -33,7 +33,7 @@ def page(result: FrameResult) -> str:
     return "\n".join(_lines(result))
 
 
-def remarks(result: FrameResult) -> list[tuple[str, str]]:
+def decision_log_lines(result: FrameResult) -> list[tuple[str, str]]:
     """Return log lines (level and text) for failures, problems, unmatched detections and doubtful objects."""
     lines = [("ERROR", f"{failure.stage}: {failure.reason}") for failure in result.failures]
     lines += [("WARN", problem) for problem in result.frame.problems]

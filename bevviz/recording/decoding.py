@@ -12,11 +12,11 @@ from typing import Any
 from bevviz.errors import UserError, first_line
 from bevviz.recording import rerun_cli
 
-PANIC = 101  # and above: exit status of a Rust program that panicked
+PANIC_STATUS = 101  # and above: exit status of a Rust program that panicked
 
 
 @contextmanager
-def readable(path: Path, otherwise: str = "cannot be read") -> Iterator[None]:
+def reader_errors_as_user_errors(path: Path, otherwise: str = "cannot be read") -> Iterator[None]:
     """Raise a ``UserError`` for any error in this context, including a panic of Rerun's reader."""
     try:
         with warnings.catch_warnings():
@@ -47,9 +47,9 @@ def check_decodes(path: Path, otherwise: str = "cannot be read", *, first: int |
     with path.open("rb") as file:
         input_arguments: dict[str, Any] = {"stdin": file} if first is None else {"input": file.read(first)}
         null = subprocess.DEVNULL
-        command = rerun_cli.tied([rerun_cli.program(), "rrd", "verify"])
+        command = rerun_cli.ending_with_parent([rerun_cli.rerun_program(), "rrd", "verify"])
         status = subprocess.run(
             command, **input_arguments, stdout=null, stderr=null, env=rerun_cli.environment(), check=False
         ).returncode
-    if status < 0 or status >= PANIC:
+    if status < 0 or status >= PANIC_STATUS:
         raise UserError(f"{path}: {otherwise}: it is damaged, Rerun's own reader breaks on it")

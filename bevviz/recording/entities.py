@@ -16,7 +16,7 @@ FRAME = "frame"  # sequence number of the frame
 VERSION = "version"  # sequence number of the configuration, in bevviz tune
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
-SLACK = 1000  # nanoseconds of tolerance for times from a viewer, which counts them in doubles
+TIME_TOLERANCE = 1000  # nanoseconds of tolerance for times from a viewer, which counts them in doubles
 
 # --- entities ----------------------------------------------------------------------------------
 

@@ -13,15 +13,15 @@ from pathlib import Path
 import rerun as rr
 
 from bevviz.errors import UserError
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 from bevviz.support.files import write_all
 
-PIECE = 1 << 20  # bytes
-HEAD = 12  # bytes of a recording's header: magic, version, options
-MESSAGE = struct.Struct("<QQ")  # kind and length of the message that follows
+PIPE_BYTES = 1 << 20  # bytes
+HEADER_BYTES = 12  # bytes of a recording's header: magic, version, options
+MESSAGE_HEADER = struct.Struct("<QQ")  # kind and length of the message that follows
 
 
-class FileWriter(Closing):
+class FileWriter(Closable):
     """Writer of Rerun's log data to a file.
 
     Rerun's own writer ends silently at the first error, and the next flush then waits for ever. Here Rerun
@@ -39,7 +39,7 @@ class FileWriter(Closing):
         self._read_end, self._write_end = os.pipe()
         if sys.platform == "linux":
             with suppress(OSError):
-                fcntl.fcntl(self._read_end, fcntl.F_SETPIPE_SZ, PIECE)
+                fcntl.fcntl(self._read_end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self.sink = rr.FileSink(f"/dev/fd/{self._write_end}")
         self._thread = threading.Thread(target=self._run, name="file", daemon=True)
         self._thread.start()
@@ -73,16 +73,16 @@ class FileWriter(Closing):
 
     def _run(self) -> None:
         buffer = bytearray()
-        message_end = HEAD  # bytes up to the end of the last message seen so far
-        while piece := os.read(self._read_end, PIECE):
+        message_end = HEADER_BYTES  # bytes up to the end of the last message seen so far
+        while piece := os.read(self._read_end, PIPE_BYTES):
             buffer += piece
             complete = 0
             while len(buffer) >= message_end:
                 complete = message_end
-                if len(buffer) < complete + MESSAGE.size:
+                if len(buffer) < complete + MESSAGE_HEADER.size:
                     break
-                _, length = MESSAGE.unpack_from(buffer, complete)
-                message_end = complete + MESSAGE.size + length
+                _, length = MESSAGE_HEADER.unpack_from(buffer, complete)
+                message_end = complete + MESSAGE_HEADER.size + length
             with memoryview(buffer) as view, view[:complete] as messages:
                 self._write(messages)
             del buffer[:complete]

@@ -11,69 +11,77 @@ import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config
-from bevviz.model.frame import Frame, Intrinsics, LateResult, Scene
+from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.annotations import log_world
-from bevviz.recording.anomalies import log_anomalies, log_anomalies_looks
+from bevviz.recording.anomalies import log_anomalies, log_anomaly_style
 from bevviz.recording.bev import log_bev, log_grid
 from bevviz.recording.camera import (
-    Videos,
+    VideoEncoders,
     log_camera,
-    log_camera_looks,
+    log_camera_style,
     log_detections,
     log_intrinsics,
     log_projected_points,
 )
 from bevviz.recording.cloud import (
-    coarse,
     log_cloud,
-    log_cloud_looks,
     log_cloud_poses,
+    log_cloud_style,
     log_ground,
     log_obstacles,
-    quantised,
     raw_clouds,
+    round_points,
+    round_voxels,
 )
-from bevviz.recording.clusters import in_kept, log_clusters, log_clusters_looks
+from bevviz.recording.clusters import in_kept_clusters, log_cluster_style, log_clusters
 from bevviz.recording.decisions import log_decisions
 from bevviz.recording.frustums import log_frustums
-from bevviz.recording.health import Rates, log_health, log_health_looks
-from bevviz.recording.objects import log_objects, log_objects_looks
+from bevviz.recording.health import FrameRates, log_health, log_health_style
+from bevviz.recording.objects import log_object_style, log_objects
 from bevviz.recording.opinions import (
     log_fusion,
-    log_opinions_from_above,
+    log_opinion_style,
+    log_opinions_in_bev,
     log_opinions_in_images,
-    log_opinions_looks,
 )
 from bevviz.recording.primitives import transform
-from bevviz.recording.properties import log_origin
+from bevviz.recording.properties import log_run_settings
 from bevviz.recording.reference_boxes import (
-    forget_late,
+    clear_late,
     log_late,
     log_robot,
     log_truth,
-    log_truth_looks,
+    log_truth_style,
 )
-from bevviz.recording.retention import COARSE, FINE, Around, Held, is_whole, sorted_rows, step
+from bevviz.recording.retention import (
+    CLUSTER_STEPS,
+    OTHER_STEPS,
+    RawCloudFrame,
+    RawCloudSelector,
+    keeps_everything,
+    rounding_scale,
+    sorted_rows,
+)
 from bevviz.recording.states import COLORS, StateLanes, states_of, track_states
 from bevviz.recording.surroundings import (
-    AroundLog,
-    Fixed,
+    DiagnosticsLog,
+    StaticData,
     diagnostic_states,
-    fixed_parts,
-    log_motions,
+    log_imu_samples,
     log_shapes,
-    marks,
+    mark_lines,
+    static_data_makers,
 )
-from bevviz.recording.tracks import Lanes, log_speeds, log_tracks, log_tracks_looks
+from bevviz.recording.tracks import TrackLanes, log_speeds, log_track_style, log_tracks
 from bevviz.recording.writer import Writer
 
-STALE = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
+LATE_RESULT_LIFETIME = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
 
 
 @dataclass(frozen=True, slots=True)
-class Context:
+class RecordingContext:
     """State from earlier frames that a frame relies on. A recording that starts with the frame needs it."""
 
     config: Config
@@ -81,10 +89,12 @@ class Context:
     clock: tuple[int, int, int] = (0, 0, 0)  # index, stamp and received of the frame
     intrinsics: Mapping[str, Intrinsics] = field(default_factory=dict)
     lanes: Mapping[str, str] = field(default_factory=dict)  # state lane -> its state
-    fixed: Mapping[str, Fixed] = field(default_factory=dict)  # entity -> static data, from its first frame on
+    fixed: Mapping[str, StaticData] = field(
+        default_factory=dict
+    )  # entity -> static data, from its first frame on
 
 
-class Logger(Writer):
+class FrameLogger(Writer):
     """Logger of frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
 
     Call ``log_static`` once, then ``log`` for each frame.
@@ -118,14 +128,14 @@ class Logger(Writer):
         self.streams_video = config.logging.video == "stream"
         self._scene, self._network = scene, network
         self._intrinsics: dict[str, Intrinsics] = {}
-        self._static_data: dict[str, Fixed] = {}
-        self._track_lanes = Lanes()
+        self._static_data: dict[str, StaticData] = {}
+        self._track_lanes = TrackLanes()
         self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
-        self._robot_log = AroundLog()
+        self._robot_log = DiagnosticsLog()
         self._onsets = Onsets()
         self._last_frame: Frame | None = None
-        self._rates = Rates()
-        self._videos, self._cloud_selector = Videos(), Around()
+        self._rates = FrameRates()
+        self._videos, self._cloud_selector = VideoEncoders(), RawCloudSelector()
         self._raw_shown: set[str] = set()  # entities with the raw clouds of the previous frame
         self._raw_known: set[str] = set()
         self._watched_states: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
@@ -133,11 +143,11 @@ class Logger(Writer):
         self._late_stamps: dict[str, int] = {}  # topic of late robot results -> stamp of the newest
 
     @property
-    def context(self) -> Context:
+    def context(self) -> RecordingContext:
         """State that the last logged frame relies on."""
         frame = self._last_frame
         clock = (0, 0, 0) if frame is None else (frame.index, frame.stamp, frame.received)
-        return Context(
+        return RecordingContext(
             self._config, self._scene, clock, self._intrinsics, self._state_lanes.states, self._static_data
         )
 
@@ -167,20 +177,20 @@ class Logger(Writer):
     def log_static(self) -> None:
         """Log the static data: origin of the recording, axes, classes and styles."""
         lidars = list(dict.fromkeys(filter(None, (self._scene.lidar, *self._scene.lidars))))
-        log_origin(self, self._config, self._scene, self._network)
+        log_run_settings(self, self._config, self._scene, self._network)
         log_world(self)
-        log_cloud_looks(self, lidars)
-        log_clusters_looks(self, lidars)
-        log_camera_looks(self, self._scene.cameras)
-        log_objects_looks(self)
+        log_cloud_style(self, lidars)
+        log_cluster_style(self, lidars)
+        log_camera_style(self, self._scene.cameras)
+        log_object_style(self)
         if self._has_opinions:
-            log_opinions_looks(self, self._scene.cameras)
-        log_tracks_looks(self)
-        log_truth_looks(self)
-        log_anomalies_looks(self)
-        log_health_looks(self)
+            log_opinion_style(self, self._scene.cameras)
+        log_track_style(self)
+        log_truth_style(self)
+        log_anomaly_style(self)
+        log_health_style(self)
 
-    def log_context(self, context: Context) -> None:
+    def log_context(self, context: RecordingContext) -> None:
         """Log static data, calibration and states for a recording that starts with a frame."""
         self.log_static()
         for name, intrinsics in context.intrinsics.items():
@@ -198,9 +208,9 @@ class Logger(Writer):
         self._config_changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
-            log_origin(self, config, scene, self._network)
+            log_run_settings(self, config, scene, self._network)
             if self._has_opinions and not had_opinions:
-                log_opinions_looks(self, scene.cameras)
+                log_opinion_style(self, scene.cameras)
         else:
             self.log_static()
 
@@ -216,7 +226,7 @@ class Logger(Writer):
         result: FrameResult,
         health: Mapping[str, float] = MappingProxyType({}),
         notes: Sequence[tuple[str, str]] = (),
-        late: Sequence[LateResult] = (),
+        late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
         beside: Callable[[], object] | None = None,
         cloud: bool = False,
@@ -258,19 +268,19 @@ class Logger(Writer):
         for camera in result.cameras:
             log_detections(self, camera, result.explanations)
             if self._config.logging.projected_points and self._config.logging.keep != "report":
-                log_projected_points(self, camera, packed=not is_whole(self._config))
+                log_projected_points(self, camera, packed=not keeps_everything(self._config))
         log_opinions_in_images(self, result)
         log_frustums(self, frame, result.cameras)
         log_decisions(self, result)
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
-            log_opinions_from_above(self, result)
+            log_opinions_in_bev(self, result)
             if self._config.logging.keep != "report":
                 log_grid(self, result, result.bev)
         if not self.root:
             self._log_static_data(frame)
             log_shapes(self, frame)
-            log_motions(self, frame)
+            log_imu_samples(self, frame)
 
     def _log_changes(
         self,
@@ -285,7 +295,7 @@ class Logger(Writer):
         log_fusion(self, result)
         if result.tracks is not None:
             log_tracks(self, frame, result.tracks, self._config.bev)
-        lines = marks(frame) if self.root else self._robot_log.lines(frame)
+        lines = mark_lines(frame) if self.root else self._robot_log.lines(frame)
         self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
         started = self._onsets.of(result.anomalies)
         log_anomalies(self, result, started)
@@ -312,11 +322,11 @@ class Logger(Writer):
     def _log_input(self, result: FrameResult) -> None:
         """Log the input of the sensors and the robot."""
         frame, config = result.frame, self._config
-        if config.logging.raw_cloud and is_whole(config):
+        if config.logging.raw_cloud and keeps_everything(config):
             log_cloud(self, result, config.logging.color_by)
         else:
             log_cloud_poses(self, frame)
-        videos = None if is_whole(config) else self._videos
+        videos = None if keeps_everything(config) else self._videos
         for camera in result.cameras:
             log_camera(self, frame, camera, config.logging.jpeg_quality, videos)
             if camera.camera.intrinsics is not None:
@@ -324,13 +334,13 @@ class Logger(Writer):
         log_truth(self, frame, config.bev)
         log_robot(self, frame, config.bev)
         for topic, stamp in list(self._late_stamps.items()):
-            if frame.stamp - stamp > STALE:
+            if frame.stamp - stamp > LATE_RESULT_LIFETIME:
                 del self._late_stamps[topic]
-                forget_late(self, topic)
+                clear_late(self, topic)
 
     def _log_static_data(self, frame: Frame) -> None:
         """Log static data that the frame is the first to have."""
-        for path, make_data in fixed_parts(frame).items():
+        for path, make_data in static_data_makers(frame).items():
             if path not in self._static_data and (data := make_data()) is not None:
                 self._static_data = {
                     **self._static_data,
@@ -350,13 +360,13 @@ class Logger(Writer):
 
     def _log_lidar_results(self, result: FrameResult) -> None:
         frame, config, clusters = result.frame, self._config, result.clusters
-        if not is_whole(config):
+        if not keeps_everything(config):
             self._log_packed_results(result)
             return
         log_ground(self, result, config.voxel.size)
         if result.obstacles is None:
             return
-        obstacles = quantised(result.obstacles, config.voxel.size)
+        obstacles = round_voxels(result.obstacles, config.voxel.size)
         log_obstacles(self, frame, obstacles)
         if clusters is not None:
             log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering)
@@ -372,12 +382,12 @@ class Logger(Writer):
         if ground_too:
             unclustered = result.obstacles
             if clusters is not None:
-                unclustered = unclustered.compress(~in_kept(clusters), axis=0)
-            scale = step(size, COARSE)
-            unclustered = coarse(unclustered.take(sorted_rows(unclustered, scale), axis=0), scale)
+                unclustered = unclustered.compress(~in_kept_clusters(clusters), axis=0)
+            scale = rounding_scale(size, OTHER_STEPS)
+            unclustered = round_points(unclustered.take(sorted_rows(unclustered, scale), axis=0), scale)
             log_obstacles(self, frame, unclustered)
         if clusters is not None:
-            scale = step(size, FINE)
+            scale = rounding_scale(size, CLUSTER_STEPS)
             log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
 
     def _log_selected_clouds(self, result: FrameResult, *, is_event: bool) -> None:
@@ -392,11 +402,11 @@ class Logger(Writer):
         ]
         watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
         is_event |= any(self._watched_states.get(lane, state) != state for lane, state in watched.items())
-        is_user_event = bool(marks(frame)) or self._config_changed
+        is_user_event = bool(mark_lines(frame)) or self._config_changed
         self._watched_states, self._config_changed = watched, False
         clock, left_out = (frame.index, frame.stamp, frame.received), self._cloud_selector.left_out
         selected = self._cloud_selector.see(
-            Held(clock, clouds), self._config.logging, strange=is_event, wanted=is_user_event
+            RawCloudFrame(clock, clouds), self._config.logging, strange=is_event, wanted=is_user_event
         )
         if self._cloud_selector.left_out > left_out:
             text = f"logging.raw_share is reached; {self._cloud_selector.left_out} times so far"

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import rerun as rr
 
-from bevviz.model.colors import SERIES
-from bevviz.model.counts import counts_of
+from bevviz.model.colors import SERIES_COLORS
+from bevviz.model.counts import count_results
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -22,11 +22,11 @@ STAGES = (
 )
 COUNTS = ("detections", "clusters", "matches", "problems", "failures")
 
-WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
-LEAST = 250_000_000  # nanoseconds, minimum time span for a rate
+RATE_WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
+MIN_RATE_SPAN = 250_000_000  # nanoseconds, minimum time span for a rate
 
 
-class Rates:
+class FrameRates:
     """Rates at which frames arrive, over the last second.
 
     A rate needs a minimum time span, because two frames that arrive together have no frequency.
@@ -41,25 +41,25 @@ class Rates:
             if times and stamp < times[-1]:
                 times.clear()
             times.append(stamp)
-            while len(times) > 2 and times[1] <= stamp - WINDOW:
+            while len(times) > 2 and times[1] <= stamp - RATE_WINDOW:
                 times.popleft()
 
     def __iter__(self) -> Iterator[tuple[str, float]]:
         """By what was counted, in Hz; nothing as long as little is known."""
         for clock, times in self._times.items():
-            if len(times) > 1 and times[-1] - times[0] >= LEAST:
+            if len(times) > 1 and times[-1] - times[0] >= MIN_RATE_SPAN:
                 yield clock, (len(times) - 1) * 1e9 / (times[-1] - times[0])
 
 
-def log_health_looks(to: Writer) -> None:
+def log_health_style(to: Writer) -> None:
     """Log the static colours of the stage time and count curves."""
     for paths in (map(entities.stage_time, STAGES), map(entities.count, COUNTS)):
-        for path, color in zip(paths, SERIES, strict=False):
+        for path, color in zip(paths, SERIES_COLORS, strict=False):
             to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
 def log_health(
-    to: Writer, result: FrameResult, last: Frame | None, rates: Rates, extra_scalars: Mapping[str, float]
+    to: Writer, result: FrameResult, last: Frame | None, rates: FrameRates, extra_scalars: Mapping[str, float]
 ) -> None:
     """Log every health scalar of a frame.
 
@@ -75,7 +75,7 @@ def log_health(
             to.scalar(path, float(value))
 
 
-def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tuple[str, float]]:
+def health(result: FrameResult, last: Frame | None, rates: FrameRates) -> Iterator[tuple[str, float]]:
     """Yield entity and value of every scalar of a frame. NaN means unknown.
 
     Args:
@@ -90,7 +90,7 @@ def health(result: FrameResult, last: Frame | None, rates: Rates) -> Iterator[tu
         yield entities.rate("pipeline"), 1 / result.timings["total"]
     for name, rate in rates:
         yield entities.rate(name), rate
-    for name, number in counts_of(result, last).items():
+    for name, number in count_results(result, last).items():
         yield entities.count(name), number
     if frame.lidar:
         yield entities.tf_age(frame.lidar), frame.tf_age * 1e3

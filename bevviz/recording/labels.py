@@ -19,17 +19,17 @@ from bevviz.recording import entities
 from bevviz.recording.primitives import CORNER, edges, strips
 from bevviz.recording.writer import Writer
 
-NEAR = 6  # boxes with a name; names of all boxes would cover the scene
-EYE, LOOK = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
+MAX_NAMES = 6  # boxes with a name; names of all boxes would cover the scene
+EYE, LOOK_TARGET = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
 # Size of a name, across and up: as tangents of the view angle in 3D, in metres from above, and as fractions
 # of the image width in an image. Two names must be further apart than this in one direction.
 IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.05)
-LETTER = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
+LETTER_WIDTH = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
 
 _INVISIBLE, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
 
-def log_spoken_looks(to: Writer, path: str) -> None:
+def log_box_label_style(to: Writer, path: str) -> None:
     """Log the static style of outlines and names of 3D boxes."""
     to.static(entities.outlines(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
     to.static(
@@ -37,14 +37,14 @@ def log_spoken_looks(to: Writer, path: str) -> None:
     )
 
 
-def log_spoken_looks_in_image(to: Writer, path: str, draw_order: float) -> None:
+def log_image_box_label_style(to: Writer, path: str, draw_order: float) -> None:
     """Log the static style of outlines and names of boxes in an image."""
     lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
     to.static(entities.outlines(path), lines)
-    log_names_looks(to, path, draw_order + 1)
+    log_name_style(to, path, draw_order + 1)
 
 
-def log_names_looks(to: Writer, path: str, draw_order: float) -> None:
+def log_name_style(to: Writer, path: str, draw_order: float) -> None:
     """Log the static style of names in an image."""
     points = rr.Points2D.from_fields(
         radii=_INVISIBLE, colors=[_COLOR], show_labels=True, draw_order=draw_order
@@ -52,7 +52,7 @@ def log_names_looks(to: Writer, path: str, draw_order: float) -> None:
     to.static(entities.names(path), points)
 
 
-def log_spoken(
+def log_box_labels(
     to: Writer,
     path: str,
     boxes: Boxes3D,
@@ -78,7 +78,7 @@ def log_spoken(
         to.put(entities.names(path), rr.Points3D(tops[rows], labels=_repeat_single(names)), tooltips)
 
 
-def log_spoken_in_image(
+def log_image_box_labels(
     to: Writer, path: str, xyxy: F32, names: Sequence[str], sentences: Sequence[str], colors: Sequence[Color]
 ) -> None:
     """Log outlines and names over boxes in an image. ``xyxy``: (K, 4) pixels in bevviz's convention."""
@@ -93,7 +93,7 @@ def log_spoken_in_image(
         )
 
 
-def log_stroked(
+def log_labelled_outlines(
     to: Writer, path: str, strokes: Sequence[F32], names: Sequence[str], sentences: Sequence[str], places: F32
 ) -> None:
     """Log (K,) outlines of (M, 2) pixels with a sentence each, and names at (K, 2) ``places``."""
@@ -104,12 +104,12 @@ def log_stroked(
         to.put(entities.names(path), rr.Points2D(places[rows], labels=_repeat_single(names)), tooltips)
 
 
-def row_of(instance: int, count: int) -> int:
+def box_row(instance: int, count: int) -> int:
     """Return the row of the box for an instance of outlines or names. A single box has two instances."""
     return 0 if count == 1 and instance in (0, 1) else instance
 
 
-def named_in_space(places: F32 | F64, first: Bool | None = None, height: float = 1.0) -> Bool:
+def choose_named_in_3d(places: F32 | F64, first: Bool | None = None, height: float = 1.0) -> Bool:
     """Choose the 3D boxes that get a name: the nearest ones, as long as names do not overlap.
 
     Args:
@@ -120,28 +120,28 @@ def named_in_space(places: F32 | F64, first: Bool | None = None, height: float =
     Returns:
         (K,) mask.
     """
-    ahead = np.subtract(LOOK, EYE)
+    ahead = np.subtract(LOOK_TARGET, EYE)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     eye_positions = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
     tangents = eye_positions[:, :2] / np.maximum(eye_positions[:, 2:], 0.1)
-    return apart(tangents, _distances(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
+    return choose_named(tangents, _distances(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
 
 
-def named_from_above(places: F32) -> Bool:
+def choose_named_in_bev(places: F32) -> Bool:
     """Choose the boxes that get a name in the bird's-eye view. Return a (K,) mask.
 
     Args:
         places: (K, 2 or 3) positions around the robot, x ahead.
     """
-    return apart(places[:, 1::-1], _distances(places), FROM_ABOVE)
+    return choose_named(places[:, 1::-1], _distances(places), FROM_ABOVE)
 
 
-def apart(
+def choose_named(
     at: geometry.FloatArray, order: F32, room: tuple[float | F64, float], first: Bool | None = None
 ) -> Bool:
-    """Choose the first ``NEAR`` names that do not overlap. Return a (K,) mask.
+    """Choose the first ``MAX_NAMES`` names that do not overlap. Return a (K,) mask.
 
     Args:
         at: (K, 2) positions of the names, across and up.
@@ -162,7 +162,7 @@ def apart(
         ):
             mask[row] = True
             chosen.append((x, y, widths[row]))
-            if len(chosen) == NEAR:
+            if len(chosen) == MAX_NAMES:
                 break
     return mask
 

@@ -9,18 +9,18 @@ import rerun as rr
 
 from bevviz import anomalies
 from bevviz.model.colors import class_color
-from bevviz.model.results import SIDES, FrameResult, Objects, Opinion
+from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion
 from bevviz.recording import entities, tracks
-from bevviz.recording.labels import log_spoken, log_spoken_looks, named_in_space
-from bevviz.recording.opinions import marked
+from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
+from bevviz.recording.opinions import outline_colors
 from bevviz.recording.primitives import boxes3d, scored, texts_by_row, transform
 from bevviz.recording.writer import Writer
 
 
-def log_objects_looks(to: Writer) -> None:
+def log_object_style(to: Writer) -> None:
     """Log the static style of fused boxes, their labels and their measured boxes."""
     to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False))
-    log_spoken_looks(to, entities.FUSED)
+    log_box_label_style(to, entities.FUSED)
     to.static(entities.MEASURED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=False))
 
 
@@ -38,7 +38,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
     unusual_subjects = {anomaly.subject for anomaly in result.anomalies}
     is_unusual = np.zeros(len(objects), bool)
     ids, speeds = np.full(len(objects), -1), np.full(len(objects), np.nan, np.float32)
-    for row, track in enumerate(tracks.of_objects(tracked, len(objects))):
+    for row, track in enumerate(tracks.track_rows_of_objects(tracked, len(objects))):
         if track is not None and tracked is not None:
             labels[row] = tracks.label(tracked, track)
             is_unusual[row] = anomalies.label(tracked, track) in unusual_subjects
@@ -69,8 +69,8 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         ),
     )
     distances = np.hypot(*objects.boxes.center[:, :2].T)
-    is_named = named_in_space(objects.boxes.center, is_unusual)
-    log_spoken(
+    is_named = choose_named_in_3d(objects.boxes.center, is_unusual)
+    log_box_labels(
         to,
         entities.FUSED,
         objects.boxes,
@@ -79,7 +79,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
             for label, metres, reason in zip(labels, distances, reasons, strict=True)
         ],
-        marked(result, colors),
+        outline_colors(result, colors),
     )
     if objects.measured is not None:
         rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
@@ -107,6 +107,6 @@ def sides(objects: Objects) -> list[str]:
     if objects.seen is None:
         return [""] * len(objects)
     return [
-        ", ".join(side for side, seen in zip(SIDES, row, strict=True) if seen)
+        ", ".join(side for side, seen in zip(BOX_SIDES, row, strict=True) if seen)
         for row in objects.seen.tolist()
     ]

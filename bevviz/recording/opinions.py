@@ -9,23 +9,23 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import OPINIONS, SERIES, Color, State, class_color
+from bevviz.model.colors import OPINION_COLORS, SERIES_COLORS, Color, StateColor, class_color
 from bevviz.model.counts import OPINIONS as COUNTED
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Camera
 from bevviz.model.results import FrameResult, Objects, Opinion
 from bevviz.recording import entities
-from bevviz.recording.bev import footprints, seen_from_above
-from bevviz.recording.camera import over_image
+from bevviz.recording.bev import bev_pixels, ground_outlines
+from bevviz.recording.camera import image_frame
 from bevviz.recording.health import COUNTS
 from bevviz.recording.labels import (
     FROM_ABOVE,
     IN_IMAGE,
-    LETTER,
-    apart,
-    log_names_looks,
-    log_spoken,
-    log_stroked,
-    named_in_space,
+    LETTER_WIDTH,
+    choose_named,
+    choose_named_in_3d,
+    log_box_labels,
+    log_labelled_outlines,
+    log_name_style,
 )
 from bevviz.recording.primitives import (
     CORNER,
@@ -38,35 +38,35 @@ from bevviz.recording.primitives import (
 )
 from bevviz.recording.writer import Writer
 
-DIM = 0.65  # factor on the class colour of objects that both methods have
+SHARED_OBJECT_BRIGHTNESS = 0.65  # factor on the class colour of objects that both methods have
 MISSED = "missed"
-DOUBTS = ("contradicted", "named otherwise", MISSED)  # opinions whose objects get a name
+NAMED_OPINIONS = ("contradicted", "named otherwise", MISSED)  # opinions whose objects get a name
 
 _DOUBT_COLORS = {
-    opinion: OPINIONS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)
+    opinion: OPINION_COLORS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)
 }
 
 
-def log_opinions_looks(to: Writer, cameras: Iterable[str]) -> None:
+def log_opinion_style(to: Writer, cameras: Iterable[str]) -> None:
     """Log the static style of opinions. Lines are thinner than those of the objects."""
     thin = rr.Radius.ui_points(0.5)
     to.static(entities.FUSION, rr.Boxes3D.from_fields(radii=thin, show_labels=False, fill_mode=OUTLINE))
     lines = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.0))
     to.static(entities.outlines(entities.FUSION), lines)
     points = rr.Points3D.from_fields(
-        radii=rr.Radius.ui_points(0.0), colors=[State.DOUBTFUL.value], show_labels=True
+        radii=rr.Radius.ui_points(0.0), colors=[StateColor.DOUBTFUL.value], show_labels=True
     )
     to.static(entities.names(entities.FUSION), points)
     for camera in cameras:
-        for opinion in OPINIONS:
+        for opinion in OPINION_COLORS:
             path = entities.image_opinion(camera, opinion)
             _log_outline_style(to, path, opinion)
             if to.root:
                 for entity in (path, entities.names(path)):
-                    to.static(entity, over_image(camera))
-    for opinion in OPINIONS:
+                    to.static(entity, image_frame(camera))
+    for opinion in OPINION_COLORS:
         _log_outline_style(to, entities.overlay_opinion(opinion), opinion)
-    for name, color in zip(COUNTED, SERIES[len(COUNTS) :], strict=False):
+    for name, color in zip(COUNTED, SERIES_COLORS[len(COUNTS) :], strict=False):
         to.static(entities.count(name), rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
@@ -95,8 +95,8 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
             reason=[reasons.get(row, "") for row in range(len(fused))],
         ),
     )
-    has_name = named_in_space(fused.boxes.center, missed) & missed
-    log_spoken(
+    has_name = choose_named_in_3d(fused.boxes.center, missed) & missed
+    log_box_labels(
         to,
         entities.FUSION,
         fused.boxes,
@@ -110,11 +110,11 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class OpinionOutlines:
     """Outlines of the objects in a view that share one opinion.
 
     Attributes:
-        opinion: one of ``OPINIONS``.
+        opinion: one of ``OPINION_COLORS``.
         rows: rows in the method's objects; for missed objects, rows in the objects of our fusion.
         strokes: (M, 2) pixels of each outline.
     """
@@ -124,7 +124,7 @@ class Told:
     strokes: list[F32]
 
 
-def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
+def opinion_outlines_in_image(result: FrameResult, camera: Camera) -> Mapping[str, OpinionOutlines]:
     """Return the outlines of objects in a camera's image, by the entity of their opinion."""
     return {
         entities.image_opinion(camera.name, opinion): outlines
@@ -133,7 +133,7 @@ def told_in_image(result: FrameResult, camera: Camera) -> Mapping[str, Told]:
     }
 
 
-def told_from_above(result: FrameResult) -> Mapping[str, Told]:
+def opinion_outlines_in_bev(result: FrameResult) -> Mapping[str, OpinionOutlines]:
     """Return the outlines of objects in the bird's-eye view, by the entity of their opinion.
 
     Only objects with their centre in the view count.
@@ -144,9 +144,11 @@ def told_from_above(result: FrameResult) -> Mapping[str, Told]:
     for opinion, boxes, all_rows in _by_opinion(result):
         rows = all_rows[(np.abs(boxes.center[all_rows, :2]) < reach).all(axis=1)]
         if len(rows):
-            outlines = footprints(geometry.corners(boxes.chosen(rows)))
-            strokes = [*seen_from_above(config, np.eye(4), outlines)]
-            outlines_by_entity[entities.overlay_opinion(opinion)] = Told(opinion, rows.tolist(), strokes)
+            outlines = ground_outlines(geometry.corners(boxes.chosen(rows)))
+            strokes = [*bev_pixels(config, np.eye(4), outlines)]
+            outlines_by_entity[entities.overlay_opinion(opinion)] = OpinionOutlines(
+                opinion, rows.tolist(), strokes
+            )
     return outlines_by_entity
 
 
@@ -154,17 +156,17 @@ def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
     """Log object outlines over each image, in the colour of the cameras' opinion."""
     for camera_result in result.cameras if result.opinions is not None else ():
         camera = camera_result.camera
-        if (outlines := told_in_image(result, camera)) and camera.intrinsics is not None:
+        if (outlines := opinion_outlines_in_image(result, camera)) and camera.intrinsics is not None:
             width = camera.intrinsics.width
-            layout = _NameLayout(np.array(IN_IMAGE) * width, LETTER * width, CORNER, over=True)
+            layout = _NameLayout(np.array(IN_IMAGE) * width, LETTER_WIDTH * width, CORNER, over=True)
             _log_outlines(to, result, outlines, layout)
 
 
-def log_opinions_from_above(to: Writer, result: FrameResult) -> None:
+def log_opinions_in_bev(to: Writer, result: FrameResult) -> None:
     """Log object outlines over the bird's-eye image, which has the names of the method's objects already."""
     if result.opinions is not None:
         room = np.array(FROM_ABOVE) / result.config.bev.resolution
-        _log_outlines(to, result, told_from_above(result), _NameLayout(room, 0.0, 0.0, over=False))
+        _log_outlines(to, result, opinion_outlines_in_bev(result), _NameLayout(room, 0.0, 0.0, over=False))
 
 
 def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
@@ -173,17 +175,17 @@ def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
     if opinions is None or objects is None:
         return
     words = np.array([Opinion(value).word for value in opinions.opinion.tolist()], np.str_)
-    for opinion in OPINIONS:
+    for opinion in OPINION_COLORS:
         if opinion == MISSED:
             yield opinion, opinions.fused.boxes, np.flatnonzero(opinions.missed)
         else:
             yield opinion, objects.boxes, np.flatnonzero(words == opinion)
 
 
-def _visible_outlines(opinion: str, rows: I64, strokes: Sequence[F32]) -> Told:
+def _visible_outlines(opinion: str, rows: I64, strokes: Sequence[F32]) -> OpinionOutlines:
     """Return the outlines that are in the view."""
     shown = [(row, stroke) for row, stroke in zip(rows.tolist(), strokes, strict=True) if len(stroke)]
-    return Told(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
+    return OpinionOutlines(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,14 +211,14 @@ class _NameLayout:
 
 
 def _log_outlines(
-    to: Writer, result: FrameResult, outlines_by_entity: Mapping[str, Told], layout: _NameLayout
+    to: Writer, result: FrameResult, outlines_by_entity: Mapping[str, OpinionOutlines], layout: _NameLayout
 ) -> None:
     """Log outlines, and names of doubtful objects as long as names do not overlap.
 
     Missed objects come last, because their detection has a name already. Among the others the nearest comes
     first.
     """
-    doubtful = [outlines for outlines in outlines_by_entity.values() if outlines.opinion in DOUBTS]
+    doubtful = [outlines for outlines in outlines_by_entity.values() if outlines.opinion in NAMED_OPINIONS]
     places = np.array(
         [layout.place(stroke) for outlines in doubtful for stroke in outlines.strokes], np.float32
     )
@@ -230,14 +232,18 @@ def _log_outlines(
     letters = [len(name) for outlines in doubtful for name in _outline_names(result, outlines)]
     across = np.maximum(layout.room[0], layout.letter * np.array(letters, np.float64))
     named = iter(
-        apart(places.reshape(-1, 2), distances, (across, float(layout.room[1])), is_contradicted).tolist()
+        choose_named(
+            places.reshape(-1, 2), distances, (across, float(layout.room[1])), is_contradicted
+        ).tolist()
     )
     for path, outlines in outlines_by_entity.items():
         subject = "fused" if outlines.opinion == MISSED else "object"
         sentences = texts_by_row(result.explanations, subject)
         names = _outline_names(result, outlines)
-        has_name = [next(named) for _ in names] if outlines.opinion in DOUBTS else [False] * len(names)
-        log_stroked(
+        has_name = (
+            [next(named) for _ in names] if outlines.opinion in NAMED_OPINIONS else [False] * len(names)
+        )
+        log_labelled_outlines(
             to,
             path,
             [stroke + np.float32(layout.corner) for stroke in outlines.strokes],
@@ -247,7 +253,7 @@ def _log_outlines(
         )
 
 
-def _outline_names(result: FrameResult, outlines: Told) -> list[str]:
+def _outline_names(result: FrameResult, outlines: OpinionOutlines) -> list[str]:
     objects = _indexed_objects(result, outlines.opinion)
     return [f"{objects.names[row]} {outlines.opinion}" for row in outlines.rows]
 
@@ -259,20 +265,20 @@ def _indexed_objects(result: FrameResult, opinion: str) -> Objects:
 
 
 def _log_outline_style(to: Writer, path: str, opinion: str) -> None:
-    is_doubtful = opinion in DOUBTS
+    is_doubtful = opinion in NAMED_OPINIONS
     radius, order = (2.0, 34.0) if is_doubtful else (0.75, 33.0)
     style = rr.LineStrips2D.from_fields(
-        colors=[OPINIONS[opinion]], radii=rr.Radius.ui_points(radius), draw_order=order
+        colors=[OPINION_COLORS[opinion]], radii=rr.Radius.ui_points(radius), draw_order=order
     )
     to.static(path, style)
     if is_doubtful:
-        log_names_looks(to, path, order + 1)
+        log_name_style(to, path, order + 1)
 
 
 # --- in space ----------------------------------------------------------------------------------
 
 
-def marked(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
+def outline_colors(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
     """Return the colours of the objects' outlines. Doubtful objects have a colour of their own."""
     if result.opinions is None:
         return [*colors]
@@ -281,5 +287,5 @@ def marked(result: FrameResult, colors: Sequence[Color]) -> list[Color]:
 
 
 def _dim(color: Color) -> Color:
-    red, green, blue = (round(DIM * value) for value in color)
+    red, green, blue = (round(SHARED_OBJECT_BRIGHTNESS * value) for value in color)
     return red, green, blue

@@ -45,7 +45,7 @@ def host_for(address: str) -> str:
     return f"[{address}]" if isinstance(ip_address(address), IPv6Address) else address
 
 
-def origins(address: str, port: int) -> list[str]:
+def allowed_origins(address: str, port: int) -> list[str]:
     """Return the origins of web pages that may read the data: pages served from the same machine.
 
     Rerun adds localhost itself. An unspecified address allows any host name, because not every name of the
@@ -63,7 +63,7 @@ def viewer_address(host: str, port: int, data_port: int) -> str:
     return f"http://{host}:{port}/?url={quote(f'rerun+http://{host}:{data_port}/proxy', safe='')}"
 
 
-def answers(host: str, port: int) -> bool:
+def is_listening(host: str, port: int) -> bool:
     """Return whether a server listens at the port."""
     try:
         socket.create_connection((host, port), timeout=5).close()

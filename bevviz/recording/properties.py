@@ -6,23 +6,23 @@ from typing import Any
 
 import rerun as rr
 
-from bevviz.config import Config, dump, stated_lines
+from bevviz.config import Config, config_yaml, stated_lines
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
 from bevviz.recording.primitives import document
 from bevviz.recording.provenance import versions
-from bevviz.recording.retention import left_out
+from bevviz.recording.retention import omitted_data
 from bevviz.recording.writer import Writer
 from bevviz.support.text import fenced, markdown
 
 
-def log_origin(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
+def log_run_settings(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
     """Log source, configuration, versions, and the device of the detector's network."""
-    settings = dump(config)
+    settings = config_yaml(config)
     stated = stated_lines(config, folders=False)
     packages = [f"{name} {version}" for name, version in versions().items()]
     lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
-    omitted = list(left_out(config.logging))
+    omitted = list(omitted_data(config.logging))
     omissions = "".join(f"- {line}\n" for line in omitted)
     omissions = (
         f"## Not in this recording (keep: {config.logging.keep})\n\n{omissions}\n" if omissions else ""

@@ -16,7 +16,7 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from bevviz.config import STAGES, Config, object_files, plugin_of
+from bevviz.config import METHOD_KEYS, Config, object_files, plugin_of
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
 from bevviz.support.version import __version__
@@ -83,7 +83,7 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
             dependencies[key] = Dependency(sha256=file_hash(path), file=path.name)
     for key, file in object_files(config).items():
         dependencies[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
-    for section, key in STAGES.items():
+    for section, key in METHOD_KEYS.items():
         plugin = plugin_of(config, section)
         if plugin is not None:
             content = file_hash(plugin.file) if plugin.file else ""

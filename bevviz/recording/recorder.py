@@ -9,9 +9,9 @@ import rerun as rr
 from bevviz.config import Config
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.recording.frame_logger import Logger
-from bevviz.recording.sinks import Sinks
-from bevviz.recording.writer import WAIT
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.sinks import OpenRecording
+from bevviz.recording.writer import SCALAR_WAIT
 
 
 class Recorder(Observer[FrameResult]):
@@ -28,7 +28,9 @@ class Recorder(Observer[FrameResult]):
 
     def begin(self, items: Items[object]) -> None:
         """Log the static data."""
-        self.logger = Logger(self.recording, self._config, items.scene, wait=WAIT, network=self._network)
+        self.logger = FrameLogger(
+            self.recording, self._config, items.scene, wait=SCALAR_WAIT, network=self._network
+        )
         self.logger.log_static()
 
     def see(self, result: FrameResult) -> None:
@@ -51,7 +53,7 @@ class Recorder(Observer[FrameResult]):
 class DiskWatch(Observer[Any]):
     """Observer that ends a run if its recording can no longer be written."""
 
-    def __init__(self, sinks: Sinks) -> None:
+    def __init__(self, sinks: OpenRecording) -> None:
         self._sinks = sinks
 
     def see(self, result: object) -> None:

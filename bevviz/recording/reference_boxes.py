@@ -9,10 +9,10 @@ import rerun as rr
 
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateResult
+from bevviz.model.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
 from bevviz.recording import entities
-from bevviz.recording.bev import footprints, seen_from_above
-from bevviz.recording.camera import over_image
+from bevviz.recording.bev import bev_pixels, ground_outlines
+from bevviz.recording.camera import image_frame
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, scored, transform
 from bevviz.recording.writer import Writer
 
@@ -23,7 +23,7 @@ _TRUTH_COLOR = (215, 215, 215)
 _ROBOT_COLOR = (255, 210, 0)
 
 
-def log_truth_looks(to: Writer) -> None:
+def log_truth_style(to: Writer) -> None:
     """Log the static style of the ground truth."""
     to.static(
         entities.TRUTH,
@@ -56,10 +56,10 @@ def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
             _log_image_boxes(to.put, detections)
 
 
-def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
+def log_late(to: Writer, late: LateBoxes, config: BevConfig) -> None:
     """Log a result that came too late for its frame, at its own stamp.
 
-    It stays visible until the next result or ``forget_late``.
+    It stays visible until the next result or ``clear_late``.
     """
     boxes = late.boxes
     to.set_time(late.index, boxes.stamp, boxes.received)
@@ -72,7 +72,7 @@ def log_late(to: Writer, late: LateResult, config: BevConfig) -> None:
         to.write(path, rr.Clear(recursive=False))
 
 
-def forget_late(to: Writer, topic: str) -> None:
+def clear_late(to: Writer, topic: str) -> None:
     """Clear the boxes of a topic."""
     for path in (entities.robot(topic), entities.robot_overlay(topic)):
         to.write(path, rr.Clear(recursive=False))
@@ -95,7 +95,7 @@ def _log_image_boxes(put: Put, detections: LabelledBoxes2D) -> None:
     """Log detections under /robot. They have the coordinate frame of the image, so that it can show them."""
     put(
         entities.robot(detections.topic),
-        *([over_image(detections.camera)] if detections.camera else []),
+        *([image_frame(detections.camera)] if detections.camera else []),
         boxes2d(
             detections.xyxy,
             scored(detections.labels, detections.scores),
@@ -114,11 +114,11 @@ def _log_outlines(
     inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
     if not inside.any():
         return False
-    outlines = footprints(geometry.corners(labelled.boxes)[inside])
+    outlines = ground_outlines(geometry.corners(labelled.boxes)[inside])
     put(
         path,
         rr.LineStrips2D(
-            seen_from_above(config, points_from_boxes, outlines),
+            bev_pixels(config, points_from_boxes, outlines),
             colors=[color],
             radii=rr.Radius.ui_points(0.75),
             labels=[labelled.labels[row] for row in np.flatnonzero(inside)],

@@ -14,11 +14,11 @@ from typing import TypeAlias
 import rerun as rr
 
 from bevviz.errors import UserError
-from bevviz.recording.ports import answers
+from bevviz.recording.ports import is_listening
 
 Process: TypeAlias = "subprocess.Popen[bytes]"
 
-PATIENCE = 30.0  # seconds until a program listens
+START_TIMEOUT = 30.0  # seconds until a program listens
 # Ask Linux to end the program with its parent, in every case. The request survives exec.
 _END_WITH_PARENT = (
     "import ctypes,os,sys;ctypes.CDLL(None).prctl(1,15);"
@@ -26,13 +26,13 @@ _END_WITH_PARENT = (
 )
 
 
-def program() -> str:
+def rerun_program() -> str:
     """Return Rerun's program in the version of the SDK."""
     binary = Path(rr.__file__).parents[1] / "rerun_cli" / "rerun"
     return str(binary) if binary.exists() else "rerun"
 
 
-def tied(command: Sequence[str]) -> list[str]:
+def ending_with_parent(command: Sequence[str]) -> list[str]:
     """Return a command that ends with the thread that starts it. A server must not outlive its client."""
     if sys.platform != "linux":
         return list(command)
@@ -85,24 +85,24 @@ def start(
     Raises:
         UserError: the program ends, or does not listen.
     """
-    command = [program(), *arguments]
+    command = [rerun_program(), *arguments]
     try:
-        process = spawn(command if lasting else tied(command), subprocess.DEVNULL)
+        process = spawn(command if lasting else ending_with_parent(command), subprocess.DEVNULL)
     except OSError as error:
         raise UserError(f"cannot start {command[0]}: {error.strerror}") from None
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + START_TIMEOUT
     try:
-        while not answers(host, port):
+        while not is_listening(host, port):
             if process.poll() is not None or time.monotonic() > deadline:
                 raise UserError(f"'rerun {' '.join(arguments)}' does not start: try it by hand")
             time.sleep(0.05)
     except BaseException:
-        end(process)
+        stop(process)
         raise
     return process
 
 
-def end(process: Process) -> None:
+def stop(process: Process) -> None:
     """Stop a program that was started without ``lasting``."""
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
@@ -111,7 +111,7 @@ def end(process: Process) -> None:
     process.wait()
 
 
-def page(address: str, port: int, source: str) -> Process:
+def start_web_viewer(address: str, port: int, source: str) -> Process:
     """Serve the web viewer without data at an address. It loads the data from ``source``.
 
     The SDK's own web server listens at all addresses, so it is not used.

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from bevviz.config import Config, LoggingConfig
 from bevviz.model.frame import F32, I64
 
-FINE = 4  # rounding steps per voxel for points of clusters, if not everything is kept
-COARSE = 2  # the same for the ground and for points without a cluster
-PIXEL = 2  # rounding steps per pixel for obstacle points in an image
+CLUSTER_STEPS = 4  # rounding steps per voxel for points of clusters, if not everything is kept
+OTHER_STEPS = 2  # the same for the ground and for points without a cluster
+PIXEL_STEPS = 2  # rounding steps per pixel for obstacle points in an image
 BEV_QUALITY = 60  # JPEG quality of the bird's-eye view, which shows points only
 LOSSY = ("image/jpeg", "image/webp")
 
 
-def is_whole(config: Config) -> bool:
+def keeps_everything(config: Config) -> bool:
     """Return whether the recording keeps everything."""
     return config.logging.keep == "everything"
 
 
-def left_out(config: LoggingConfig) -> tuple[str, ...]:
+def omitted_data(config: LoggingConfig) -> tuple[str, ...]:
     """Return one sentence for each kind of data that a recording omits."""
     if config.keep == "everything":
         return ()
@@ -49,7 +49,7 @@ def left_out(config: LoggingConfig) -> tuple[str, ...]:
 # --- order -------------------------------------------------------------------------------------
 
 
-def step(voxel_size: float, parts: int) -> float:
+def rounding_scale(voxel_size: float, parts: int) -> float:
     """Return rounding steps per metre, as a power of two. 0: no rounding.
 
     A voxel has at most ``parts`` steps, and more than half as many.
@@ -78,14 +78,14 @@ def sorted_rows(points: F32, scale: float, first: I64 | None = None) -> I64:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class RawCloudFrame:
     """Raw clouds of a frame that may still be wanted."""
 
     clock: tuple[int, int, int]  # index, stamp and received
     clouds: Sequence[tuple[str, F32, NDArray[np.uint16]]]  # entity, points, class id of each point
 
 
-class Around:
+class RawCloudSelector:
     """Selector of frames whose raw clouds are kept. It buffers the frames of the last ``raw_around`` seconds.
 
     Anomalies and state changes keep the clouds around them only while the clouds kept for this reason are
@@ -99,7 +99,7 @@ class Around:
 
     def __init__(self) -> None:
         self.left_out = 0
-        self._buffer: list[Held] = []
+        self._buffer: list[RawCloudFrame] = []
         self._until = -1
         self._count = self._kept_for_events = 0
 
@@ -109,8 +109,8 @@ class Around:
         return len(self._buffer)
 
     def see(
-        self, frame: Held, config: LoggingConfig, *, strange: bool, wanted: bool = False
-    ) -> Sequence[Held]:
+        self, frame: RawCloudFrame, config: LoggingConfig, *, strange: bool, wanted: bool = False
+    ) -> Sequence[RawCloudFrame]:
         """Return the frames whose clouds are logged now, oldest first.
 
         Args:

@@ -14,23 +14,24 @@ from bevviz.recording.ports import (
     free_port,
     viewer_address,
 )
-from bevviz.recording.sinks import MEMORY
+from bevviz.recording.sinks import SERVER_MEMORY
 
-WEB = 2.3e9  # bytes that fit into the web viewer, as WebAssembly has 4 GiB of memory
+WEB_VIEWER_BYTES = 2.3e9  # bytes that fit into the web viewer, as WebAssembly has 4 GiB of memory
 
 
 def too_large_for_web(recording: Path, size: int) -> str:
     """Return a warning if a browser cannot show the whole recording, else "". ``size`` is in bytes."""
-    if size <= WEB:
+    if size <= WEB_VIEWER_BYTES:
         return ""
+    limit = f"{WEB_VIEWER_BYTES / 1e9:.1f} GB"
     return (
-        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {WEB / 1e9:.1f} GB: "
-        f"its beginning is missing; Rerun's own viewer reads what it shows from the file (rerun "
-        f"{recording}); --keep inspect saves a fifth"
+        f"{recording.name} has {size / 1e9:.1f} GB, and a browser's viewer can hold {limit}: its beginning "
+        f"is missing; Rerun's own viewer reads what it shows from the file (rerun {recording}); --keep "
+        "inspect saves a fifth"
     )
 
 
-def in_viewer(recording: Path) -> None:
+def open_in_viewer(recording: Path) -> None:
     """Open the recording in a viewer, which stays open after this process.
 
     Raises:
@@ -42,7 +43,7 @@ def in_viewer(recording: Path) -> None:
 
 
 @contextmanager
-def in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
+def serve_in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
     """Serve the recording to browsers of this machine while the context is open. Yield the page's address.
 
     Args:
@@ -57,9 +58,9 @@ def in_browser(recording: Path, port: int | None = None) -> Iterator[str]:
     page_port = port or free_port(9090)
     data_port = free_port(FIRST_DATA_PORT, but=page_port)
     arguments = [str(recording), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(page_port)]
-    arguments += ["--port", str(data_port), "--server-memory-limit", MEMORY]
+    arguments += ["--port", str(data_port), "--server-memory-limit", SERVER_MEMORY]
     process = rerun_cli.start(arguments, LOOPBACK, page_port)
     try:
         yield viewer_address("localhost", page_port, data_port)
     finally:
-        rerun_cli.end(process)
+        rerun_cli.stop(process)

@@ -21,25 +21,25 @@ from bevviz.recording.file_writer import FileWriter
 from bevviz.recording.ports import (
     FIRST_DATA_PORT,
     LOOPBACK,
+    allowed_origins,
     check_port,
     free_port,
     host_for,
-    origins,
     own_address,
     viewer_address,
 )
-from bevviz.recording.retention import is_whole
+from bevviz.recording.retention import keeps_everything
 from bevviz.recording.source_lookup import Origin
-from bevviz.support.files import Unfinished, written
+from bevviz.support.files import UnfinishedFile, atomic_write
 
 APPLICATION = "bevviz"
-TICK = 2.0  # seconds that a frame may wait until a chunk is written
-CHUNK = 1 << 24  # bytes that may wait until a chunk is written
-MEMORY = "25%"  # of the machine's memory, for a server's buffer for late viewers, and for the viewer
+CHUNK_SECONDS = 2.0  # seconds that a frame may wait until a chunk is written
+CHUNK_BYTES = 1 << 24  # bytes that may wait until a chunk is written
+SERVER_MEMORY = "25%"  # of the machine's memory, for a server's buffer for late viewers, and for the viewer
 
 
 @dataclass(frozen=True, slots=True)
-class Sinks:
+class OpenRecording:
     """An open recording.
 
     Attributes:
@@ -83,7 +83,7 @@ def open_recording(
     recording_id: str | None = None,
     place: Path | None = None,
     origin: Origin | None = None,
-) -> Iterator[Sinks]:
+) -> Iterator[OpenRecording]:
     """Open a recording with a blueprint and one or several outputs.
 
     The file is written under a temporary name next to its target (see ``bevviz.support.files``). After an
@@ -123,13 +123,13 @@ def open_recording(
         if connect is not None:
             sinks.append(_connect(connect))
         if spawn:
-            sinks.append(_viewer())
+            sinks.append(_start_viewer())
         if serve is not None:
             server, address = stack.enter_context(_serve_web(serve, bind))
             sinks.append(server)
             urls.append(address)
         has_viewer = connect is not None or spawn or serve is not None
-        recording = _new_stream(recording_id, batcher=None if has_viewer else batches(config))
+        recording = _new_stream(recording_id, batcher=None if has_viewer else chunk_batching(config))
         # The writer waits until Rerun closes the sink. From here on, every interrupt must close it.
         stack.callback(recording.disconnect)
         try:
@@ -143,7 +143,7 @@ def open_recording(
         if origin is not None:
             origin.log(recording)
         try:
-            yield Sinks(recording, urls, warnings, file, writer)
+            yield OpenRecording(recording, urls, warnings, file, writer)
         finally:
             _flush_and_disconnect(recording)
             if writer is not None:
@@ -162,15 +162,15 @@ def _new_stream(
     return recording
 
 
-def batches(config: Config) -> rr.ChunkBatcherConfig | None:
+def chunk_batching(config: Config) -> rr.ChunkBatcherConfig | None:
     """Return the batching of log calls into chunks of a file. None: Rerun's default.
 
     Small frames get larger chunks, which compress better.
     """
-    if is_whole(config):
+    if keeps_everything(config):
         return None
     batcher = rr.ChunkBatcherConfig()
-    batcher.flush_tick, batcher.flush_num_bytes = TICK, CHUNK
+    batcher.flush_tick, batcher.flush_num_bytes = CHUNK_SECONDS, CHUNK_BYTES
     return batcher
 
 
@@ -186,12 +186,12 @@ def _flush_and_disconnect(recording: rr.RecordingStream) -> None:
         recording.disconnect()
 
 
-def _open_file(path: Path) -> AbstractContextManager[Unfinished]:
+def _open_file(path: Path) -> AbstractContextManager[UnfinishedFile]:
     for name in (path, path.resolve()):  # a typing error must not overwrite a bag, not even through a link
         if name.suffix != ".rrd":
             link = f" (it is a link to {name})" if name != path else ""
             raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
-    return written(path, "recording")
+    return atomic_write(path, "recording")
 
 
 def _connect(url: str) -> rr.GrpcSink:
@@ -225,11 +225,11 @@ def check_viewer(url: str) -> tuple[str, int]:
     return host, port
 
 
-def _viewer() -> rr.GrpcSink:
+def _start_viewer() -> rr.GrpcSink:
     """Start a viewer for this machine only. The SDK's own function opens it to the network."""
     port = free_port(FIRST_DATA_PORT)
     arguments = ["--bind", LOOPBACK, "--port", str(port), "--memory-limit", "50%"]
-    arguments += ["--server-memory-limit", MEMORY, "--expect-data-soon", "--hide-welcome-screen"]
+    arguments += ["--server-memory-limit", SERVER_MEMORY, "--expect-data-soon", "--hide-welcome-screen"]
     try:
         rerun_cli.start(arguments, LOOPBACK, port, lasting=True)
     except UserError as error:
@@ -244,10 +244,13 @@ def _serve_web(port: int, bind: str) -> Iterator[tuple[rr.GrpcServerSink, str]]:
     check_port(port)
     data_port, host = free_port(FIRST_DATA_PORT, but=port), host_for(address)
     server = rr.GrpcServerSink(
-        address, data_port, server_memory_limit=MEMORY, cors_allow_origin=origins(address, port)
+        address,
+        data_port,
+        server_memory_limit=SERVER_MEMORY,
+        cors_allow_origin=allowed_origins(address, port),
     )
-    page = rerun_cli.page(address, port, f"rerun+http://{host}:{data_port}/proxy")
+    page = rerun_cli.start_web_viewer(address, port, f"rerun+http://{host}:{data_port}/proxy")
     try:
         yield server, viewer_address(host, port, data_port)
     finally:
-        rerun_cli.end(page)
+        rerun_cli.stop(page)

@@ -20,10 +20,10 @@ from bevviz.config import (
     flat_yaml,
     load,
     object_files,
-    received,
+    untrusted_layers,
     values,
 )
-from bevviz.config.pillars import is_network
+from bevviz.config.pillars import is_network_file
 from bevviz.errors import UserError, first_line
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
@@ -32,12 +32,12 @@ from bevviz.recording.provenance import model_path, names_path
 from bevviz.support.files import bag_files, open_regular, sampled_files
 from bevviz.support.text import path_text
 
-FRAMES = ("source.", "sync.")  # sections that decide what a frame is made of
-OBJECTS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
-BLOCK = 1 << 16  # bytes that are hashed at the beginning, the middle and the end of a file
-AFTER = 500  # chunks within which one property follows another
+FRAME_SECTIONS = ("source.", "sync.")  # sections that decide what a frame is made of
+OBJECT_FILE_KEYS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
+HASHED_BYTES = 1 << 16  # bytes that are hashed at the beginning, the middle and the end of a file
+PROPERTY_CHUNKS = 500  # chunks within which one property follows another
 MAGIC = b"RRF"  # followed by a digit, the generation of the format
-HEAD = 1 << 24  # bytes that are checked before properties are read; they need fewer
+CHECKED_BYTES = 1 << 24  # bytes that are checked before properties are read; they need fewer
 
 
 class NoBagError(UserError):
@@ -45,7 +45,7 @@ class NoBagError(UserError):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FileReference:
     """Reference to a bag or another file: paths where it may be, and a fingerprint of its content.
 
     Attributes:
@@ -126,9 +126,9 @@ def fingerprint(path: Path) -> tuple[int, str]:
         with open_regular(file) as content:
             size = os.fstat(content.fileno()).st_size
             digest.update(size.to_bytes(8, "little"))
-            for start in sorted({0, max(size // 2 - BLOCK // 2, 0), max(size - BLOCK, 0)}):
+            for start in sorted({0, max(size // 2 - HASHED_BYTES // 2, 0), max(size - HASHED_BYTES, 0)}):
                 content.seek(start)
-                digest.update(content.read(BLOCK) or b"")  # None: a special file that would block
+                digest.update(content.read(HASHED_BYTES) or b"")  # None: a special file that would block
         total += size
     return total, digest.hexdigest()
 
@@ -144,8 +144,8 @@ class Origin:
         redacted: the bag's images are not the images that the network saw.
     """
 
-    bag: Sequence[Place]
-    files: Mapping[str, Place] = field(default_factory=dict)
+    bag: Sequence[FileReference]
+    files: Mapping[str, FileReference] = field(default_factory=dict)
     topics: Sequence[str] = ()
     redacted: bool = False
 
@@ -173,9 +173,9 @@ class Origin:
             named_files = {}
         named_files |= {key: Path(file) for key, file in object_files(config).items()}
         try:
-            bag = [Place.of(path, recording, folders=folders) for path in scene.bag]
+            bag = [FileReference.of(path, recording, folders=folders) for path in scene.bag]
             files = {
-                key: Place.of(path, recording, folders=folders)
+                key: FileReference.of(path, recording, folders=folders)
                 for key, path in named_files.items()
                 if path is not None
             }
@@ -196,15 +196,15 @@ class Origin:
         """
         tree = json.loads(text)
         return cls(
-            [Place(**reference) for reference in tree["bag"]],
-            {str(key): Place(**reference) for key, reference in tree["files"].items()},
+            [FileReference(**reference) for reference in tree["bag"]],
+            {str(key): FileReference(**reference) for key, reference in tree["files"].items()},
             [str(setting) for setting in tree["topics"]],
             bool(tree["redacted"]),
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordingSource:
     """Bag and settings that a recording was made from.
 
     Attributes:
@@ -248,21 +248,23 @@ class Recorded:
         """Return the recording's frame and detector values that a configuration leaves at their default."""
         stated, defaults = values(config), values(load(preset=config.preset))
         recording_values = flat_yaml(self.yaml, str(self.recording))
-        recorded = {key: value for key, value in recording_values.items() if key.startswith(FRAMES)}
+        recorded = {key: value for key, value in recording_values.items() if key.startswith(FRAME_SECTIONS)}
         if recording_values.get("detector.model"):
             recorded["detector.model"] = recording_values["detector.model"]
         for layer in self._received():
             recorded |= layer.values
         open_keys = [
-            key for key in recorded if key in defaults and key not in OBJECTS and stated[key] == defaults[key]
+            key
+            for key in recorded
+            if key in defaults and key not in OBJECT_FILE_KEYS and stated[key] == defaults[key]
         ]
         return Layer(str(self.recording), {key: recorded[key] for key in open_keys})
 
     def _received(self) -> list[Layer]:
-        return received(self.settings, str(self.recording))
+        return untrusted_layers(self.settings, str(self.recording))
 
 
-def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> Recorded:
+def find_source(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = ()) -> RecordingSource:
     """Find the bag and the settings that a recording was made from.
 
     Args:
@@ -274,7 +276,7 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         NoBagError: the recording has no bag or does not name it.
         UserError: it is no recording, or the bag or the detector's file is not found or has changed.
     """
-    yaml, origin = read(recording)
+    yaml, origin = read_origin(recording)
     warnings: list[str] = []
     if origin is None and not bag:
         beside = recording.with_suffix(".mcap")  # 'bevviz live' saves both
@@ -305,9 +307,9 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         )
     topics, file_settings = list(origin.topics) if origin is not None else [], list[str]()
     new_settings = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
-    has_no_network = not is_network(new_settings.get("objects.method", ".onnx"))
+    has_no_network = not is_network_file(new_settings.get("objects.method", ".onnx"))
     for key, reference in origin.files.items() if origin is not None else ():
-        if key in new_settings or (key in OBJECTS and has_no_network):
+        if key in new_settings or (key in OBJECT_FILE_KEYS and has_no_network):
             continue
         path, reason = reference.locate(recording)
         if path is None:
@@ -318,10 +320,10 @@ def follow(recording: Path, bag: Sequence[Path] = (), settings: Sequence[str] = 
         *(topic for topic in topics if not configuration.get(topic.partition("=")[0])),
         *file_settings,
     ]
-    return Recorded(recording, tuple(paths), tuple(recorded_settings), tuple(warnings), yaml)
+    return RecordingSource(recording, tuple(paths), tuple(recorded_settings), tuple(warnings), yaml)
 
 
-def _locate(reference: Place, recording: Path) -> Path:
+def _locate(reference: FileReference, recording: Path) -> Path:
     path, reason = reference.locate(recording)
     if path is None:
         raise UserError(
@@ -338,7 +340,7 @@ def _fingerprint_of_option(path: Path) -> tuple[int, str]:
         raise UserError(f"--bag {path}: cannot be read: {error.strerror}") from None
 
 
-def read(recording: Path) -> tuple[str, Origin | None]:
+def read_origin(recording: Path) -> tuple[str, Origin | None]:
     """Return the configuration (YAML) in a recording, and its source. None: the recording does not name it.
 
     Raises:
@@ -349,7 +351,7 @@ def read(recording: Path) -> tuple[str, Origin | None]:
     with recording.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise UserError(f"{recording}: no recording: it does not begin as one of Rerun's")
-    check_decodes(recording, first=HEAD)
+    check_decodes(recording, first=CHECKED_BYTES)
     yaml: str | None = None
     origin: Origin | None = None
     try:
@@ -380,7 +382,7 @@ def _properties(recording: Path) -> Iterator[tuple[str, Any]]:
         yield name, chunk
         if name == entities.PROPERTY:
             break
-    for chunk in islice(chunks, AFTER):
+    for chunk in islice(chunks, PROPERTY_CHUNKS):
         head, _, name = chunk.entity_path.rpartition("/")
         if head == "/__properties":
             yield name, chunk

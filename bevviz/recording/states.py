@@ -10,29 +10,29 @@ import rerun as rr
 
 from bevviz import anomalies
 from bevviz.anomalies import KINDS
-from bevviz.model.colors import Color, State
+from bevviz.model.colors import Color, StateColor
 from bevviz.model.results import CameraResult, Decision, FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
 
 COLORS: Mapping[str, Color] = {
-    "ok": State.GOOD.value,
-    "matched": State.GOOD.value,
-    "degraded": State.DOUBTFUL.value,
-    "failed": State.BAD.value,
-    "no cluster": State.BAD.value,
-    "too few points": State.DOUBTFUL.value,
-    "low overlap": State.DOUBTFUL.value,
-    "misfit": State.DOUBTFUL.value,
-    "taken": State.OTHER.value,
-    "too far": State.UNKNOWN.value,
-    "not fused": State.UNKNOWN.value,
-    "silent": State.BAD.value,
-    "unusable": State.BAD.value,
-    "no publisher": State.BAD.value,
-    "warning": State.DOUBTFUL.value,  # level in the robot's diagnostics
-    "error": State.BAD.value,
-    "stale": State.UNKNOWN.value,
+    "ok": StateColor.GOOD.value,
+    "matched": StateColor.GOOD.value,
+    "degraded": StateColor.DOUBTFUL.value,
+    "failed": StateColor.BAD.value,
+    "no cluster": StateColor.BAD.value,
+    "too few points": StateColor.DOUBTFUL.value,
+    "low overlap": StateColor.DOUBTFUL.value,
+    "misfit": StateColor.DOUBTFUL.value,
+    "taken": StateColor.OTHER.value,
+    "too far": StateColor.UNKNOWN.value,
+    "not fused": StateColor.UNKNOWN.value,
+    "silent": StateColor.BAD.value,
+    "unusable": StateColor.BAD.value,
+    "no publisher": StateColor.BAD.value,
+    "warning": StateColor.DOUBTFUL.value,  # level in the robot's diagnostics
+    "error": StateColor.BAD.value,
+    "stale": StateColor.UNKNOWN.value,
 }
 
 
@@ -64,7 +64,7 @@ class StateLanes:
             known = self._plain_states.setdefault(lane, [])
             if state and state not in known:
                 known.append(state)
-                colors = [State.DOUBTFUL.value] * len(known)
+                colors = [StateColor.DOUBTFUL.value] * len(known)
                 to.static(lane, rr.StateConfiguration(values=known, colors=colors))
         elif state and lane not in self.states:
             to.static(lane, rr.StateConfiguration(values=self._values, colors=self._colors))

@@ -11,25 +11,33 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import bins, turbo
-from bevviz.model.frame import Around, Frame, Grid, MeshFile, Shape, Status, Surface
+from bevviz.model.colors import color_rows, turbo
+from bevviz.model.frame import (
+    ComponentStatus,
+    Frame,
+    HeightMap,
+    MeshFile,
+    OccupancyGrid,
+    PlacedShape,
+    RobotContext,
+)
 from bevviz.recording import entities
 from bevviz.recording.primitives import transform
 from bevviz.recording.writer import Writer
 
-LANES = 40  # lanes for the robot's worst diagnostics
+DIAGNOSTIC_LANES = 40  # lanes for the robot's worst diagnostics
 _WORST = ("error", "stale", "warning", "ok")
 _PARTS = ("points", "strips", "solids", "axes", "grid", "surface", "fix", "picture")
 _TYPES = {".dae": "model/vnd.collada+xml"}  # media types that Rerun does not guess from the file name
 _AXES = {"x": (225, 75, 60), "y": (110, 190, 90), "z": (86, 150, 233)}
 
-Fixed: TypeAlias = Sequence[rr.AsComponents]
+StaticData: TypeAlias = Sequence[rr.AsComponents]
 _COLOR = (120, 200, 255)
 
 
 def log_shapes(to: Writer, frame: Frame) -> None:
     """Log shapes that have a pose in the fixed frame, geographic positions and pictures."""
-    for shape in (frame.around or Around()).shapes:
+    for shape in (frame.around or RobotContext()).shapes:
         flat = shape.fix is not None or shape.picture is not None
         if flat or shape.world_from_shape is not None:
             _log_shape(to, shape)
@@ -37,9 +45,9 @@ def log_shapes(to: Writer, frame: Frame) -> None:
             to.put(entities.robot(shape.topic), rr.Transform3D(scale=0.0))
 
 
-def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
+def static_data_makers(frame: Frame) -> dict[str, Callable[[], StaticData | None]]:
     """Return functions that make the static data, by entity: the robot's meshes, and the axes of its IMUs."""
-    surroundings, makers = frame.around or Around(), dict[str, Callable[[], Fixed | None]]()
+    surroundings, makers = frame.around or RobotContext(), dict[str, Callable[[], StaticData | None]]()
     for shape in surroundings.shapes:
         for number, mesh in enumerate(shape.meshes):
             makers[f"{entities.robot(shape.topic)}/mesh_{number}"] = partial(_mesh, mesh)
@@ -48,9 +56,9 @@ def fixed_parts(frame: Frame) -> dict[str, Callable[[], Fixed | None]]:
     return makers
 
 
-def log_motions(to: Writer, frame: Frame) -> None:
+def log_imu_samples(to: Writer, frame: Frame) -> None:
     """Log IMU samples since the previous frame, each at its own time."""
-    for motion in (frame.around or Around()).motions:
+    for motion in (frame.around or RobotContext()).motions:
         for path, values in (
             (entities.rotation(motion.topic), motion.rotation),
             (entities.acceleration(motion.topic), motion.acceleration),
@@ -60,7 +68,7 @@ def log_motions(to: Writer, frame: Frame) -> None:
                 to.samples(path, motion.stamp[rows], motion.received[rows], values[rows])
 
 
-class AroundLog:
+class DiagnosticsLog:
     """Log lines of marks and diagnostics. It remembers the diagnostics, so that only changes make a line."""
 
     def __init__(self) -> None:
@@ -68,9 +76,9 @@ class AroundLog:
 
     def lines(self, frame: Frame) -> list[tuple[str, str]]:
         """Return log lines (level and text) of marks and of changed diagnostics."""
-        return [*marks(frame), *self._news((frame.around or Around()).statuses)]
+        return [*mark_lines(frame), *self._news((frame.around or RobotContext()).statuses)]
 
-    def _news(self, statuses: Sequence[Status]) -> list[tuple[str, str]]:
+    def _news(self, statuses: Sequence[ComponentStatus]) -> list[tuple[str, str]]:
         """Return log lines of statuses that changed. A first status makes a line only if it is not ok."""
         lines = []
         for status in statuses:
@@ -86,16 +94,16 @@ class AroundLog:
 def diagnostic_states(frame: Frame) -> dict[str, str]:
     """Return state lane -> level of the robot's worst diagnostics."""
     statuses = frame.around.statuses if frame.around else ()
-    shown = sorted(statuses, key=lambda status: _WORST.index(status.level))[:LANES]
+    shown = sorted(statuses, key=lambda status: _WORST.index(status.level))[:DIAGNOSTIC_LANES]
     return {entities.diagnostic(status.name): status.level for status in shown}
 
 
-def marks(frame: Frame) -> list[tuple[str, str]]:
+def mark_lines(frame: Frame) -> list[tuple[str, str]]:
     """Return users' notes at this frame as log lines."""
     return [("INFO", f"mark: {text}") for text in (frame.around.marks if frame.around else ())]
 
 
-def _log_shape(to: Writer, shape: Shape) -> None:
+def _log_shape(to: Writer, shape: PlacedShape) -> None:
     path = entities.robot(shape.topic)
     version = hash((shape.stamp, *(id(getattr(shape, part)) for part in _PARTS)))
     color = [_COLOR if shape.color is None else shape.color.tolist()]
@@ -134,10 +142,10 @@ def _log_shape(to: Writer, shape: Shape) -> None:
         )
 
 
-def _surface(surface: Surface) -> rr.AsComponents:
+def _surface(surface: HeightMap) -> rr.AsComponents:
     """Colour a surface from its lowest to its highest value. A surface without triangles becomes points."""
     low, high = np.percentile(surface.values, (1, 99)).tolist()
-    rows = bins(surface.values, low, max(high, low + 1e-6), len(turbo()))
+    rows = color_rows(surface.values, low, max(high, low + 1e-6), len(turbo()))
     colors = turbo()[rows]
     if len(surface.triangles) == 0:
         return rr.Points3D(surface.vertices, colors=colors, radii=rr.Radius.ui_points(3))
@@ -146,7 +154,7 @@ def _surface(surface: Surface) -> rr.AsComponents:
     )
 
 
-def _mesh(mesh: MeshFile) -> Fixed | None:
+def _mesh(mesh: MeshFile) -> StaticData | None:
     try:
         contents = mesh.path.read_bytes()
     except OSError:
@@ -162,11 +170,11 @@ def _media_type(path: Path) -> str | rr.components.MediaType | None:
     return _TYPES.get(suffix) or rr.components.MediaType.guess_from_path(path.with_suffix(suffix))
 
 
-def _axes() -> Fixed:
+def _axes() -> StaticData:
     return (rr.SeriesLines(names=list(_AXES), colors=list(_AXES.values())),)
 
 
-def _grid(grid: Grid) -> rr.GridMap:
+def _grid(grid: OccupancyGrid) -> rr.GridMap:
     rows, columns = grid.cells.shape
     return rr.GridMap(
         data=grid.cells[::-1].tobytes(),

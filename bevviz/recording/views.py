@@ -13,7 +13,7 @@ from bevviz.model.counts import OPINIONS
 from bevviz.model.frame import Scene
 from bevviz.recording import color_by, entities
 from bevviz.recording.health import COUNTS
-from bevviz.recording.labels import EYE, LOOK
+from bevviz.recording.labels import EYE, LOOK_TARGET
 
 _DARK = (13, 14, 18)
 HIDDEN = rrb.EntityBehavior(visible=False)
@@ -64,7 +64,7 @@ def space(
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: color_by.visualizer(by) for path in clouds}
-    position, target = EYE, LOOK
+    position, target = EYE, LOOK_TARGET
     if why and scene.focus is not None:
         position, target = _eye_near(scene.focus), scene.focus
     return rrb.Spatial3DView(

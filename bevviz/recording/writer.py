@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence, Set
 import numpy as np
 import rerun as rr
 
-from bevviz.model.frame import F64, I64, Clip, Codec
+from bevviz.model.frame import F64, I64, Codec, VideoClip
 from bevviz.recording import entities
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # in nanoseconds; the others are sequences
-STEP = 1_000  # nanoseconds between two video packets of a frame, at least
+VIDEO_PACKET_STEP = 1_000  # nanoseconds between two video packets of a frame, at least
 CODECS: Mapping[Codec, rr.VideoCodec] = {
     "h264": rr.VideoCodec.H264,
     "h265": rr.VideoCodec.H265,
@@ -22,10 +22,10 @@ CODECS: Mapping[Codec, rr.VideoCodec] = {
     "vp8": rr.VideoCodec.VP8,
     "vp9": rr.VideoCodec.VP9,
 }
-WAIT = 1.0  # seconds; suits a recording, but not a robot's operator
+SCALAR_WAIT = 1.0  # seconds; suits a recording, but not a robot's operator
 
 
-class Writer(Closing):
+class Writer(Closable):
     """Writer of frames to a recording, on the timelines ``stamp``, ``frame`` and ``received``.
 
     The ``log_*`` functions of this folder write through a Writer.
@@ -126,7 +126,7 @@ class Writer(Closing):
         self.write(path, *archetypes)
         self._frame_entities.add(path)
 
-    def video(self, path: str, clip: Clip) -> None:
+    def video(self, path: str, clip: VideoClip) -> None:
         """Log the last image of a clip, with those packets of the clip that are not logged yet.
 
         Packets that belong to no frame get earlier times on the nanosecond timelines, from their stamps. If a
@@ -145,9 +145,9 @@ class Writer(Closing):
             offset = clip.places[end][1] - clip.places[row][1] if clock else 0
             times = dict(self._clock)
             for name in self._clock.keys() & set(STAMPS):
-                times[name] -= max(offset, STEP * (end - row))
+                times[name] -= max(offset, VIDEO_PACKET_STEP * (end - row))
                 if name in clock:
-                    times[name] = max(times[name], clock[name] + STEP * (row - begin + 1))
+                    times[name] = max(times[name], clock[name] + VIDEO_PACKET_STEP * (row - begin + 1))
             clocks.append(times)
         if clocks:
             self._write_columns(path, clocks, rr.VideoStream.columns(sample=clip.packets[begin:end]))

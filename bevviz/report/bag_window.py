@@ -17,10 +17,10 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.message import RawMessage, is_ros1
 from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
-from bevviz.drivers.ouster import metadata_of
+from bevviz.drivers.ouster import metadata_topic
 from bevviz.errors import UserError
 from bevviz.messages.roles import Roles
-from bevviz.sync.unusable_messages import Damage
+from bevviz.sync.unusable_messages import UnusableMessages
 
 MILLISECOND = 1_000_000
 
@@ -28,13 +28,13 @@ Edited = tuple[Connection, bytes | memoryview] | None
 Edit = Callable[[RawMessage, bytes | memoryview], Edited]
 
 
-def as_it_is(message: RawMessage, data: bytes | memoryview) -> Edited:
+def unchanged(message: RawMessage, data: bytes | memoryview) -> Edited:
     """Return a message unchanged."""
     return message.connection, data
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ReportWindow:
     """Time window of a report, as log times in nanoseconds.
 
     ``low`` and ``high`` are whole milliseconds, so that they can be written exactly as text.
@@ -47,20 +47,20 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Cut:
+class CutContent:
     """Content of a bag that was cut out."""
 
     counts: Counter[str]  # messages by topic
     left_out: tuple[str, ...]  # messages that are missing, one sentence each
 
 
-def find_window(source: BagSource, at: int, before: float, after: float) -> Window:
+def find_window(source: BagSource, at: int, before: float, after: float) -> ReportWindow:
     """Return the window from the first to the last scan within ``before`` and ``after`` seconds of ``at``."""
     times = source.recording.scan_times(source.roles.driver)
     first, last = np.searchsorted(times, [at - round(before * SECOND), at + round(after * SECOND) + 1])
     low = int(times[first]) // MILLISECOND * MILLISECOND
     high = (int(times[last - 1]) // MILLISECOND + 1) * MILLISECOND
-    return Window(at, low, high, source.recording.start)
+    return ReportWindow(at, low, high, source.recording.start)
 
 
 def open_window(paths: Sequence[Path], config: Config, low: int, high: int) -> BagSource:
@@ -77,12 +77,12 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
     names = [topic.name for topic in recording.topics]
     if patterns is None:
         return names
-    fits(recording, patterns, "--topics")
-    needed = {*_read(roles), *(metadata_of(topic.name) for topic in recording.topics if topic.scans)}
+    check_patterns(recording, patterns, "--topics")
+    needed = {*_read(roles), *(metadata_topic(topic.name) for topic in recording.topics if topic.scans)}
     return [n for n in names if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 
-def fits(recording: Recording, patterns: Sequence[str], option: str) -> None:
+def check_patterns(recording: Recording, patterns: Sequence[str], option: str) -> None:
     """Check that every pattern fits a topic.
 
     Raises:
@@ -108,14 +108,14 @@ def _read(roles: Roles) -> list[str]:
     ]
 
 
-def cut(
+def cut_bag(
     recording: Recording,
-    window: Window,
+    window: ReportWindow,
     topics: Collection[str],
     static: Collection[str],
     path: Path,
-    edit: Edit = as_it_is,
-) -> Cut:
+    edit: Edit = unchanged,
+) -> CutContent:
     """Write the messages of a window to an MCAP file, byte for byte, with all that a run of it needs.
 
     The file also gets:
@@ -141,7 +141,7 @@ def cut(
     low, high = window.low - MARGIN, window.high + MARGIN
     chosen = [name for name in topics if name not in static]
     counts: Counter[str] = Counter()
-    damage = Damage()
+    damage = UnusableMessages()
     ros1 = is_ros1(next(c for f in recording.files for c in f.connections))
     with McapWriter(path, recording.types.definition, ros1=ros1) as bag:
         for topic in sorted(recording.calibrations.keys() & set(topics)):
@@ -174,7 +174,7 @@ def cut(
         messages_after += recording.messages(static, high)
         for message in sorted(messages_after, key=lambda message: message.received):
             put(message)
-    return Cut(counts, tuple(damage.sentences))
+    return CutContent(counts, tuple(damage.sentences))
 
 
 def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:

@@ -21,7 +21,7 @@ from bevviz.pipeline.progress_bar import Progress
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
-from bevviz.recording.decoding import check_decodes, readable
+from bevviz.recording.decoding import check_decodes, reader_errors_as_user_errors
 from bevviz.recording.provenance import differences, file_hash, model_path, provenance
 from bevviz.report.bag_window import open_window
 from bevviz.report.fingerprints import (
@@ -37,7 +37,7 @@ from bevviz.report.make import replay
 from bevviz.report.report_info import ReportInfo
 from bevviz.report.seal import check_seal
 from bevviz.stages.detector import DEMO_MODEL
-from bevviz.support.files import Scratch
+from bevviz.support.files import ScratchFolder
 
 UNREADABLE = "cannot be read as a report"
 
@@ -135,10 +135,10 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
     info, bag = stored.info, rrd.with_suffix(".mcap")
     if not bag.is_file():
         raise UserError(f"{bag}: the bag of the report is not there; it has the name of the recording")
-    with closing(Scratch()) as scratch:
+    with closing(ScratchFolder()) as scratch:
         stored_config, current_config = _configs(rrd, stored, model, settings, scratch.new())
         result = CheckResult(redacted=info.redacted, sealed=sealed, sound=file_hash(bag) == info.bag_sha256)
-        with readable(rrd, UNREADABLE):
+        with reader_errors_as_user_errors(rrd, UNREADABLE):
             frames = stored.frames.values()
             detections = {key: value for stages in frames for key, value in detections_of(stages).items()}
         session = Session(current_config, replay(detections) if info.redacted else None)
@@ -183,7 +183,7 @@ def read(rrd: Path) -> StoredReport:
     """
     info = config = None
     frames: dict[int, tuple[StageDigest, ...]] = {}
-    with readable(rrd, UNREADABLE):
+    with reader_errors_as_user_errors(rrd, UNREADABLE):
         for chunk in RrdReader(rrd).stream():
             if chunk.entity_path == "/__properties/report":
                 info = _column(chunk, "about")[-1][0]

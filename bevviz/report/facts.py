@@ -13,7 +13,7 @@ from pathlib import Path
 from bevviz.bags.source import SECOND, iso
 from bevviz.config import Config, ParameterChange, changes, load
 from bevviz.recording.provenance import Dependency
-from bevviz.report.bag_window import Window
+from bevviz.report.bag_window import ReportWindow
 from bevviz.support.text import fenced, markdown
 from bevviz.support.version import __version__
 
@@ -65,13 +65,13 @@ class Facts:
         return "\n".join([*lines, "", "## How to run it again", "", commands])
 
 
-def window_text(name: str, window: Window) -> str:
+def window_text(name: str, window: ReportWindow) -> str:
     """Return the sentence about the window of a bag, in seconds and in UTC."""
     first, last, at = ((t - window.start) / SECOND for t in (window.low, window.high, window.at))
     return f"{name}, {first:.1f} to {last:.1f} s of it, at {at:.3f} s ({iso(window.at)})"
 
 
-def commands(rrd: Path, window: Window, config: Config, redacted: bool) -> list[str]:
+def commands(rrd: Path, window: ReportWindow, config: Config, redacted: bool) -> list[str]:
     """Return the commands that show, check and repeat the report, to be typed in the folder of its files.
 
     Args:

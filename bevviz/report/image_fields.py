@@ -45,7 +45,7 @@ def is_coloured(cloud: Any) -> bool:
     return not COLOUR_FIELDS.isdisjoint(column.name.lower() for column in columns)
 
 
-class Contents:
+class ImageFinder:
     """Search for images in the messages of one type.
 
     Args:

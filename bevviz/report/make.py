@@ -40,15 +40,15 @@ from bevviz.recording.recorder import DiskWatch, Recorder
 from bevviz.recording.sinks import open_recording
 from bevviz.recording.source_lookup import Origin
 from bevviz.report.bag_window import (
-    Cut,
+    CutContent,
     Edited,
-    Window,
-    as_it_is,
+    ReportWindow,
+    check_patterns,
     choose_topics,
-    cut,
+    cut_bag,
     find_window,
-    fits,
     open_window,
+    unchanged,
 )
 from bevviz.report.facts import (
     AnswerText,
@@ -65,8 +65,8 @@ from bevviz.report.report_info import ReportInfo, shareable
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress
-from bevviz.support.files import claim, save
-from bevviz.support.files import written as write_beside
+from bevviz.support.files import atomic_write as write_beside
+from bevviz.support.files import claim_target, save_text
 
 if TYPE_CHECKING:
     from bevviz.why import Answer
@@ -152,14 +152,14 @@ def make(
         topics = choose_topics(whole_bag.recording, whole_bag.roles, request.topics)
         redactor = detections = None
         if request.redact:
-            fits(whole_bag.recording, request.unredacted, "--unredacted")
+            check_patterns(whole_bag.recording, request.unredacted, "--unredacted")
             redactor = Redactor(
                 request.config.detector, whole_bag.recording, whole_bag.roles.lidars, request.unredacted
             )
         # Delete an older report first. If this run fails, nobody may take the old files, perhaps
         # unredacted, for the new ones.
         for target in (rrd, html, bag):
-            unfinished = claim(target, "report")
+            unfinished = claim_target(target, "report")
             target.unlink(missing_ok=True)
             unfinished.discard()
             written.warnings += unfinished.warnings
@@ -168,8 +168,8 @@ def make(
         detect = None if detections is None else replay(detections)
         session = Session(request.config, detect)
         content = _cut(whole_bag, window, topics, bag, redactor)
-        cleanup.remember(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
-        stack.callback(cleanup.forget, bag)
+        cleanup.register(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
+        stack.callback(cleanup.unregister, bag)
         written.files.append(bag)
         written.warnings += [
             *whole_bag.recording.warnings,
@@ -190,7 +190,7 @@ def make(
         sinks = stack.enter_context(
             open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
         )
-        cleanup.forget(bag)
+        cleanup.unregister(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole_bag.scene.cameras))
@@ -210,7 +210,7 @@ def make(
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    save(html, page(facts, summary, file_hash(rrd)), "-o")
+    save_text(html, page(facts, summary, file_hash(rrd)), "-o")
     written.files.insert(1, html)
     return written
 
@@ -294,7 +294,7 @@ class _Detections(Observer[DetectionsByImage]):
         self.detections |= detections
 
 
-def _detect(request: ReportRequest, window: Window) -> DetectionsByImage:
+def _detect(request: ReportRequest, window: ReportWindow) -> DetectionsByImage:
     """Return the detections in the original images of a window."""
     observer = _Detections(request.config)
     with open_window(request.paths, request.config, window.low, window.high) as source:
@@ -304,8 +304,8 @@ def _detect(request: ReportRequest, window: Window) -> DetectionsByImage:
 
 
 def _cut(
-    source: BagSource, window: Window, topics: Sequence[str], bag: Path, redactor: Redactor | None
-) -> Cut:
+    source: BagSource, window: ReportWindow, topics: Sequence[str], bag: Path, redactor: Redactor | None
+) -> CutContent:
     """Cut the window out of the bag, with a progress bar."""
     low, high = window.low - MARGIN, window.high + MARGIN
     times = [source.recording.times(name) for name in topics]
@@ -314,13 +314,13 @@ def _cut(
 
         def edit(message: RawMessage, data: bytes | memoryview) -> Edited:
             bar.update()
-            return as_it_is(message, data) if redactor is None else redactor(message, data)
+            return unchanged(message, data) if redactor is None else redactor(message, data)
 
-        return cut(source.recording, window, topics, source.roles.tf_static, bag, edit)
+        return cut_bag(source.recording, window, topics, source.roles.tf_static, bag, edit)
 
 
 def _info(
-    request: ReportRequest, window: Window, written: WrittenReport, made_with: Provenance, bag: Path
+    request: ReportRequest, window: ReportWindow, written: WrittenReport, made_with: Provenance, bag: Path
 ) -> ReportInfo:
     """Return the machine-readable description of the report."""
     return ReportInfo(
@@ -340,8 +340,8 @@ def _info(
 def _facts(
     request: ReportRequest,
     public: Config,
-    window: Window,
-    content: Cut,
+    window: ReportWindow,
+    content: CutContent,
     written: WrittenReport,
     made_with: Provenance,
     summary: WindowSummary,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from bevviz.model.colors import bins, class_color, turbo
+from bevviz.model.colors import class_color, color_rows, turbo
 from bevviz.model.frame import U8, Bool
 from bevviz.model.results import Bev, CameraResult, Decision
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
@@ -65,7 +65,7 @@ def shrink(bgr: U8, width: int) -> tuple[U8, float]:
     return small, scale
 
 
-def ahead(bev: Bev) -> U8:
+def crop_ahead(bev: Bev) -> U8:
     """Return the part of a bird's-eye image that is ahead and not far to the sides."""
     rows, columns = bev.image.shape[:2]
     return bev.image[rows // 20 : 5 * rows // 8, columns // 4 : 3 * columns // 4]
@@ -83,7 +83,7 @@ def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
         return
     visible = np.isfinite(result.uv[:, 0])
     u, v = np.floor((result.uv[visible] + 0.5) * scale).astype(int).T
-    colors = turbo(DEPTH_BINS)[::-1, ::-1][bins(result.depth[visible], 0, DEPTH_RANGE, DEPTH_BINS)]
+    colors = turbo(DEPTH_BINS)[::-1, ::-1][color_rows(result.depth[visible], 0, DEPTH_RANGE, DEPTH_BINS)]
     height, width = picture.shape[:2]
     picture[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = colors
 

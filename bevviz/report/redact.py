@@ -21,7 +21,7 @@ from bevviz.drivers.video import decode_packet
 from bevviz.errors import UserError
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.encode import encode_compressed_image, typestore
-from bevviz.messages.foxglove import short_of
+from bevviz.messages.foxglove import foxglove_type
 from bevviz.messages.guard import guard
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.model.frame import F32, U8
@@ -32,7 +32,7 @@ from bevviz.report.image_fields import (
     IMAGE,
     OLD_CLOUD,
     PICTURES,
-    Contents,
+    ImageFinder,
     is_coloured,
     is_known,
 )
@@ -101,7 +101,7 @@ class Redactor:
             for topic in recording.topics
             if topic.kind == "CompressedVideo"
         }
-        self._contents: dict[tuple[str, MessageDefinition], Contents] = {}
+        self._contents: dict[tuple[str, MessageDefinition], ImageFinder] = {}
         self._left_out: Counter[str] = Counter()
         self.images = 0
         self.hidden = 0  # hidden boxes
@@ -135,7 +135,7 @@ class Redactor:
         msgtype = normalized(message.connection.msgtype)
         if msgtype in (IMAGE, COMPRESSED):
             return self._edited_image(message, data, msgtype == COMPRESSED)
-        if message.topic in self._lidars or short_of(msgtype) in PLAIN_FOXGLOVE:
+        if message.topic in self._lidars or foxglove_type(msgtype) in PLAIN_FOXGLOVE:
             return data
         if PICTURES.search(msgtype):
             raise MessageError(f"a {msgtype} cannot be looked into")
@@ -145,7 +145,7 @@ class Redactor:
         contents = self._contents.get(key)
         if contents is None:
             definitions = self._recording.types.fields(message.connection)
-            contents = self._contents[key] = Contents(msgtype, definitions)
+            contents = self._contents[key] = ImageFinder(msgtype, definitions)
         if not contents.may_show:
             return data
         content = self._recording.decode(message)
@@ -172,7 +172,7 @@ class Redactor:
         if not len(boxes):
             return data
         self.hidden += len(boxes)
-        hidden = hide(bgr, boxes)
+        hidden = hide_boxes(bgr, boxes)
         values: dict[str, Any]
         if compressed:
             values = {"data": _encoded(hidden, bytes(content.data[:8]))}
@@ -198,7 +198,7 @@ class Redactor:
         boxes = self.find(bgr)
         self.images += 1
         self.hidden += len(boxes)
-        data = _encoded(hide(bgr, boxes), b"").tobytes()
+        data = _encoded(hide_boxes(bgr, boxes), b"").tobytes()
         image = encode_compressed_image(packet.stamp, packet.frame_id, data, "jpeg")
         profiles = getattr(message.connection.ext, "offered_qos_profiles", [])
         connection = message.connection._replace(
@@ -224,11 +224,11 @@ class Redactor:
         return boxes[np.argsort(sizes.prod(axis=1), kind="stable")]
 
 
-def hide(bgr: U8, boxes: F32) -> U8:
+def hide_boxes(bgr: U8, boxes: F32) -> U8:
     """Return a copy of an (H, W, 3) image. Flat cells hide the (B, 4) boxes and their margins."""
     hidden = bgr.copy()
     height, width = bgr.shape[:2]
-    for x0, y0, x1, y1 in grown(boxes, width, height):
+    for x0, y0, x1, y1 in grow_boxes(boxes, width, height):
         region = hidden[y0:y1, x0:x1]
         edge = max(SMALLEST, -(-max(region.shape[:2]) // CELLS))
         cells = [max(1, side // edge) for side in region.shape[1::-1]]
@@ -237,7 +237,7 @@ def hide(bgr: U8, boxes: F32) -> U8:
     return hidden
 
 
-def grown(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, int]]:
+def grow_boxes(boxes: F32, width: int, height: int) -> Sequence[tuple[int, int, int, int]]:
     """Return the boxes with their margin in whole pixels: first column and row, and those after the last.
 
     A box outside the image is left out.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
-from bevviz.recording.health import Rates, health
+from bevviz.recording.health import FrameRates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 
 STRIP_PICTURES = 48  # pictures of all cameras and the bird's-eye view together
@@ -46,7 +46,7 @@ class WindowSummary:
     result: FrameResult | None = None  # scan nearest to ``at``
     tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # by stage and traceback
     _last: Frame | None = None
-    _rates: Rates = field(default_factory=Rates)
+    _rates: FrameRates = field(default_factory=FrameRates)
 
     def add(self, result: FrameResult) -> FrameSummary:
         """Add the next frame, and return its summary."""

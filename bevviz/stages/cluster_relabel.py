@@ -9,7 +9,7 @@ import numpy as np
 from bevviz.config import ClusteringConfig
 from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import Clusters, Splits
-from bevviz.stages.clustering import redescribe
+from bevviz.stages.clustering import update_clusters
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ def relabel_claimed(
         labels = row[labels]
     kept = np.concatenate([np.where(unchanged, np.arange(before), -1), np.full(fresh, -1)])[alive]
     rows = np.append(row[number], -1).astype(np.int32)
-    now = redescribe(points, labels, clusters, kept, rows[:-1], config)
+    now = update_clusters(points, labels, clusters, kept, rows[:-1], config)
     part_of, source, moved_points = np.array(moves, np.int32).T
     was_noise = source < 0
     return (

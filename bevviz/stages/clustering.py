@@ -29,10 +29,10 @@ def cluster(points: F32, config: ClusteringConfig) -> Clusters:
         their state. The oriented boxes have size x >= size y and yaw in (-pi/2, pi/2]. No side of a box is
         shorter than ``MIN_SIZE``.
     """
-    return describe(points, dbscan(points, config.eps, config.min_points), config)
+    return describe_clusters(points, dbscan(points, config.eps, config.min_points), config)
 
 
-def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
+def describe_clusters(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
     """Compute counts, size verdicts and boxes of clusters of any method.
 
     Args:
@@ -51,14 +51,14 @@ def describe(points: F32, labels: I32, config: ClusteringConfig) -> Clusters:
     return Clusters(labels, state, count, centroid, aligned, _upright(oriented))
 
 
-def redescribe(
+def update_clusters(
     points: F32, labels: I32, before: Clusters, kept_rows: I64, named: I32, config: ClusteringConfig
 ) -> Clusters:
-    """Describe clusters as ``describe`` does, and reuse the values of unchanged clusters.
+    """Describe clusters as ``describe_clusters`` does, and reuse the values of unchanged clusters.
 
     Args:
         points: (P, 3) float32 finite points.
-        labels: (P,) int32, as in ``describe``.
+        labels: (P,) int32, as in ``describe_clusters``.
         before: the clusters before the change.
         kept_rows: (K,) row in ``before`` of each unchanged cluster, -1 for the others.
         named: rows of clusters that are kept, regardless of the size limits.
@@ -68,7 +68,7 @@ def redescribe(
     number = np.full(len(kept_rows) + 1, -1, np.int32)
     number[fresh] = np.arange(len(fresh), dtype=np.int32)
     touched = np.flatnonzero(number[labels] >= 0)
-    new = describe(points[touched], number[labels[touched]], config)
+    new = describe_clusters(points[touched], number[labels[touched]], config)
     old = np.flatnonzero(kept_rows >= 0)
     row = np.empty(len(kept_rows), np.int64)
     row[old], row[fresh] = np.arange(len(old)), len(old) + np.arange(len(fresh))

@@ -25,7 +25,7 @@ from bevviz.stages.cells import sort_by
 from bevviz.stages.cluster_relabel import ClaimedPoints, relabel_claimed
 from bevviz.stages.clustering import MIN_SIZE
 from bevviz.stages.frustum_points import MARGIN, choose_candidate, cluster_remainder, fit_from, points_inside
-from bevviz.stages.mask_lookup import cover
+from bevviz.stages.mask_lookup import is_covered
 
 EDGE_PIXELS = 2.0  # pixels, one sigma of the edges of an image box,
 EDGE_SHARE = 0.03  # or this share of the box's width if that is more
@@ -39,7 +39,7 @@ MIN_CLUSTER_SHARE = 0.1  # share of an object's points above which a cluster cou
 UNAVAILABLE = -2  # value of ``taker`` for a point that no detection may claim
 
 
-def claim(
+def claim_clusters(
     points: F32,
     height: F32 | None,
     clusters: Clusters,
@@ -362,7 +362,7 @@ def _points_beside_mask(
     margin = MARGIN * (x1 - x0)
     u, v = uv[seen].T
     inside = seen[(u >= x0 - margin) & (u <= x1 + margin) & (v >= y0) & (v <= y1)]
-    covered = cover(masks, d, uv[inside], config.mask_margin)
+    covered = is_covered(masks, d, uv[inside], config.mask_margin)
     if np.count_nonzero(covered) < fewest:
         return None
     barred = np.zeros(len(uv), np.bool_)

@@ -19,7 +19,7 @@ from bevviz.model.results import (
     Objects,
     Pairs,
 )
-from bevviz.stages.mask_lookup import cover
+from bevviz.stages.mask_lookup import is_covered
 from bevviz.support.kernel import kernel
 
 # Weights of the three similarities of a cluster and a detection, each from 0 to 1 (see ``fuse``).
@@ -138,7 +138,7 @@ def _count_in_masks(uv: F32, inside: list[I64], detections: Detections, config: 
         return None
     counts = np.full(len(detections), -1, np.int32)
     for d in np.flatnonzero(detections.kept & (masks.place[:, 2] > 0)).tolist():
-        counts[d] = np.count_nonzero(cover(masks, d, uv[inside[d]], config.mask_margin))
+        counts[d] = np.count_nonzero(is_covered(masks, d, uv[inside[d]], config.mask_margin))
     return counts
 
 
@@ -179,7 +179,7 @@ def merge(clusters: Clusters, cameras: Sequence[CameraResult], config: Clusterin
     )
 
 
-def in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
+def clusters_in_view(cameras: Sequence[CameraResult], count: int) -> Bool:
     """Return the (count,) mask of clusters in the image of a camera with a fusion result."""
     seen = np.zeros(count, bool)
     for result in cameras:

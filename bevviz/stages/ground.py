@@ -161,7 +161,7 @@ def _moments(points: F32, chosen: Bool) -> tuple[F64, F64]:
 
 def _segment_polar(points: F32, config: GroundConfig) -> Ground:
     rings = math.ceil(RING_COUNT * math.asinh(config.max_range / RING_SCALE))
-    ring, sector, order, start = _place(points, rings, config.sectors)
+    ring, sector, order, start = _sort_into_bins(points, rings, config.sectors)
     plane = _first_plane(points, order, start, config)
     if plane is None:
         return _no_ground(len(points))
@@ -192,7 +192,7 @@ def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F
     return _fit_plane(low, inliers) if inliers.any() else None
 
 
-def _place(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
+def _sort_into_bins(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:
     """Return ring and sector of each point with fractions, and the points sorted by both."""
     # NumPy has vectorised arcsinh and arctan2; compiled loops do not.
     ring, turn = np.arcsinh(_range(points)), np.arctan2(points[:, 1], points[:, 0])

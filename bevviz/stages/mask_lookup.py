@@ -11,7 +11,7 @@ from bevviz.model.results import Masks
 from bevviz.support.kernel import kernel
 
 
-def cover(masks: Masks, d: int, uv: F32, margin: float = 0.0) -> Bool:
+def is_covered(masks: Masks, d: int, uv: F32, margin: float = 0.0) -> Bool:
     """Return the (N,) mask of pixels that a detection's object covers. NaN pixels are not covered.
 
     ``margin``: a pixel also counts if the object covers a position this many pixels left, right, above or

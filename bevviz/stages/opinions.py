@@ -21,7 +21,7 @@ from bevviz.model.results import (
     Opinion,
     Opinions,
 )
-from bevviz.stages.visibility import image_boxes, in_view, visible
+from bevviz.stages.visibility import image_boxes, share_in_image, visible
 
 MARGIN = 0.2  # metres around a box in which points still belong to it
 MIN_SHARE = 0.5  # smallest share of a cluster's points in the box that it belongs to
@@ -119,7 +119,7 @@ def opinions(
     )
 
 
-def right_names(label: str, known: Sequence[str]) -> frozenset[str]:
+def matching_names(label: str, known: Sequence[str]) -> frozenset[str]:
     """Return the detector's class names that match a label of another method, in lower case."""
     wanted, names = accepted_names(label, known), {name.lower() for name in known}
     if right := wanted & names:
@@ -223,7 +223,7 @@ def _camera_opinions(
         looks[most[sure], free[sure]] = True
 
     names = tuple(dict.fromkeys([*known, *detections.names]))
-    right = {label: right_names(label, names) for label in dict.fromkeys(objects.names)}
+    right = {label: matching_names(label, names) for label in dict.fromkeys(objects.names)}
     fits = np.array([[n.lower() in right[label] for n in detections.names] for label in objects.names], bool)
     fits = fits.reshape(count, len(detections))
 
@@ -233,7 +233,7 @@ def _camera_opinions(
     beside = (overlap >= MIN_NEARBY_IOU) & (detections.state != DetectionState.SUPPRESSED)
     rank = np.maximum(rank, np.where(beside, 2 * fits + overlap, 0))
     camera_opinions = _initial_opinions(count, Opinion.CONTRADICTED)
-    camera_opinions.shown[:] = in_view(objects.boxes, result.camera)
+    camera_opinions.shown[:] = share_in_image(objects.boxes, result.camera)
     camera_opinions.height[:] = np.nan_to_num(around[:, 3] - around[:, 1])
     knows = np.array([not known or bool(right[label]) for label in objects.names], bool)
     camera_opinions.opinion[~knows] = Opinion.NO_CLASS

@@ -26,7 +26,7 @@ from bevviz.model.results import (
     Objects,
 )
 from bevviz.stages.cells import cell_keys
-from bevviz.stages.user_stages import heights, placed
+from bevviz.stages.user_stages import heights_above_ground, make_objects
 
 SAME_POINT_DISTANCE = 0.05  # metres: our point is the same as a point of the robot's within it
 
@@ -45,7 +45,7 @@ def segment(points: F32, frame: Frame, topic: str, voxel: float) -> Ground:
         raise _missing(topic, "cloud of obstacles")
     reach = max(SAME_POINT_DISTANCE, voxel * 3**0.5)
     obstacle = _within(points, cloud.xyz, reach)
-    return Ground(~obstacle, heights(points, ~obstacle))
+    return Ground(~obstacle, heights_above_ground(points, ~obstacle))
 
 
 def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
@@ -101,7 +101,9 @@ def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clus
         StageError: the robot published no boxes at this time.
     """
     labelled = _boxes(frame, topic)
-    return placed(in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters)
+    return make_objects(
+        in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters
+    )
 
 
 def detections_of(labelled: LabelledBoxes2D) -> Detections:
@@ -119,7 +121,7 @@ def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
     points_from_boxes = np.eye(4)
     if labelled.world_from_boxes is not None:
         points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
-    return geometry.moved(labelled.boxes, points_from_boxes)
+    return geometry.transform_boxes(labelled.boxes, points_from_boxes)
 
 
 def _boxes(frame: Frame, topic: str) -> LabelledBoxes3D:

@@ -398,4 +398,4 @@ def _complete_boxes(
 
 def _move_boxes(boxes: Boxes3D, rows: NDArray[Any], pose: F64) -> Boxes3D:
     """Move upright boxes into another upright frame."""
-    return geometry.moved(boxes.chosen(rows), pose)
+    return geometry.transform_boxes(boxes.chosen(rows), pose)

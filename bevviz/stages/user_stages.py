@@ -17,14 +17,14 @@ from bevviz.errors import StageError, UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, Bool, Boxes3D
 from bevviz.model.results import Clusters, Detections, DetectionState, Ground, Objects
-from bevviz.stages.clustering import describe
+from bevviz.stages.clustering import describe_clusters
 
 CELL = 1.0  # metres: edge of a cell of the ground level, which is derived from ground points
 REACH = 200.0  # metres around the origin within which that level is stored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Foreign:
+class UserStage:
     """A user's function with its parameters."""
 
     plugin: Plugin
@@ -40,7 +40,7 @@ class Foreign:
         return self.plugin.name
 
 
-def foreign(config: Config, section: str) -> Foreign | None:
+def load_user_stage(config: Config, section: str) -> UserStage | None:
     """Return the user's function that a stage's section names; None if the section names a built-in method.
 
     Raises:
@@ -53,7 +53,7 @@ def foreign(config: Config, section: str) -> Foreign | None:
     if plugin.takes_params and plugin.params is not None:
         params.append(plugin.params.model_validate(getattr(config, section).params))
     if not isinstance(plugin.target, type):
-        return Foreign(plugin, lambda array: plugin.target(array, *params))
+        return UserStage(plugin, lambda array: plugin.target(array, *params))
     try:
         instance = plugin.target(*params)
     except Exception as error:  # A user's class may raise anything.
@@ -62,7 +62,7 @@ def foreign(config: Config, section: str) -> Foreign | None:
         ) from error
     if not callable(instance):
         raise UserError(f"{section}: {plugin.name} makes a {type(instance).__name__} that cannot be called")
-    return Foreign(plugin, instance)
+    return UserStage(plugin, instance)
 
 
 # --- the stages --------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def ground_of(points: F32, returned: Any, name: str) -> Ground:
         StageError: the function returned something else.
     """
     mask = _check_array(name, returned, "a mask", (len(points),), "b")
-    return Ground(mask.astype(np.bool_), heights(points, mask))
+    return Ground(mask.astype(np.bool_), heights_above_ground(points, mask))
 
 
 def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str) -> Clusters:
@@ -87,7 +87,7 @@ def clusters_of(points: F32, config: ClusteringConfig, returned: Any, name: str)
     labels = _check_array(name, returned, "labels", (len(points),), "iu").astype(np.int64)
     if len(labels) and labels.min() < -1:
         raise StageError(f"{name} returned label {labels.min()}: -1 is noise, 0 the first")
-    return describe(points, _renumber(labels), config)
+    return describe_clusters(points, _renumber(labels), config)
 
 
 def detections_of(threshold: float, returned: Any, name: str) -> Detections:
@@ -128,7 +128,7 @@ def objects_of(returned: Any, name: str, obstacles: F32 | None, clusters: Cluste
     if (rows[:, 3:6] <= 0).any():
         raise StageError(f"{name} returned a box without a volume: its columns are x y z l w h yaw")
     score, names = _check_scores(name, len(rows), score, names)
-    return placed(Boxes3D(rows[:, :3], rows[:, 3:6], rows[:, 6]), names, score, obstacles, clusters)
+    return make_objects(Boxes3D(rows[:, :3], rows[:, 3:6], rows[:, 6]), names, score, obstacles, clusters)
 
 
 def with_intensity(points: F32, intensity: NDArray[Any] | None) -> F32:
@@ -140,7 +140,7 @@ def with_intensity(points: F32, intensity: NDArray[Any] | None) -> F32:
     return cloud
 
 
-def placed(
+def make_objects(
     boxes: Boxes3D, names: Sequence[str], score: F32, obstacles: F32 | None, clusters: Clusters | None
 ) -> Objects:
     """Make objects from boxes without detections. An object's cluster has the most points in its box.
@@ -159,7 +159,7 @@ def placed(
     return Objects(boxes, tuple(names), score, cluster, ("",) * len(boxes), detection)
 
 
-def heights(points: F32, ground: Bool) -> F32:
+def heights_above_ground(points: F32, ground: Bool) -> F32:
     """Return (N,) metres above the ground near each point, derived from the ground points.
 
     The ground level of a square metre is the mean of its ground points. Without ground points it is that of

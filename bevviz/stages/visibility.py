@@ -62,7 +62,7 @@ def image_points(boxes: Boxes3D, camera: Camera) -> F32 | None:
     return uv.reshape(len(boxes), -1, 2)
 
 
-def in_view(boxes: Boxes3D, camera: Camera) -> F64:
+def share_in_image(boxes: Boxes3D, camera: Camera) -> F64:
     """Return the (K,) share of each box inside the image; 0 if the camera's pose is not known."""
     if camera.intrinsics is None or camera.camera_from_points is None or len(boxes) == 0:
         return np.zeros(len(boxes))

@@ -58,7 +58,7 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
 
 
 @kernel
-def of_points(values: NDArray[S], inverse: I32) -> NDArray[S]:
+def spread_to_points(values: NDArray[S], inverse: I32) -> NDArray[S]:
     """Return the (N,) values of the points, each copied from the voxel of the point."""
     result = np.empty(len(inverse), values.dtype)
     for i in range(len(inverse)):

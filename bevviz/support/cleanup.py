@@ -14,7 +14,7 @@ _removals: dict[object, Callable[[], None]] = {}
 
 
 @contextmanager
-def unfinished() -> Iterator[None]:
+def must_finish() -> Iterator[None]:
     """Mark a block that must finish: a signal does not kill the process inside it."""
     mark = object()
     _unfinished.append(mark)
@@ -24,22 +24,22 @@ def unfinished() -> Iterator[None]:
         _unfinished.remove(mark)
 
 
-def any_unfinished() -> bool:
-    """Return whether any thread is inside ``unfinished``."""
+def is_any_unfinished() -> bool:
+    """Return whether any thread is inside ``must_finish``."""
     return bool(_unfinished)
 
 
-def remember(owner: object, remove: Callable[[], None]) -> None:
-    """Register the function that deletes an owner's files, until ``forget``."""
+def register(owner: object, remove: Callable[[], None]) -> None:
+    """Register the function that deletes an owner's files, until ``unregister``."""
     _removals[owner] = remove
 
 
-def forget(owner: object) -> None:
+def unregister(owner: object) -> None:
     """Unregister the function of an owner, who has deleted the files."""
     _removals.pop(owner, None)
 
 
-def remove() -> None:
+def remove_all() -> None:
     """Delete the files of all registered owners."""
     for removal in list(_removals.values()):
         with suppress(OSError):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Self
 
 
-class Closing(ABC):
+class Closable(ABC):
     """Base class of context managers that call ``close`` at the end of their block."""
 
     @abstractmethod
@@ -25,7 +25,7 @@ class Closing(ABC):
 
 
 @contextmanager
-def without_collections() -> Iterator[None]:
+def garbage_collection_off() -> Iterator[None]:
     """Pause the garbage collection of cycles.
 
     Imports make many objects and leave no cycles behind.

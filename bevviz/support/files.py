@@ -42,7 +42,7 @@ PAUSE = 0.1  # longest pause between two attempts, in seconds
 
 
 @dataclass(frozen=True, slots=True)
-class Unfinished:
+class UnfinishedFile:
     """A file that is being written, under a temporary name beside its target.
 
     Attributes:
@@ -101,13 +101,13 @@ def is_locked(path: Path) -> bool:
     return False
 
 
-def create(path: Path) -> int:
+def create_file(path: Path) -> int:
     """Create a file for writing and return its descriptor. Fail if the name exists, even as a link."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 @contextmanager
-def written(target: Path, what: str) -> Iterator[Unfinished]:
+def atomic_write(target: Path, what: str) -> Iterator[UnfinishedFile]:
     """Yield an unfinished file beside ``target``, locked for this process. At the end it replaces ``target``.
 
     An interrupt also replaces ``target``. After an error or a kill, the data stays in the unfinished file,
@@ -124,8 +124,8 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
     resolved = target.resolve()
     if resolved.suffix != target.suffix:
         raise UserError(f"{target}: cannot write the {what}: it is a link to {resolved}")
-    with cleanup.unfinished():
-        unfinished = claim(resolved, what)
+    with cleanup.must_finish():
+        unfinished = claim_target(resolved, what)
         path, handle = unfinished.path, unfinished.handle
         try:
             try:
@@ -144,7 +144,7 @@ def written(target: Path, what: str) -> Iterator[Unfinished]:
             os.close(handle)  # This also releases the lock.
 
 
-def save(target: Path, text: str, option: str) -> None:
+def save_text(target: Path, text: str, option: str) -> None:
     """Write a text file atomically. Write directly into a pipe or a file in /dev (stdout).
 
     Args:
@@ -159,7 +159,7 @@ def save(target: Path, text: str, option: str) -> None:
         if target.absolute().is_relative_to("/dev") or (target.exists() and not target.is_file()):
             target.write_text(text, encoding="utf-8", newline="")
             return
-        with written(target, "file") as file:
+        with atomic_write(target, "file") as file:
             try:
                 file.path.write_text(text, encoding="utf-8", newline="")
             except OSError:
@@ -171,7 +171,7 @@ def save(target: Path, text: str, option: str) -> None:
         raise UserError(f"{option} {error}") from None
 
 
-def claim(target: Path, what: str) -> Unfinished:
+def claim_target(target: Path, what: str) -> UnfinishedFile:
     """Create an unfinished file for a target that no other process is writing.
 
     The name is new: no existing file or link is opened. The process takes its lock before it looks for locks
@@ -188,20 +188,20 @@ def claim(target: Path, what: str) -> Unfinished:
             break
         path = target.with_name(f"{target.stem}.partial-{secrets.token_hex(4)}{target.suffix}")
         try:
-            handle = create(path)
+            handle = create_file(path)
         except OSError as error:
             raise UserError(f"{target}: cannot write the {what}: {error.strerror}") from None
         with suppress(UserError):
-            lock(handle, taken)
+            lock_file(handle, taken)
             others = tuple(other for other in unfinished_files(target) if other != path)
             if not any(is_locked(other) for other in others):
-                return Unfinished(path, handle, others)
-        Unfinished(path, handle).discard()
+                return UnfinishedFile(path, handle, others)
+        UnfinishedFile(path, handle).discard()
         time.sleep(random.uniform(0, PAUSE))
     raise UserError(taken)
 
 
-def lock(handle: int, taken: str) -> None:
+def lock_file(handle: int, taken: str) -> None:
     """Lock a file for this process until its handle is closed.
 
     Raises:
@@ -249,7 +249,7 @@ def write_all(file: int, data: bytes | memoryview) -> None:
             done += os.write(file, rest[done:])
 
 
-def full_disk(error: BaseException) -> UserError | None:
+def full_disk_error(error: BaseException) -> UserError | None:
     """Return an error that names the folder whose disk is full, or None if the error has another reason.
 
     An error without a file name comes from a temporary file, which has no name.
@@ -268,12 +268,12 @@ def full_disk(error: BaseException) -> UserError | None:
 
 
 @contextmanager
-def on_disk() -> Iterator[None]:
+def catch_full_disk() -> Iterator[None]:
     """Raise UserError if a full disk ends the block."""
     try:
         yield
     except OSError as error:
-        full = full_disk(error)
+        full = full_disk_error(error)
         if full is None:
             raise
         raise full from error
@@ -446,7 +446,7 @@ def sampled_files(folder: Path) -> tuple[int, list[Path]]:
     return count, [file for file in chosen if file.is_file()]
 
 
-class Scratch:
+class ScratchFolder:
     """A temporary folder, made on first use. Making it deletes folders that killed processes have left."""
 
     PREFIX = "bevviz-scratch-"
@@ -465,13 +465,13 @@ class Scratch:
             if self._folder is None:
                 self._sweep()
                 self._folder = Path(tempfile.mkdtemp(prefix=self.PREFIX))
-                cleanup.remember(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
+                cleanup.register(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
                 self._lock = os.open(self._folder, os.O_RDONLY | os.O_CLOEXEC)
                 with suppress(OSError):
                     fcntl.flock(self._lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             return Path(tempfile.mkdtemp(dir=self._folder))
         except OSError as error:
-            if (full := full_disk(error)) is not None:
+            if (full := full_disk_error(error)) is not None:
                 raise full from None
             where = tempfile.gettempdir()
             raise UserError(
@@ -484,7 +484,7 @@ class Scratch:
             shutil.rmtree(self._folder, ignore_errors=True)
             os.close(self._lock)
             self._folder = None
-            cleanup.forget(self)
+            cleanup.unregister(self)
 
     def _sweep(self) -> None:
         """Delete this user's temporary folders without a lock. A lock ends with its process."""

@@ -20,11 +20,11 @@ def render(template: str, **values: object) -> str:
         template: file name of the template.
         values: values that the template names. None of them may be missing.
     """
-    return environment().get_template(template).render(values)
+    return template_environment().get_template(template).render(values)
 
 
 @lru_cache(maxsize=1)
-def environment() -> Environment:
+def template_environment() -> Environment:
     """Return the environment of the templates, with the filters for values."""
     templates = Environment(
         loader=PackageLoader("bevviz"),

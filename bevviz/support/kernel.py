@@ -79,7 +79,7 @@ event.register("numba:compiler_lock", _compile_timer)
 event.register("numba:compile", _CompileAnnouncer())
 
 
-def clock() -> float:
+def thread_clock() -> float:
     """Return seconds, as ``time.perf_counter``, without the time in which this thread compiled."""
     return time.perf_counter() - _compile_timer.here
 

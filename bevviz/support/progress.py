@@ -11,7 +11,7 @@ _say: Callable[[str], None] | None = None
 _bars = True
 
 
-def to(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
+def set_receiver(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
     """Set the receiver of messages.
 
     Args:
@@ -22,7 +22,7 @@ def to(say: Callable[[str], None] | None, *, bars: bool = True) -> None:
     _say, _bars = say, bars
 
 
-def heard() -> bool:
+def has_receiver() -> bool:
     """Return whether messages have a receiver."""
     return _say is not None
 

@@ -29,7 +29,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return a stated value as Python writes it, without the middle of a long one.
 
     >>> shown("a" * 1000)[:8]

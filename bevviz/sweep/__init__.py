@@ -1,6 +1,6 @@
 """Parameter sweeps, and tuning on one frame. Imports `evaluate` and below."""
 
 from bevviz.sweep.parameters import Parameter, combine, parse
-from bevviz.sweep.run import Outcome, Sweep
+from bevviz.sweep.run import Sweep, SweepOutcome
 
-__all__ = ["Outcome", "Parameter", "Sweep", "combine", "parse"]
+__all__ = ["Parameter", "Sweep", "SweepOutcome", "combine", "parse"]

@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.model.colors import SERIES, Color, State
+from bevviz.model.colors import SERIES_COLORS, Color, StateColor
 from bevviz.model.frame import F64, U8
 from bevviz.recording.primitives import png
 
@@ -20,7 +20,7 @@ Log = Callable[..., None]  # name of the entity below the chart, archetypes
 
 WIDTH, HEIGHT = 640.0, 420.0  # size of the area inside the axes, in units of the view
 _LEFT, _RIGHT, _TOP, _BOTTOM = 70.0, 190.0, 120.0, 60.0  # room beside the axes
-_MARKS = (State.GOOD.value, State.DOUBTFUL.value)
+_MARKS = (StateColor.GOOD.value, StateColor.DOUBTFUL.value)
 _AXIS, _GRID, _TEXT = (150, 155, 165), (48, 50, 58), (200, 204, 212)
 _LINE = 46.0  # least distance of names, so that they do not overlap
 _TICKS = 5  # ticks on the upright axis, about
@@ -48,7 +48,7 @@ def log_chart(
         marks: word -> position of an upright line, such as that of the best value; at most two.
     """
     known = np.concatenate([curve[np.isfinite(curve)] for curve in curves.values()])
-    low, high, step = scale(float(known.min(initial=0.0)), float(known.max(initial=0.0)))
+    low, high, step = axis_scale(float(known.min(initial=0.0)), float(known.max(initial=0.0)))
     span = float(places[-1] - places[0]) or 1.0
 
     def x(at: F64 | float) -> F64:
@@ -72,7 +72,7 @@ def log_chart(
     _log_words(log, "values", [(x(places[i]), HEIGHT + 2) for i in shown], [values[i] for i in shown])
     _log_words(log, "numbers", [(-26, y(tick) - 14) for tick in ticks], [f"{tick:.6g}" for tick in ticks])
     ends = []
-    for (metric, curve), color in zip(curves.items(), SERIES, strict=False):
+    for (metric, curve), color in zip(curves.items(), SERIES_COLORS, strict=False):
         finite = np.isfinite(curve)
         if not finite.any():
             continue
@@ -191,7 +191,7 @@ def _log_names(log: Log, ends: Sequence[tuple[str, Color, float]]) -> None:
         _log_words(log, f"{metric.replace(' ', '_')}/name", [(WIDTH + 90, below)], [metric], color)
 
 
-def scale(low: float, high: float) -> tuple[float, float, float]:
+def axis_scale(low: float, high: float) -> tuple[float, float, float]:
     """Return start, end and step of an axis. It starts at 0 if that wastes at most about half of it."""
     low = 0.0 if low >= 0 and low < 0.6 * high else low
     if high - low < 1e-300:  # The logarithm of zero is undefined.

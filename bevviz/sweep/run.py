@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.evaluate import Score, Truth
+from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model import counts
-from bevviz.model.counts import counts_of
+from bevviz.model.counts import count_results
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.variants import Variants
 from bevviz.support import table
-from bevviz.support.files import save
+from bevviz.support.files import save_text
 from bevviz.support.text import printable
 from bevviz.sweep.parameters import Parameter, Values
 
@@ -33,7 +33,7 @@ SCORES = ("precision", "recall", "F1", "error m")
 
 
 @dataclass
-class Outcome:
+class SweepOutcome:
     """Counts, times and scores of one combination of values, over all frames."""
 
     frames: int = 0
@@ -41,13 +41,13 @@ class Outcome:
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by stage and frame
     failures: int = 0
     judged: int = 0  # frames with ground truth
-    score: Score = field(default_factory=Score)
+    score: ObjectScore = field(default_factory=ObjectScore)
 
     def add(self, result: FrameResult, truth: Truth | None) -> None:
         """Add the result of one frame."""
         self.frames += 1
         self.failures += len(result.failures)
-        self.counts.update(counts_of(result))
+        self.counts.update(count_results(result))
         self.counts["objects"] += 0 if result.objects is None else len(result.objects)
         for stage in STAGES:
             self.seconds[stage].append(result.timings.get(stage, 0.0))
@@ -96,7 +96,7 @@ class Sweep:
         truth: Callable[[Frame], Truth | None] | None = None,
     ) -> None:
         self.parameters, self.configs = parameters, configs
-        self.outcomes = {values: Outcome() for values in configs}
+        self.outcomes = {values: SweepOutcome() for values in configs}
         self.truth = truth
         self._variants = Variants()
         for config in configs.values():
@@ -201,7 +201,7 @@ class Sweep:
             by_class = [class_counts.get(name, Counter())[kind] for name in classes for kind in kinds]
             rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
             writer.writerow([*values, outcome.frames, *rounded, *by_class])
-        save(path, file.getvalue(), "--csv")
+        save_text(path, file.getvalue(), "--csv")
 
 
 def _number(name: str, value: float) -> str:

@@ -14,17 +14,17 @@ import rerun as rr
 from bevviz.compare.differences import DIFFERENT, Change, FrameDifferences, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config, ParameterChange, changes
-from bevviz.config.reloading import Settings
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.model.frame import Frame, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.variants import Variants, check_same_frames
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.primitives import document
-from bevviz.support.files import save
+from bevviz.support.files import save_text
 from bevviz.support.text import markdown, printable
 
 ABOUT = "A is the version before, B the one that is shown."
@@ -32,7 +32,7 @@ LOOK = 0.01  # seconds between two looks at the file
 
 
 @dataclass(frozen=True, slots=True)
-class Save:
+class ConfigSave:
     """One saved state of the configuration file."""
 
     config: Config
@@ -45,7 +45,7 @@ class Version:
     """The result of one saved state for the frame."""
 
     number: int
-    save: Save
+    save: ConfigSave
     result: FrameResult
     found: FrameDifferences  # from the version before
 
@@ -63,7 +63,7 @@ class Version:
         return printable("; ".join([f"version {self.number}: {changed or 'as it is'}: {objects}", *failed]))
 
 
-class Saves:
+class ConfigSaves:
     """Iterable over the states of a configuration file: the present one, then each saved one, until ``stop``.
 
     Args:
@@ -78,7 +78,7 @@ class Saves:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: ReloadableConfig,
         scene: Scene,
         check: Callable[[Config], None],
         tell: Callable[[UserError], None],
@@ -93,8 +93,8 @@ class Saves:
         """End the iteration, from any thread."""
         self._stopped.set()
 
-    def __iter__(self) -> Iterator[Save]:
-        yield Save(self._first, {}, time.time())
+    def __iter__(self) -> Iterator[ConfigSave]:
+        yield ConfigSave(self._first, {}, time.time())
         while not self._stopped.wait(LOOK):
             try:
                 save = self._look()
@@ -104,7 +104,7 @@ class Saves:
             if save is not None:
                 yield save
 
-    def _look(self) -> Save | None:
+    def _look(self) -> ConfigSave | None:
         """Return the new state once the file was saved and no longer changes, else None."""
         if self._settings.changed():  # Editors may write in several steps.
             self._pending = True
@@ -126,10 +126,10 @@ class Saves:
             return None
         self._check(config)
         self._last = config
-        return Save(config, changed, stat.st_mtime)
+        return ConfigSave(config, changed, stat.st_mtime)
 
 
-class OneFrame:
+class FrameTuner:
     """A frame that was decoded once, and its version for each state of the file."""
 
     def __init__(self, frame: Frame) -> None:
@@ -141,7 +141,7 @@ class OneFrame:
         """Raise a UserError if the configuration cannot be run."""
         self._variants.check(config)
 
-    def perceive(self, save: Save, network: Executor | None = None) -> Version:
+    def perceive(self, save: ConfigSave, network: Executor | None = None) -> Version:
         """Run the frame with a saved state. Compare it with the version before."""
         result = self._variants.perceive(self._frame, save.config, network)
         current, last = seen(result), self._last
@@ -152,7 +152,7 @@ class OneFrame:
 
     def finish(self, version: Version) -> Version:
         """Add the explanations to the result of a version."""
-        return replace(version, result=describe(version.result))
+        return replace(version, result=add_explanations(version.result))
 
 
 class VersionRecorder(Observer[Version]):
@@ -172,7 +172,7 @@ class VersionRecorder(Observer[Version]):
     def begin(self, items: Items[object]) -> None:
         """Log the static entities."""
         self._scene = items.scene
-        self._logger = Logger(self._recording, self._config, items.scene)
+        self._logger = FrameLogger(self._recording, self._config, items.scene)
         self._differences = DifferenceLogger(self._recording, ("version before", "this version"), ABOUT)
         self._logger.log_static()
 
@@ -194,7 +194,7 @@ class VersionRecorder(Observer[Version]):
         self._tell(version, time.time() - save.time)
 
 
-def create(file: Path, text: str) -> bool:
+def create_config_file(file: Path, text: str) -> bool:
     """Write the configuration file if it does not exist. Return whether it was written.
 
     Raises:
@@ -202,5 +202,5 @@ def create(file: Path, text: str) -> bool:
     """
     if file.exists():
         return False
-    save(file, text, "--config")
+    save_text(file, text, "--config")
     return True

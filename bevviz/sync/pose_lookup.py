@@ -224,7 +224,7 @@ def _make_upright(
     return replace(
         boxes,
         frame_id=reference.points_frame,
-        boxes=geometry.upright(box_poses[:, :3, 3], kept.size, box_poses[:, :3, :3]),
+        boxes=geometry.upright_boxes(box_poses[:, :3, 3], kept.size, box_poses[:, :3, :3]),
         labels=tuple(boxes.labels[row] for row in rows),
         scores=boxes.scores[rows],
         ids=tuple(boxes.ids[row] for row in rows) if boxes.ids else (),

@@ -14,7 +14,7 @@ from bevviz.messages.roles import Roles
 from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.transform_tree import TransformBuffer
-from bevviz.sync.unusable_messages import Damage
+from bevviz.sync.unusable_messages import UnusableMessages
 
 
 @dataclass(slots=True)
@@ -68,8 +68,8 @@ class SyncReport:
     undecodable: Counter[str] = field(default_factory=Counter)
     first_undecodable: dict[str, str] = field(default_factory=dict)
     untold: Counter[tuple[str, str]] = field(default_factory=Counter)
-    damage: Damage = field(default_factory=Damage)
-    boxes: Damage = field(default_factory=partial(Damage, "box(es)"))
+    damage: UnusableMessages = field(default_factory=UnusableMessages)
+    boxes: UnusableMessages = field(default_factory=partial(UnusableMessages, "box(es)"))
     problems: Counter[str] = field(default_factory=Counter)
     tf: TransformBuffer = field(default_factory=TransformBuffer)
     upright: Mapping[str, str] = field(default_factory=dict)
@@ -158,7 +158,7 @@ def _describe_delay(seconds: float) -> str:
     return f"at worst {seconds:.2f} s after the stamp"
 
 
-def blindness(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
+def why_no_images(config: Config, roles: Roles, report: SyncReport | None) -> list[str]:
     """Return why the detector's model got no image, as one sentence in a list; empty if it got one.
 
     Args:

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from bevviz.model.frame import F64, Around, Motion, Shape, Status
+from bevviz.model.frame import F64, ComponentStatus, ImuSamples, PlacedShape, RobotContext
 
 _Sample: TypeAlias = tuple[int, int, Sequence[float], Sequence[float]]
 
@@ -18,7 +18,7 @@ SAMPLES = 5000  # most Imu samples between two frames; the oldest is dropped
 MARKS = 100  # most marks between two frames
 
 
-class Surroundings:
+class SurroundingsBuffer:
     """Buffer of marks, statuses, shapes and Imu samples.
 
     A mark or a sample belongs to the next frame only. Statuses and shapes hold until newer ones come.
@@ -26,8 +26,8 @@ class Surroundings:
 
     def __init__(self) -> None:
         self._marks: list[str] = []
-        self._statuses: dict[str, Status] = {}  # by name
-        self._shapes: dict[str, list[Shape]] = {}  # by topic
+        self._statuses: dict[str, ComponentStatus] = {}  # by name
+        self._shapes: dict[str, list[PlacedShape]] = {}  # by topic
         self._samples: dict[str, deque[_Sample]] = {}  # by topic
 
     def add_mark(self, text: str) -> None:
@@ -42,7 +42,7 @@ class Surroundings:
         samples = self._samples.setdefault(topic, deque(maxlen=SAMPLES))
         samples.append((stamp, received, rotation, acceleration))
 
-    def add_statuses(self, statuses: Sequence[Status]) -> None:
+    def add_statuses(self, statuses: Sequence[ComponentStatus]) -> None:
         """Add statuses. Each replaces the status of the same name."""
         for status in statuses:
             self._statuses.pop(status.name, None)
@@ -50,11 +50,11 @@ class Surroundings:
         while len(self._statuses) > MANY:
             del self._statuses[next(iter(self._statuses))]
 
-    def add_shapes(self, topic: str, shapes: list[Shape]) -> None:
+    def add_shapes(self, topic: str, shapes: list[PlacedShape]) -> None:
         """Replace the shapes of a topic."""
         self._shapes[topic] = shapes[-MANY:]
 
-    def take(self, pose_of: Callable[[str], F64 | None]) -> Around | None:
+    def take(self, pose_of: Callable[[str], F64 | None]) -> RobotContext | None:
         """Return the surroundings for a frame; None if there are none.
 
         Args:
@@ -64,7 +64,7 @@ class Surroundings:
             return None
         shapes = [shape for topic_shapes in self._shapes.values() for shape in topic_shapes]
         poses = {frame: pose_of(frame) for frame in dict.fromkeys(shape.frame_id for shape in shapes)}
-        around = Around(
+        around = RobotContext(
             marks=tuple(self._marks),
             statuses=tuple(self._statuses.values()),
             shapes=tuple(replace(shape, world_from_shape=poses[shape.frame_id]) for shape in shapes),
@@ -74,7 +74,7 @@ class Surroundings:
         return around
 
 
-def _motion(topic: str, samples: Iterable[_Sample]) -> Motion:
+def _motion(topic: str, samples: Iterable[_Sample]) -> ImuSamples:
     stamp, received, rotation, acceleration = zip(*samples, strict=True)
     times = np.array(stamp, np.int64), np.array(received, np.int64)
-    return Motion(topic, *times, np.array(rotation, np.float64), np.array(acceleration, np.float64))
+    return ImuSamples(topic, *times, np.array(rotation, np.float64), np.array(acceleration, np.float64))

@@ -28,14 +28,14 @@ from bevviz.model.frame import (
     Intrinsics,
     LabelledBoxes2D,
     LabelledBoxes3D,
-    LateResult,
+    LateBoxes,
 )
 from bevviz.sync.cameras import Cameras
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.gravity import VerticalEstimate
 from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
-from bevviz.sync.surroundings import Surroundings
+from bevviz.sync.surroundings import SurroundingsBuffer
 from bevviz.sync.topic_buffer import JUMP, TopicBuffer, describe_distance
 from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
@@ -89,7 +89,7 @@ class Synchronizer:
         self.tf = self.report.tf
         self.upright = VerticalEstimate(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
-        self.around = Surroundings()
+        self.around = SurroundingsBuffer()
         self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
         self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
@@ -115,7 +115,7 @@ class Synchronizer:
             *filter(None, [roles.truth])
         )
         self._beside = frozenset(beside)
-        self._overtaken: deque[LateResult] = deque(maxlen=OVERTAKEN)
+        self._overtaken: deque[LateBoxes] = deque(maxlen=OVERTAKEN)
         # Reference frames and poses of the last frames.
         self._past_references: deque[tuple[ReferenceFrames, F64]] = deque(maxlen=OVERTAKEN)
         self.placing = PoseLookup(
@@ -271,9 +271,9 @@ class Synchronizer:
         elif not result.camera:
             names = {self.cameras.frames.get(role.topic): role.name for role in self._roles.cameras}
             result = replace(result, camera=names.get(result.frame_id, ""))
-        self._overtaken.append(LateResult(result, reference.stamp, pose))
+        self._overtaken.append(LateBoxes(result, reference.stamp, pose))
 
-    def overtaken(self) -> tuple[LateResult, ...]:
+    def overtaken(self) -> tuple[LateBoxes, ...]:
         """Return the robot's results that no frame has taken since the last call."""
         results = tuple(self._overtaken)
         self._overtaken.clear()

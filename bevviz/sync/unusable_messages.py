@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 
-class Damage:
+class UnusableMessages:
     """Counts of unusable messages by topic, with the reason for the first one.
 
     Args:
@@ -28,7 +28,7 @@ class Damage:
         self._first.setdefault(topic, reason)
         return self._counts[topic]
 
-    def extend(self, other: Damage) -> None:
+    def extend(self, other: UnusableMessages) -> None:
         """Add the counts of another one."""
         self._counts += other._counts
         self._first = {**other._first, **self._first}

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from bevviz.drivers.bitstream import Continuity
-from bevviz.drivers.video import Packet
+from bevviz.drivers.video import VideoPacket
 from bevviz.errors import first_line
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.images import MOST_PIXELS
-from bevviz.model.frame import U8, Clip, Codec, Image
+from bevviz.model.frame import U8, Codec, Image, VideoClip
 
 if TYPE_CHECKING:
     import av
     from av.video.codeccontext import VideoCodecContext
 
-Rewind = Callable[[str, int], Iterable[Packet]]
+Rewind = Callable[[str, int], Iterable[VideoPacket]]
 
 SHOWN = ("h264", "h265", "av1", "vp8", "vp9")  # codecs that Rerun shows
 HELD = 5_000_000_000  # nanoseconds after the receipt of a packet in which its image may be requested
@@ -59,7 +59,7 @@ class Video:
 
     def __init__(self, topic: str, rewind: Rewind | None = None) -> None:
         self.topic, self._rewind = topic, rewind
-        self._packets: list[Packet] = []
+        self._packets: list[VideoPacket] = []
         self._size = 0  # bytes of the packets
         self._keyless = -1  # no key frame before this time of receipt
         self._headers: dict[bytes, None] = {}  # header packets of Theora
@@ -70,7 +70,7 @@ class Video:
         self._stamp = 0  # stamp of the last packet
         self._steps: deque[int] = deque(maxlen=STEPS)  # nanoseconds between packets
 
-    def add(self, packet: Packet) -> bool:
+    def add(self, packet: VideoPacket) -> bool:
         """Add a packet.
 
         Returns:
@@ -140,12 +140,12 @@ class Video:
             clip=clip,
         )
 
-    def _clip(self, key: int, row: int) -> Clip:
+    def _clip(self, key: int, row: int) -> VideoClip:
         before = [earlier for earlier in range(key) if self._packets[earlier].is_key]
         first = before[-1] if before else key
         packets = self._packets[first : row + 1]
         codec, places = cast("Codec", packets[0].codec), tuple(packet.place for packet in packets)
-        return Clip(codec, places, tuple(packet.data for packet in packets), key - first)
+        return VideoClip(codec, places, tuple(packet.data for packet in packets), key - first)
 
     def _find(self, place: tuple[int, int]) -> tuple[int, int]:
         """Return the rows of the packet and of the key frame before it.
@@ -220,7 +220,7 @@ class _Decoder:
         """Whether a picture may depend on later packets."""
         return bool(self._context.has_b_frames)
 
-    def put(self, packet: Packet) -> None:
+    def put(self, packet: VideoPacket) -> None:
         """Decode a packet."""
         import av
 
@@ -235,7 +235,7 @@ class _Decoder:
         self._places.append(packet.place)
         self._take(av_packet)
 
-    def _missing(self, packet: Packet) -> int:
+    def _missing(self, packet: VideoPacket) -> int:
         """Return the number of packets that are missing before a packet."""
         if self._continuity is not None:
             return self._continuity.missing(packet.data)

@@ -28,7 +28,7 @@ from bevviz.model.frame import (
 )
 from bevviz.synthetic import faults
 from bevviz.synthetic.mesh import Material
-from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, Scan, View, optical
+from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, RaycastView, Scan, optical
 from bevviz.synthetic.world import World, bounds
 
 LIDAR_TOPIC = "/rslidar_points"
@@ -200,12 +200,14 @@ class SyntheticSource:
         at_scan, at_image = ((t - START) * 1e-9 for t in (stamp, exposure))
 
         moving = self.world.moving(at_scan, map_from_lidar[:3, 3], self._lidar.reach)
-        scan = self._lidar.scan(View(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng)
+        scan = self._lidar.scan(
+            RaycastView(self._static(self.world.section(at_scan)), moving), map_from_lidar, rng
+        )
         ahead = (
             map_from_lens[:3, 3] + 50.0 * map_from_lens[:3, 2]
         )  # objects far behind cast no shadow into the image
         scenery = self._static(self.world.section(at_image))
-        seen = View(scenery, self.world.moving(at_image, ahead, 70.0))
+        seen = RaycastView(scenery, self.world.moving(at_image, ahead, 70.0))
         picture = self._camera.picture(seen, map_from_lens, self.world.light, rng)
 
         fields: dict[str, NDArray[Any]] = {"intensity": scan.intensity, "ring": scan.ring, "time": scan.time}

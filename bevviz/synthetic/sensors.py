@@ -67,7 +67,7 @@ class RayHits:
     object: I32  # (H,)
 
 
-class View:
+class RaycastView:
     """Scenery and moving objects at one time. Only the caster of the small mesh is rebuilt."""
 
     def __init__(self, static: Caster, moving: Mesh) -> None:
@@ -158,7 +158,7 @@ class Lidar:
         ]
         object.__setattr__(self, "_directions", np.stack(unit, -1).reshape(-1, 3).astype(np.float32))
 
-    def scan(self, view: View, map_from_lidar: F64, rng: np.random.Generator) -> Scan:
+    def scan(self, view: RaycastView, map_from_lidar: F64, rng: np.random.Generator) -> Scan:
         """Scan the view from this pose."""
         rays = _rays(map_from_lidar, self._directions)
         hits = view.cast(rays, self.reach)
@@ -220,7 +220,7 @@ class PinholeCamera:
         )
 
     def picture(
-        self, view: View, map_from_camera: F64, light: Light, rng: np.random.Generator
+        self, view: RaycastView, map_from_camera: F64, light: Light, rng: np.random.Generator
     ) -> CameraPicture:
         """Render the view from this pose."""
         import cv2

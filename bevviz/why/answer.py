@@ -15,8 +15,8 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.chain import Step, steps_of
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
-from bevviz.why.frame_index import Traces
-from bevviz.why.hints import Hint, HintFinder, Search
+from bevviz.why.frame_index import FrameIndex
+from bevviz.why.hints import Hint, HintFinder, HintSearch
 from bevviz.why.selection import select_subjects, subjects_at_place
 from bevviz.why.sentences import verdict_of
 from bevviz.why.subject import Selection, Subject
@@ -104,7 +104,7 @@ def _hint_dict(hint: Hint) -> Mapping[str, Any]:
     }
 
 
-class Questioner:
+class FrameExplainer:
     """Explainer of one frame. All answers share the index of its results.
 
     Args:
@@ -116,7 +116,7 @@ class Questioner:
     def __init__(
         self, result: FrameResult, loader: StageLoader | None = None, classes: Sequence[str] = ()
     ) -> None:
-        self.traces = Traces(result, classes)
+        self.traces = FrameIndex(result, classes)
         self._hint_finder = HintFinder(self.traces, loader)
         self._answers: dict[tuple[object, ...], Answer] = {}
 
@@ -187,7 +187,7 @@ class Questioner:
         ]
         return sorted(answers, key=_sort_distance)
 
-    def search(self, answer: Answer) -> Search:
+    def search(self, answer: Answer) -> HintSearch:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
         return self._hint_finder.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
@@ -230,11 +230,11 @@ def why(
     *,
     everything: bool = False,
 ) -> list[Answer]:
-    """Answer one question about a result; see ``Questioner.explain``."""
-    return Questioner(result, loader, classes).explain(selection, hints, everything=everything)
+    """Answer one question about a result; see ``FrameExplainer.explain``."""
+    return FrameExplainer(result, loader, classes).explain(selection, hints, everything=everything)
 
 
-def _no_help_text(search: Search) -> str:
+def _no_help_text(search: HintSearch) -> str:
     """Say that no change helps, and how far the best one brings the subject."""
     count = "the change" if search.tried == 1 else f"none of the {search.tried} changes"
     helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"

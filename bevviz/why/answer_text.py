@@ -13,7 +13,7 @@ from bevviz.why.verdict import HOPELESS, Reason
 LISTED = 5  # other subjects at the place, at most
 
 
-def plain(answers: Sequence[Answer], chains: int, beside: Sequence[Answer] = ()) -> str:
+def plain_text(answers: Sequence[Answer], chains: int, beside: Sequence[Answer] = ()) -> str:
     """Return the verdicts with steps for the first ``chains``, then the other subjects there."""
     return "\n".join(map(printable, [*_plain(answers, chains), *_listed(beside)])).rstrip("\n")
 
@@ -40,7 +40,7 @@ def _listed(others: Sequence[Answer]) -> Iterator[str]:
         yield f"- and {len(others) - LISTED} more"
 
 
-def summary(answers: Sequence[Answer]) -> str:
+def summary_line(answers: Sequence[Answer]) -> str:
     """Return one line about a frame. It needs the answers about all objects, reported ones included."""
     things = [answer for answer in answers if not answer.weak]
     reported = [answer for answer in things if answer.verdict.reported]

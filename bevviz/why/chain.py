@@ -10,10 +10,10 @@ import numpy as np
 
 from bevviz.model.results import Decision, DetectionState, Opinion
 from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
-from bevviz.why.frame_index import Traces
+from bevviz.why.frame_index import FrameIndex
 from bevviz.why.outcome import find_fused, in_box_of, opinion_on
 from bevviz.why.sentences import label, not_run, state_text
-from bevviz.why.subject import Subject, projected
+from bevviz.why.subject import Subject, projected_box
 from bevviz.why.verdict import detector_ran, name_of
 
 _SHOWN = 5  # clusters or candidates listed in a step, at most
@@ -28,7 +28,7 @@ class Step:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
 
-def steps_of(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def steps_of(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the step of each stage that was run."""
     result, config = traces.result, traces.result.config
     for failure in result.failures:
@@ -69,7 +69,7 @@ def steps_of(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[S
     yield from _object_steps(subject, evidence, traces)
 
 
-def _camera_steps(subject: Subject, traces: Traces) -> Iterator[Step]:
+def _camera_steps(subject: Subject, traces: FrameIndex) -> Iterator[Step]:
     """Yield the time and position of each camera relative to the cloud."""
     for camera in (result.camera for result in traces.result.cameras):
         if subject.camera and camera.name != subject.camera:
@@ -88,14 +88,14 @@ def _camera_steps(subject: Subject, traces: Traces) -> Iterator[Step]:
             "moved to the image's time" if camera.motion_compensated else "not moved to the image's time"
         )
         texts += camera.problems
-        box = projected(subject.box, camera) if subject.box is not None else None
+        box = projected_box(subject.box, camera) if subject.box is not None else None
         if box is not None:
             u, v = (box[:2] + box[2:]) / 2
             texts.append(f"expected at pixel {u:.0f}, {v:.0f}")
         yield Step(f"camera {camera.name}", ", ".join(texts), numbers)
 
 
-def _ground_step(evidence: Evidence, traces: Traces) -> Step:
+def _ground_step(evidence: Evidence, traces: FrameIndex) -> Step:
     """Return the step of the ground removal."""
     known = evidence.ground[np.isfinite(evidence.ground)]
     text = f"{len(evidence.ground)} of {evidence.voxels} voxels removed as ground"
@@ -114,7 +114,7 @@ def _ground_step(evidence: Evidence, traces: Traces) -> Step:
     )
 
 
-def _clustering_step(evidence: Evidence, traces: Traces) -> Step:
+def _clustering_step(evidence: Evidence, traces: FrameIndex) -> Step:
     """Return the step of the clustering, with the largest clusters of the subject."""
     texts, rows = [], []
     clusters, owner = traces.result.clusters, traces.origin("clustering")
@@ -154,7 +154,7 @@ def _clustering_step(evidence: Evidence, traces: Traces) -> Step:
     return Step("clustering", "; ".join(texts) or "no obstacle point", numbers)
 
 
-def _merged_steps(evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def _merged_steps(evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the step about other objects in the cluster of the subject, if there are any."""
     if not np.isfinite(evidence.gap):
         return
@@ -174,13 +174,13 @@ def _merged_steps(evidence: Evidence, traces: Traces) -> Iterator[Step]:
     yield Step("merged", text, numbers)
 
 
-def _class_in_brackets(traces: Traces, cluster: int) -> str:
+def _class_in_brackets(traces: FrameIndex, cluster: int) -> str:
     """Return the class of a cluster's object in brackets, empty for none."""
     name = name_of(traces.result, cluster)
     return f" ({name})" if name else ""
 
 
-def _detector_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the steps of the detector and of the fusion for the best candidates."""
     result, config = traces.result, traces.result.config
     if not detector_ran(result, subject.camera):
@@ -220,7 +220,7 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Ite
         yield Step("detector", f"{more} weaker candidates more", {"more": more})
 
 
-def _pair_steps(candidate: Candidate, evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def _pair_steps(candidate: Candidate, evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the fusion's decision about a detection, and its pairs with the subject's clusters."""
     _, fusion = camera_and_fusion(traces.result, candidate.camera)
     assert fusion is not None
@@ -256,7 +256,7 @@ def _pair_steps(candidate: Candidate, evidence: Evidence, traces: Traces) -> Ite
         )
 
 
-def _object_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Iterator[Step]:
+def _object_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the steps of objects that do not come from our fusion."""
     owner, objects = traces.origin("objects"), traces.result.objects
     if owner.ours:
@@ -287,7 +287,7 @@ def _object_steps(subject: Subject, evidence: Evidence, traces: Traces) -> Itera
         )
 
 
-def _opinion_numbers(evidence: Evidence, traces: Traces) -> Mapping[str, Any]:
+def _opinion_numbers(evidence: Evidence, traces: FrameIndex) -> Mapping[str, Any]:
     """Return the numbers behind the cameras' opinion on an object, with their limits."""
     opinions, least = traces.result.opinions, traces.result.config.opinions
     assert opinions is not None and evidence.named is not None

@@ -9,11 +9,11 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import ClusterState, FrameResult
-from bevviz.stages.visibility import in_view
+from bevviz.stages.visibility import share_in_image
 from bevviz.support.kernel import kernel
 from bevviz.why.detection_candidates import find_candidates, sort_candidates
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence
-from bevviz.why.frame_index import FEW, PART, Fate, Traces
+from bevviz.why.frame_index import FEW, PART, Fate, FrameIndex
 from bevviz.why.merged import LOOKED_AT, find_mates, least_distance, separation
 from bevviz.why.outcome import find_reported_object
 from bevviz.why.subject import IN_VIEW, Subject
@@ -22,7 +22,7 @@ NEARER = 0.5  # metres by which a return must be nearer to hide the subject
 CORE = 0.8  # share of the directions of a box; an object does not fill the corners of its box
 
 
-def collect_evidence(subject: Subject, traces: Traces) -> Evidence:
+def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     """Collect the points, clusters and detections of the subject, stage by stage."""
     result = traces.result
     voxels, ground = result.voxels, result.ground
@@ -107,7 +107,7 @@ def _main_cluster(
     return next((part.cluster for part in parts if part.kept and part.points >= least), -1)
 
 
-def _returns_in_front(subject: Subject, traces: Traces) -> tuple[I64, int]:
+def _returns_in_front(subject: Subject, traces: FrameIndex) -> tuple[I64, int]:
     """Return the rows of the returns that end before the subject, and the number of returns in its direction.
 
     Directions start at the origin of the points. With one LiDAR, this is the LiDAR itself.
@@ -166,7 +166,7 @@ def _most_around(centers: F32, points: F32, eps2: float) -> int:
     return largest
 
 
-def _distance(subject: Subject, traces: Traces, points: I64, main: int) -> float:
+def _distance(subject: Subject, traces: FrameIndex, points: I64, main: int) -> float:
     """Return the horizontal distance of the subject in metres, NaN where unknown."""
     result = traces.result
     if subject.box is not None:
@@ -187,7 +187,7 @@ def _largest_gap(result: FrameResult, parts: Sequence[ClusterPart]) -> float:
     return least_distance(first, second)
 
 
-def _in_view(subject: Subject, traces: Traces) -> bool:
+def _in_view(subject: Subject, traces: FrameIndex) -> bool:
     """Return whether a camera has the subject in its image. True if no camera has a pose."""
     placed = [c.camera for c in traces.result.cameras if c.camera.intrinsics is not None]
     if all(camera.camera_from_points is None for camera in placed):
@@ -195,5 +195,5 @@ def _in_view(subject: Subject, traces: Traces) -> bool:
     if subject.kind == "truth":
         return bool((traces.shown[subject.row] >= IN_VIEW).any())
     if subject.box is not None:
-        return any(in_view(subject.box, camera)[0] >= IN_VIEW for camera in placed)
+        return any(share_in_image(subject.box, camera)[0] >= IN_VIEW for camera in placed)
     return True

@@ -10,13 +10,15 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, I64
 from bevviz.model.results import CameraResult, Decision, DetectionState, Fusion
 from bevviz.why.evidence import Candidate, ClusterPart
-from bevviz.why.frame_index import Traces
-from bevviz.why.subject import LINK, Subject, projected
+from bevviz.why.frame_index import FrameIndex
+from bevviz.why.subject import LINK, Subject, projected_box
 
 COVERED = 0.8  # share of a cluster's image box that a detection of it covers
 
 
-def find_candidates(subject: Subject, traces: Traces, parts: Sequence[ClusterPart]) -> tuple[Candidate, ...]:
+def find_candidates(
+    subject: Subject, traces: FrameIndex, parts: Sequence[ClusterPart]
+) -> tuple[Candidate, ...]:
     """Find the detections of the subject in all cameras."""
     candidates = []
     for camera in traces.result.cameras:
@@ -29,7 +31,7 @@ def find_candidates(subject: Subject, traces: Traces, parts: Sequence[ClusterPar
 
 
 def _rows_of_subject(
-    subject: Subject, traces: Traces, camera: CameraResult, parts: Sequence[ClusterPart]
+    subject: Subject, traces: FrameIndex, camera: CameraResult, parts: Sequence[ClusterPart]
 ) -> tuple[I64, F32]:
     """Return the rows of the subject's detections in a camera, and the (D,) overlap with all."""
     detections = camera.detections
@@ -40,7 +42,7 @@ def _rows_of_subject(
         overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
         return np.flatnonzero((np.array(detections.names) == subject.label) & (overlap > 0.99)), overlap
     if subject.kind == "truth":
-        box = projected(subject.box, camera.camera) if subject.box is not None else None
+        box = projected_box(subject.box, camera.camera) if subject.box is not None else None
         around = np.full((1, 4), np.nan, np.float32) if box is None else box[None]
         overlap = geometry.iou(around, detections.xyxy)[0]
         return np.flatnonzero(traces.owners(camera) == subject.row), overlap

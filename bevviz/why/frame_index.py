@@ -14,9 +14,9 @@ from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
 from bevviz.model.results import CameraResult, Decision, Detections, FrameResult
 from bevviz.stages.robot_results import in_points_frame
-from bevviz.stages.visibility import in_view
-from bevviz.why.stage_owner import StageOwner, origin
-from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, one_of, points_in_box, projected
+from bevviz.stages.visibility import share_in_image
+from bevviz.why.stage_owner import StageOwner, owner_of
+from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, points_in_box, projected_box, single_box
 
 SAME_CLASS = 1.3  # factor on the overlap of a detection with an object of its class
 FEW = 3  # fewer points than this count as none
@@ -47,7 +47,7 @@ class Directions:
     away: F32  # (N,) horizontal metres
 
 
-class Traces:
+class FrameIndex:
     """Index of one frame. Each array is computed at its first use.
 
     Args:
@@ -64,9 +64,9 @@ class Traces:
         self._owners: dict[str, tuple[Detections, I64]] = {}  # camera -> detections, their owners
         self._labels: dict[int, I32] = {}
 
-    def for_result(self, result: FrameResult) -> Traces:
+    def for_result(self, result: FrameResult) -> FrameIndex:
         """Return the index of another result of the same frame. Arrays of the frame alone are shared."""
-        other = Traces(result, self.classes)
+        other = FrameIndex(result, self.classes)
         other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
         other.truth, other.shown = self.truth, self.shown
         other.directions, other._by_x = self.directions, self._by_x
@@ -79,7 +79,7 @@ class Traces:
     @cached_property
     def _origins(self) -> dict[str, StageOwner]:
         sections = "ground", "clustering", "detector", "objects"
-        return {section: origin(self.result.config, section) for section in sections}
+        return {section: owner_of(self.result.config, section) for section in sections}
 
     # --- points --------------------------------------------------------------------------------
 
@@ -229,9 +229,9 @@ class Traces:
     def shown(self) -> F32:
         """(K, cameras) share of each object of the ground truth that is inside each camera's image."""
         share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
-        boxes = joined([subject.box for subject in self.truth if subject.box is not None])
+        boxes = joined_boxes([subject.box for subject in self.truth if subject.box is not None])
         for column, camera in enumerate(self.result.cameras):
-            share[:, column] = in_view(boxes, camera.camera)
+            share[:, column] = share_in_image(boxes, camera.camera)
         return share
 
     def labels(self, row: int) -> I32:
@@ -293,7 +293,7 @@ class Traces:
         seen = whole.copy()
         for i, row in enumerate(rows):
             box = self.truth[row].box
-            around = projected(box, camera.camera) if box is not None else None
+            around = projected_box(box, camera.camera) if box is not None else None
             if around is not None:
                 whole[i] = around
                 inside = self._in_image(self.uv(camera)[self.place(self.truth[row])], around)
@@ -346,7 +346,7 @@ def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, 
             label,
             accepted_names(label, classes),
             row,
-            box=one_of(boxes, row),
+            box=single_box(boxes, row),
         )
         for row, label in enumerate(stated.labels)
     )
@@ -357,7 +357,7 @@ def _same_boxes(a: Detections, b: Detections) -> bool:
     return a is b or (a.names == b.names and np.array_equal(a.xyxy, b.xyxy))
 
 
-def joined(boxes: Sequence[Boxes3D]) -> Boxes3D:
+def joined_boxes(boxes: Sequence[Boxes3D]) -> Boxes3D:
     """Return several lists of boxes as one list."""
     if not boxes:
         return Boxes3D.empty()

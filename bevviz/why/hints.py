@@ -16,11 +16,11 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Camera
 from bevviz.model.results import Detections, DetectionState, FrameResult
 from bevviz.pipeline.perceive import perceive
-from bevviz.pipeline.stage_loader import Detect, StageLoader
+from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Candidate, Evidence
-from bevviz.why.frame_index import Traces
+from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import FLAWED, Reason, find_reason
@@ -77,7 +77,7 @@ class Hint:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class HintSearch:
     """Result of the search for hints on one subject.
 
     Attributes:
@@ -103,12 +103,12 @@ class HintFinder:
         loader: stage loader with the networks already loaded.
     """
 
-    def __init__(self, traces: Traces, loader: StageLoader | None = None) -> None:
+    def __init__(self, traces: FrameIndex, loader: StageLoader | None = None) -> None:
         self._traces, self._result = traces, traces.result
         self._loader, self._memo = loader or StageLoader(), Memo()
-        self._runs: dict[tuple[tuple[str, Any], ...], Traces | None] = {}
+        self._runs: dict[tuple[tuple[str, Any], ...], FrameIndex | None] = {}
 
-    def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> Search:
+    def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> HintSearch:
         """Search the mildest change that changes the verdict and makes no other object worse.
 
         If each helpful change makes another object worse, return the one that does the least harm. If none
@@ -116,7 +116,7 @@ class HintFinder:
         there.
         """
         hints: list[Hint] = []
-        reached: dict[_ReachedStage, tuple[Change, Evidence, Traces]] = {}  # by the mildest change
+        reached: dict[_ReachedStage, tuple[Change, Evidence, FrameIndex]] = {}  # by the mildest change
         tried = 0
 
         def ways() -> Iterator[Change]:
@@ -143,16 +143,16 @@ class HintFinder:
             elif not text and (stage := _ReachedStage(now_reported, new)) > _ReachedStage(reported, reason):
                 reached.setdefault(stage, (change, then, after))
         if hints or not reached:
-            return Search(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tried)
+            return HintSearch(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tried)
         last = max(reached)
-        return Search((), tried, _settings(reached[last][0]), last.reason, last.reported)
+        return HintSearch((), tried, _settings(reached[last][0]), last.reason, last.reported)
 
-    def _run(self, change: Change) -> Traces | None:
+    def _run(self, change: Change) -> FrameIndex | None:
         """Run the frame with a change, once. None: the configuration cannot be run."""
         key = tuple(change.items())
         if key not in self._runs:
             try:
-                config = changed(self._result.config, change)
+                config = with_changes(self._result.config, change)
                 stages = self._loader.load(config, self._known_detections(config, change))
             except (UserError, ValidationError):  # the model file has gone, or the value is out of bounds
                 self._runs[key] = None
@@ -163,7 +163,7 @@ class HintFinder:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]
 
-    def _known_detections(self, config: Config, change: Change) -> Detect | None:
+    def _known_detections(self, config: Config, change: Change) -> DetectFunction | None:
         """Return a detector that applies another threshold to the known detections. None: run the network.
 
         The candidates kept for explanations do not tell the result of another NMS, nor that of other
@@ -187,7 +187,7 @@ class HintFinder:
         return detect
 
 
-def changed(config: Config, change: Change) -> Config:
+def with_changes(config: Config, change: Change) -> Config:
     """Return the configuration with other values."""
     tree = config.model_dump()
     for key, value in change.items():
@@ -204,7 +204,7 @@ def _new_outcome(
     old_verdict: tuple[Reason, bool],
     new_verdict: tuple[Reason, bool],
     evidence: Evidence,
-    after: Traces,
+    after: FrameIndex,
 ) -> tuple[str, int]:
     """Return the new result of the subject, empty if it is no better, and the row of its object."""
     (reason, reported), (new, now_reported), named = old_verdict, new_verdict, evidence.named
@@ -236,7 +236,9 @@ def _settings(change: Change) -> tuple[str, ...]:
     return tuple(f"{key}={_setting_text(value)}" for key, value in change.items())
 
 
-def _combined_changes(reached: Mapping[_ReachedStage, tuple[Change, Evidence, Traces]]) -> Iterator[Change]:
+def _combined_changes(
+    reached: Mapping[_ReachedStage, tuple[Change, Evidence, FrameIndex]],
+) -> Iterator[Change]:
     """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
     done: set[_ReachedStage] = set()
     while left := reached.keys() - done:
@@ -250,7 +252,7 @@ def _combined_changes(reached: Mapping[_ReachedStage, tuple[Change, Evidence, Tr
 # --- changes to try ----------------------------------------------------------------------------
 
 
-def _changes_for(evidence: Evidence, reason: Reason, traces: Traces) -> Iterator[Change]:
+def _changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Iterator[Change]:
     """Yield changes that may help: parameters of our stages, or of the user's function."""
     result = traces.result
     section = _SECTION.get(reason, "")
@@ -264,7 +266,7 @@ def _changes_for(evidence: Evidence, reason: Reason, traces: Traces) -> Iterator
             yield change
 
 
-def _has_effect(key: str, traces: Traces) -> bool:
+def _has_effect(key: str, traces: FrameIndex) -> bool:
     """Return whether a parameter has an effect. Ours have none on a stage that is not ours."""
     section, _, name = key.partition(".")
     if section not in ("ground", "clustering", "detector"):

@@ -9,25 +9,25 @@ import rerun as rr
 
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.colors import FATES
+from bevviz.model.colors import FATE_COLORS
 from bevviz.model.frame import F32, U8, Camera, Frame
 from bevviz.recording import entities
-from bevviz.recording.bev import footprints, seen_from_above
-from bevviz.recording.camera import over_image
+from bevviz.recording.bev import bev_pixels, ground_outlines
+from bevviz.recording.camera import image_frame
 from bevviz.recording.primitives import boxes2d, document, edges, transform
 from bevviz.recording.writer import Writer
 from bevviz.why.answer import Answer
 from bevviz.why.answer_text import markdown_page
 from bevviz.why.frame_index import Fate
-from bevviz.why.subject import projected
+from bevviz.why.subject import projected_box
 
 COLORS = {
-    Fate.GROUND: FATES["ground"],
-    Fate.NOISE: FATES["noise"],
-    Fate.SET_ASIDE: FATES["set aside"],
-    Fate.CLUSTERED: FATES["clustered"],
-    Fate.REPORTED: FATES["reported"],
-    Fate.IN_FRONT: FATES["in front"],
+    Fate.GROUND: FATE_COLORS["ground"],
+    Fate.NOISE: FATE_COLORS["noise"],
+    Fate.SET_ASIDE: FATE_COLORS["set aside"],
+    Fate.CLUSTERED: FATE_COLORS["clustered"],
+    Fate.REPORTED: FATE_COLORS["reported"],
+    Fate.IN_FRONT: FATE_COLORS["in front"],
 }
 NAMES = {
     Fate.GROUND: "taken for ground",
@@ -91,7 +91,7 @@ def log_answers(
         _log_above(recording, frame, drawn, above, fate)
 
 
-def focus(frame: Frame, answer: Answer) -> F32 | None:
+def focus_point(frame: Frame, answer: Answer) -> F32 | None:
     """Return the (3,) position of an answer in Frame.points_frame; None: unknown."""
     if answer.subject.box is not None:
         return np.asarray(answer.subject.box.center[0], np.float32)
@@ -101,7 +101,7 @@ def focus(frame: Frame, answer: Answer) -> F32 | None:
 
 def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> None:
     """Log the name of the worst subject and the meaning of its colours above it."""
-    place = focus(frame, answer)
+    place = focus_point(frame, answer)
     if place is None:
         return
     counts = np.bincount(answer.fate, minlength=len(Fate))
@@ -127,11 +127,11 @@ def _log_above(
     points = points[(np.abs(points[:, :2]) < reach).all(axis=1)]
     marks: rr.LineStrips2D | rr.Points2D
     if inside:
-        outlines = np.concatenate([footprints(geometry.corners(box)) for box in inside])
-        strips, radii = seen_from_above(config, np.eye(4), outlines), rr.Radius.ui_points(2.5)
+        outlines = np.concatenate([ground_outlines(geometry.corners(box)) for box in inside])
+        strips, radii = bev_pixels(config, np.eye(4), outlines), rr.Radius.ui_points(2.5)
         marks = rr.LineStrips2D(strips, radii=radii, colors=[_SUBJECT], draw_order=40.0)
     elif len(points) and not boxes:
-        dots, radii = seen_from_above(config, np.eye(4), points), rr.Radius.ui_points(2.0)
+        dots, radii = bev_pixels(config, np.eye(4), points), rr.Radius.ui_points(2.0)
         marks = rr.Points2D(dots, radii=radii, colors=[_SUBJECT], draw_order=40.0)
     else:
         return
@@ -172,13 +172,13 @@ def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[
     boxes, names = [], []
     for number, subject in enumerate(answer.subject for answer in answers):
         image_box = subject.xyxy if subject.camera == camera.name else None
-        box = projected(subject.box, camera) if subject.box is not None else image_box
+        box = projected_box(subject.box, camera) if subject.box is not None else image_box
         if box is not None:
             boxes.append(box)
             names.append("" if number else subject.name)
     if boxes:
         recording.log(
             entities.why(f"{camera.name}/place"),
-            over_image(camera.name),
+            image_frame(camera.name),
             boxes2d(np.array(boxes), names, colors=[_SUBJECT], draw_order=40.0),
         )

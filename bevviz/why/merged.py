@@ -11,7 +11,7 @@ from bevviz.model.frame import F32, I64, Bool
 from bevviz.stages.clustering import dbscan
 from bevviz.support.kernel import kernel
 from bevviz.why.evidence import MOST
-from bevviz.why.frame_index import FEW, PART, Traces
+from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.subject import LINK, Subject
 
 FINER = (
@@ -27,7 +27,9 @@ FINER = (
 LOOKED_AT = 2000  # points of a large set used for distances
 
 
-def find_mates(subject: Subject, traces: Traces, main: int, obstacle_rows: I64) -> list[tuple[int, str, int]]:
+def find_mates(
+    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64
+) -> list[tuple[int, str, int]]:
     """Return the row, name and number of points of other objects in the subject's main cluster."""
     clusters, obstacles = traces.result.clusters, traces.result.obstacles
     if main < 0 or clusters is None or obstacles is None:
@@ -61,7 +63,7 @@ def _same_view(a: Subject, b: Subject) -> bool:
 
 
 def separation(
-    subject: Subject, traces: Traces, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
+    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
 ) -> tuple[float, float]:
     """Return the gap in metres between the subject and its mates, and the eps that separates them.
 
@@ -99,12 +101,12 @@ def separation(
     return gap, finer
 
 
-def _detection_of_row(traces: Traces, camera: str, row: int) -> Subject:
+def _detection_of_row(traces: FrameIndex, camera: str, row: int) -> Subject:
     """Return the detection of a row as a subject."""
     return next(subject for subject in traces.competing if (subject.camera, subject.row) == (camera, row))
 
 
-def _separating_eps(points: F32, mine: Bool, theirs: Bool, traces: Traces) -> float:
+def _separating_eps(points: F32, mine: Bool, theirs: Bool, traces: FrameIndex) -> float:
     """Return the largest tried eps at which the two sets of points fall into different clusters."""
     config = traces.result.config.clustering
     for factor in FINER:

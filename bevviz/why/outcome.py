@@ -9,15 +9,15 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.results import Decision, FrameResult, Objects
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
-from bevviz.why.frame_index import FEW, PART, Traces
-from bevviz.why.subject import LINK, Subject, one_of, points_in_box, projected
+from bevviz.why.frame_index import FEW, PART, FrameIndex
+from bevviz.why.subject import LINK, Subject, points_in_box, projected_box, single_box
 
 HELD = 0.3  # least share of a subject's points inside the box of its object
 OVERLAP = 0.1  # or least IoU of both boxes from above
 
 
 def find_reported_object(
-    subject: Subject, traces: Traces, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
+    subject: Subject, traces: FrameIndex, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
 ) -> ReportedObject | None:
     """Find the reported object of the subject. Objects of a right class come first."""
     result = traces.result
@@ -37,7 +37,7 @@ def find_reported_object(
     return None
 
 
-def find_fused(subject: Subject, evidence: Evidence, traces: Traces) -> int:
+def find_fused(subject: Subject, evidence: Evidence, traces: FrameIndex) -> int:
     """Return the row of the object that our fusion would make of the subject, -1: none.
 
     It applies where the objects are not ours. A detection has its own object, other subjects that of their
@@ -98,7 +98,7 @@ def _reported_object(
 
 
 def _objects_of_clusters(
-    subject: Subject, traces: Traces, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
+    subject: Subject, traces: FrameIndex, parts: Sequence[ClusterPart], candidates: Sequence[Candidate]
 ) -> Iterator[int]:
     """Yield the rows of the objects that come from the subject's clusters and represent it."""
     objects = traces.result.objects
@@ -117,7 +117,7 @@ def _objects_of_clusters(
                 yield row
 
 
-def _represents(subject: Subject, traces: Traces, row: int, part: ClusterPart) -> bool:
+def _represents(subject: Subject, traces: FrameIndex, row: int, part: ClusterPart) -> bool:
     """Return whether an object is this subject, and not another one in the same cluster."""
     if subject.kind != "truth":
         return True
@@ -133,14 +133,14 @@ def _represents(subject: Subject, traces: Traces, row: int, part: ClusterPart) -
     )
 
 
-def _objects_at_place(subject: Subject, traces: Traces) -> Iterator[int]:
+def _objects_at_place(subject: Subject, traces: FrameIndex) -> Iterator[int]:
     """Yield the rows of the objects whose box is at the subject, for objects without clusters."""
     objects, points = traces.result.objects, traces.result.frame.points
     assert objects is not None
     if subject.kind in ("detection", "pixel"):
         camera = traces.camera(subject.camera)
         for row in range(len(objects)):
-            box = projected(one_of(objects.boxes, row), camera.camera) if camera is not None else None
+            box = projected_box(single_box(objects.boxes, row), camera.camera) if camera is not None else None
             if box is None or subject.xyxy is None:
                 continue
             if subject.kind == "pixel" or geometry.iou(box[None], subject.xyxy[None])[0, 0] >= LINK:
@@ -149,7 +149,7 @@ def _objects_at_place(subject: Subject, traces: Traces) -> Iterator[int]:
     mine = points[traces.place(subject)]
     share = np.array(
         [
-            points_in_box(one_of(objects.boxes, row), mine).mean() if len(mine) else 0
+            points_in_box(single_box(objects.boxes, row), mine).mean() if len(mine) else 0
             for row in range(len(objects))
         ]
     )

@@ -12,10 +12,10 @@ from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.results import CameraResult, FrameResult, Tracks
 from bevviz.recording import entities
-from bevviz.recording.labels import row_of
-from bevviz.recording.opinions import MISSED, told_from_above, told_in_image
+from bevviz.recording.labels import box_row
+from bevviz.recording.opinions import MISSED, opinion_outlines_in_bev, opinion_outlines_in_image
 from bevviz.recording.primitives import CORNER
-from bevviz.recording.tracks import shown
+from bevviz.recording.tracks import confirmed_rows
 
 Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cell"]
 
@@ -92,14 +92,14 @@ def pick(
 
 def _object_with_opinion(result: FrameResult, path: str, row: int) -> Pick | None:
     """Return an object with an opinion of the cameras, drawn over an image or the bird's-eye view."""
-    views = [told_from_above(result)] if path.startswith(f"{entities.BEV}/") else []
+    views = [opinion_outlines_in_bev(result)] if path.startswith(f"{entities.BEV}/") else []
     views += [
-        told_in_image(result, camera.camera)
+        opinion_outlines_in_image(result, camera.camera)
         for camera in result.cameras
         if path.startswith(f"{entities.image(camera.camera.name)}/")
     ]
     for view in views:
-        if path in view and 0 <= (row := row_of(row, len(view[path].rows))) < len(view[path].rows):
+        if path in view and 0 <= (row := box_row(row, len(view[path].rows))) < len(view[path].rows):
             object_row = view[path].rows[row]
             is_missed = view[path].opinion == MISSED
             return _fused_detection(result, object_row) if is_missed else Pick("object", object_row)
@@ -111,7 +111,7 @@ def _fused_detection(result: FrameResult, row: int) -> Pick | None:
     if result.opinions is None:
         return None
     fused = result.opinions.fused
-    if (row := row_of(row, len(fused))) >= len(fused):
+    if (row := box_row(row, len(fused))) >= len(fused):
         return None
     return Pick("detection", int(fused.detection[row]), fused.camera[row])
 
@@ -123,7 +123,7 @@ def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[floa
         kept = camera.detections.kept
         for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
             listed = np.flatnonzero(rows)
-            if path == where and (row := row_of(row, len(listed))) < len(listed):
+            if path == where and (row := box_row(row, len(listed))) < len(listed):
                 return Pick("detection", int(listed[row]), name)
     inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
         (f"{entities.image(name)}/", entities.why(f"{name}/"))
@@ -150,13 +150,15 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
     if path == entities.points(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
         return _point(frame.points[row])
     if path == entities.FUSED and (objects := result.objects) is not None:
-        return Pick("object", row_of(row, len(objects))) if row_of(row, len(objects)) < len(objects) else None
+        return (
+            Pick("object", box_row(row, len(objects))) if box_row(row, len(objects)) < len(objects) else None
+        )
     if path == entities.FUSION:
         return _fused_detection(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
         return Pick("truth", row)
     if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:
-        rows = shown(tracks)
+        rows = confirmed_rows(tracks)
         named = tracks.object[rows] >= 0
         listed = rows[named] if path == entities.TRACKS else rows[~named]
         return _track(result, tracks, int(listed[row])) if row < len(listed) else None

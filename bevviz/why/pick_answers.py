@@ -6,7 +6,7 @@ from bevviz.why import Answer, Selection
 from bevviz.why.pick import Pick
 
 
-def selection(pick: Pick) -> Selection:
+def selection_of(pick: Pick) -> Selection:
     """Return the selection of a pick for a ``Questioner``."""
     if pick.kind == "truth":
         return Selection(truth=pick.row)
@@ -23,7 +23,7 @@ def selection(pick: Pick) -> Selection:
     return Selection(point=pick.place)
 
 
-def surroundings(pick: Pick, answer: Answer) -> Selection | None:
+def surroundings_of(pick: Pick, answer: Answer) -> Selection | None:
     """Return a selection of everything around the answered subject; None: its position is unknown.
 
     A user who clicked on one object may mean another one at the same place.

@@ -13,9 +13,9 @@ from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
 from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
-from bevviz.why.frame_index import FEW, Traces, detection_subject, joined
+from bevviz.why.frame_index import FEW, FrameIndex, detection_subject, joined_boxes
 from bevviz.why.outcome import OVERLAP
-from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, one_of, projected
+from bevviz.why.subject import IN_VIEW, LINK, Selection, Subject, projected_box, single_box
 
 PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
 SPACING = 1.0  # pixels; subjects whose points are this much farther from the pixel may still show there
@@ -23,7 +23,7 @@ SURFACE = 1.0  # metres behind the nearest return at a pixel; subjects within it
 AS_GOOD = 0.8  # share of the best fit to a box from which a subject is as good an answer
 
 
-def select_subjects(traces: Traces, selection: Selection) -> list[Subject]:
+def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
     """Return the subjects of a selection. A pixel, box, point or cell is a subject itself.
 
     Raises:
@@ -81,7 +81,7 @@ def _subject_of_row(subjects: tuple[Subject, ...], row: int, what: str) -> Subje
     return subjects[row]
 
 
-def object_subject(traces: Traces, row: int) -> Subject:
+def object_subject(traces: FrameIndex, row: int) -> Subject:
     """Return an object of the frame's result as a subject.
 
     Raises:
@@ -91,7 +91,7 @@ def object_subject(traces: Traces, row: int) -> Subject:
     number = 0 if objects is None else len(objects)
     if objects is None or not 0 <= row < number:
         raise UserError(f"there is no object {row} in this frame: it has {number}")
-    box, name = one_of(objects.boxes, row), objects.names[row]
+    box, name = single_box(objects.boxes, row), objects.names[row]
     away = float(np.hypot(*box.center[0, :2]))
     cluster = int(objects.cluster[row])
     points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
@@ -99,7 +99,7 @@ def object_subject(traces: Traces, row: int) -> Subject:
     return Subject("object", title, name, frozenset({name.lower()}), row, box=box, points=points)
 
 
-def cluster_subject(traces: Traces, row: int) -> Subject:
+def cluster_subject(traces: FrameIndex, row: int) -> Subject:
     """Return a cluster of the frame as a subject.
 
     Raises:
@@ -112,11 +112,11 @@ def cluster_subject(traces: Traces, row: int) -> Subject:
     away = float(np.hypot(*clusters.centroid[row, :2]))
     points = np.flatnonzero(traces.cluster == row)
     name = f"cluster {row} at {away:.1f} m"
-    box = one_of(clusters.boxes(traces.result.config.clustering), row)
+    box = single_box(clusters.boxes(traces.result.config.clustering), row)
     return Subject("cluster", name, row=row, box=box, points=points)
 
 
-def track_subject(traces: Traces, number: int) -> Subject:
+def track_subject(traces: FrameIndex, number: int) -> Subject:
     """Return a live track as a subject: its cluster in this frame, or its expected position.
 
     Raises:
@@ -130,16 +130,16 @@ def track_subject(traces: Traces, number: int) -> Subject:
         known = ", ".join(map(str, tracks.id[:10].tolist())) or "none"
         raise UserError(f"there is no track {number} in this frame; there are {known}")
     row = int(rows[0])
-    box, name, cluster = one_of(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
+    box, name, cluster = single_box(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
     if tracks.absolute:
-        box = geometry.moved(box, geometry.inverse(frame.pose))
+        box = geometry.transform_boxes(box, geometry.inverse(frame.pose))
     title = f"track {number}{f' ({name})' if name else ''} at {float(np.hypot(*box.center[0, :2])):.1f} m"
     points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
     accepted = frozenset({name.lower()} if name else ())
     return Subject("track", title, name, accepted, number, box=box, points=points)
 
 
-def _surroundings(traces: Traces, selection: Selection) -> Subject:
+def _surroundings(traces: FrameIndex, selection: Selection) -> Subject:
     """Return the surroundings of a point or of a cell of the bird's-eye view as a subject."""
     edge = 2 * selection.radius
     if selection.point:
@@ -167,7 +167,7 @@ def _cell_center(config: BevConfig, row: int, column: int) -> tuple[float, float
     ) * config.resolution
 
 
-def _pixel(traces: Traces, selection: Selection) -> Subject:
+def _pixel(traces: FrameIndex, selection: Selection) -> Subject:
     """Return a pixel or image box as a subject."""
     camera = camera_of(traces, selection.camera)
     image_box = _selected_box(camera, selection)
@@ -198,7 +198,7 @@ def _image_size(camera: CameraResult) -> Intrinsics | None:
     return Intrinsics(width, height, np.eye(3))
 
 
-def camera_of(traces: Traces, name: str) -> CameraResult:
+def camera_of(traces: FrameIndex, name: str) -> CameraResult:
     """Return the camera of that name. An empty name means the only camera.
 
     Raises:
@@ -215,7 +215,7 @@ def camera_of(traces: Traces, name: str) -> CameraResult:
     return cameras[names.index(name) if name else 0]
 
 
-def _truth_in_view(traces: Traces, camera: str) -> Iterator[Subject]:
+def _truth_in_view(traces: FrameIndex, camera: str) -> Iterator[Subject]:
     """Yield the objects of the ground truth that a camera has in view. Without camera poses, yield all."""
     usable = [
         column
@@ -229,7 +229,7 @@ def _truth_in_view(traces: Traces, camera: str) -> Iterator[Subject]:
             yield subject
 
 
-def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
+def _strange_detections(traces: FrameIndex, camera: str) -> Iterator[Subject]:
     """Yield the detections of no object of the ground truth, without duplicates that NMS suppressed."""
     for camera_result in traces.result.cameras:
         detections = camera_result.detections
@@ -240,12 +240,12 @@ def _strange_detections(traces: Traces, camera: str) -> Iterator[Subject]:
             yield detection_subject(camera_result, row)
 
 
-def _contradicted_objects(traces: Traces, camera: str) -> Iterator[Subject]:
+def _contradicted_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
     """Yield the objects that are not ours, not in the ground truth, and contradicted by a camera."""
     opinions, objects = traces.result.opinions, traces.result.objects
     if opinions is None or objects is None:
         return
-    real = joined([subject.box for subject in traces.truth if subject.box is not None])
+    real = joined_boxes([subject.box for subject in traces.truth if subject.box is not None])
     in_truth = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
     for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
         if not in_truth[row] and camera in ("", opinions.camera[row]):
@@ -255,7 +255,7 @@ def _contradicted_objects(traces: Traces, camera: str) -> Iterator[Subject]:
 # --- subjects at a place -----------------------------------------------------------------------
 
 
-def subjects_at_place(traces: Traces, selection: Selection) -> list[tuple[Subject, bool]]:
+def subjects_at_place(traces: FrameIndex, selection: Selection) -> list[tuple[Subject, bool]]:
     """Return the subjects at a pixel, in an image box or around a point, and whether each is visible there.
 
     An object of the ground truth includes its detections and clusters. A detection includes the cluster that
@@ -268,7 +268,7 @@ def subjects_at_place(traces: Traces, selection: Selection) -> list[tuple[Subjec
     return list(_in_space(traces, selection) if around else _in_image(traces, selection))
 
 
-def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+def _in_space(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects around a point or in a cell."""
     place = _surroundings(traces, selection)
     points = traces.place(place)
@@ -289,7 +289,7 @@ def _in_space(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, b
             yield cluster_subject(traces, cluster), True
 
 
-def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, bool]]:
+def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects at a pixel or in an image box."""
     camera = camera_of(traces, selection.camera)
     image_box = _selected_box(camera, selection)
@@ -317,7 +317,7 @@ def _in_image(traces: Traces, selection: Selection) -> Iterator[tuple[Subject, b
 
 
 def _nearest_first(
-    traces: Traces, camera: CameraResult, things: Sequence[Subject], image_box: F32
+    traces: FrameIndex, camera: CameraResult, things: Sequence[Subject], image_box: F32
 ) -> Iterator[tuple[Subject, bool]]:
     """Yield the subjects at a pixel, and whether each is the nearest with points there.
 
@@ -335,7 +335,7 @@ def _nearest_first(
     yield from zip(things, shown.tolist(), strict=True)
 
 
-def _nearest(traces: Traces, camera: CameraResult, rows: I64, image_box: F32) -> tuple[float, float]:
+def _nearest(traces: FrameIndex, camera: CameraResult, rows: I64, image_box: F32) -> tuple[float, float]:
     """Return the pixels from the middle of the selected box to the nearest of these points, and its depth."""
     view = camera.camera
     away = np.linalg.norm(traces.uv(camera)[rows] - (image_box[:2] + image_box[2:]) / 2, axis=1)
@@ -347,7 +347,7 @@ def _nearest(traces: Traces, camera: CameraResult, rows: I64, image_box: F32) ->
     return float(away[row]), float(geometry.apply(view.camera_from_points, point[None])[0, 2])
 
 
-def _own_points(traces: Traces, camera: CameraResult, subject: Subject) -> I64:
+def _own_points(traces: FrameIndex, camera: CameraResult, subject: Subject) -> I64:
     """Return the rows of the subject's raw points. A detection has those of the cluster that it named."""
     fusion, row = camera.fusion, subject.row
     if subject.kind != "detection" or fusion is None or fusion.detection_decision[row] != Decision.MATCHED:
@@ -355,7 +355,7 @@ def _own_points(traces: Traces, camera: CameraResult, subject: Subject) -> I64:
     return np.flatnonzero(traces.cluster == fusion.detection_cluster[row])
 
 
-def _clusters_of(traces: Traces, points: I64) -> list[int]:
+def _clusters_of(traces: FrameIndex, points: I64) -> list[int]:
     """Return the clusters of an object's points that lie mostly on objects of the ground truth."""
     return [
         cluster
@@ -365,14 +365,14 @@ def _clusters_of(traces: Traces, points: I64) -> list[int]:
 
 
 def _truth_at_box(
-    traces: Traces, camera: CameraResult, image_box: F32, pixel: bool
+    traces: FrameIndex, camera: CameraResult, image_box: F32, pixel: bool
 ) -> Iterator[tuple[Subject, float]]:
     """Yield the objects of the ground truth at the selected box, with their fit."""
     column = [result.camera.name for result in traces.result.cameras].index(camera.camera.name)
     for subject in traces.truth:
         if traces.shown[subject.row, column] <= 0 or subject.box is None:
             continue
-        box = projected(subject.box, camera.camera)
+        box = projected_box(subject.box, camera.camera)
         if box is None:
             continue
         fit = _fit(image_box, box, pixel)
@@ -397,7 +397,7 @@ def _detections_at_box(camera: CameraResult, image_box: F32, pixel: bool) -> Ite
 
 
 def _clusters_at_box(
-    traces: Traces, camera: CameraResult, image_box: F32, pixel: bool
+    traces: FrameIndex, camera: CameraResult, image_box: F32, pixel: bool
 ) -> Iterator[tuple[int, float]]:
     """Yield the clusters at the selected box, with their fit."""
     clusters = traces.result.clusters

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.model.decisions import in_mask
+from bevviz.model.decisions import mask_evidence
 from bevviz.model.results import ClusterState, Decision, FrameResult
 from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
-from bevviz.why.frame_index import Fate, Traces
+from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.outcome import find_fused, in_box_of, opinion_on
 from bevviz.why.stage_owner import StageOwner
 from bevviz.why.subject import Subject, count
@@ -20,7 +20,7 @@ _ONLY = ("nothing", "only ground", "mostly ground")  # at a place without an obj
 
 
 def verdict_of(
-    subject: Subject, reason: Reason, reported: bool, evidence: Evidence, traces: Traces
+    subject: Subject, reason: Reason, reported: bool, evidence: Evidence, traces: FrameIndex
 ) -> Verdict:
     """Return the verdict with its reason in one sentence."""
     because = ReasonText(subject, evidence, traces).of(reason)
@@ -50,7 +50,7 @@ class ReasonText:
         traces: the index of the frame.
     """
 
-    def __init__(self, subject: Subject, evidence: Evidence, traces: Traces) -> None:
+    def __init__(self, subject: Subject, evidence: Evidence, traces: FrameIndex) -> None:
         self.subject, self.evidence, self.traces = subject, evidence, traces
         self.result: FrameResult = traces.result
         self.config: Config = traces.result.config
@@ -346,7 +346,7 @@ class ReasonText:
         if self.config.fusion.method == "centroid":
             return f"{pair.distance:.0f} px, {pair.depth:.1f} m"
         in_frustum = f"{count(pair.points, 'point')} in its frustum, IoU {pair.iou:.2f}"
-        return in_frustum + in_mask(fusion, row, self.config)
+        return in_frustum + mask_evidence(fusion, row, self.config)
 
     def _best_pair_text(self) -> str:
         """Return the numbers of the best detection and its cluster."""

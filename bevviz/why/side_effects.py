@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz.compare.differences import Change, Seen, compare_objects
+from bevviz.compare.differences import Change, SideResult, compare_objects
 from bevviz.evaluate import MAX_DISTANCE, pair_in_order
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
-from bevviz.why.frame_index import joined
+from bevviz.why.frame_index import joined_boxes
 from bevviz.why.subject import Subject, count
 
 
@@ -146,11 +146,11 @@ def effects(
     )
 
 
-def _seen(objects: Objects | None) -> Seen:
+def _seen(objects: Objects | None) -> SideResult:
     """Return objects in the form that the comparison needs."""
     if objects is None:
-        return Seen(Boxes3D.empty(), (), np.zeros(0, np.float32))
-    return Seen(objects.boxes, objects.names, objects.score)
+        return SideResult(Boxes3D.empty(), (), np.zeros(0, np.float32))
+    return SideResult(objects.boxes, objects.names, objects.score)
 
 
 def _name(name: str, boxes: Boxes3D, row: int) -> str:
@@ -166,7 +166,7 @@ def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]
     if objects is None:
         return []
     rows = [-1] * len(objects)
-    truth = joined([subject.box for subject in subjects if subject.box is not None])
+    truth = joined_boxes([subject.box for subject in subjects if subject.box is not None])
     order = np.argsort(-objects.score, kind="stable")
     away = np.linalg.norm(objects.boxes.center[order][:, None, :2] - truth.center[None, :, :2], axis=2)
     right = np.array([[subject.accepts(objects.names[j]) for subject in subjects] for j in order], bool)

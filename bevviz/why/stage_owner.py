@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.config import OURS, STAGES, Config, plugin_of
+from bevviz.config import BUILTIN_METHODS, METHOD_KEYS, Config, plugin_of
 from bevviz.config.plugins import TOPIC
 from bevviz.errors import UserError
 
@@ -35,15 +35,15 @@ class StageOwner:
         return self.function or self.topic
 
 
-def origin(config: Config, section: str) -> StageOwner:
+def owner_of(config: Config, section: str) -> StageOwner:
     """Return the owner of the stage of a section."""
-    method = str(getattr(getattr(config, section), STAGES[section]))
+    method = str(getattr(getattr(config, section), METHOD_KEYS[section]))
     if method.startswith(TOPIC):
         return StageOwner(section, topic=method.removeprefix(TOPIC))
     try:
         plugin = plugin_of(config, section)
     except UserError:  # The function could be loaded when the frame was run.
         return StageOwner(section, function=method)
-    if plugin is None and section == "objects" and method not in OURS:
+    if plugin is None and section == "objects" and method not in BUILTIN_METHODS:
         return StageOwner(section, function=Path(method).name)  # file of a network
     return StageOwner(section, function=plugin.name if plugin is not None else "")

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from bevviz.model.class_names import CATEGORIES, accepted_names
+from bevviz.model.class_names import NUSCENES_CLASSES, accepted_names
 from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
 from bevviz.stages.visibility import image_boxes
 
@@ -92,7 +92,9 @@ class Subject:
 
     def accepts_of_others(self, name: str) -> bool:
         """Return whether the class of an object that is not ours is right. It may have other class names."""
-        return self.accepts(name) or CATEGORIES.get(name, name).lower() in accepted_names(self.label, ())
+        return self.accepts(name) or NUSCENES_CLASSES.get(name, name).lower() in accepted_names(
+            self.label, ()
+        )
 
 
 def count(number: int, noun: str) -> str:
@@ -103,7 +105,7 @@ def count(number: int, noun: str) -> str:
 # --- boxes -------------------------------------------------------------------------------------
 
 
-def one_of(boxes: Boxes3D, row: int) -> Boxes3D:
+def single_box(boxes: Boxes3D, row: int) -> Boxes3D:
     """Return one box of several."""
     return Boxes3D(boxes.center[[row]], boxes.size[[row]], boxes.yaw[[row]])
 
@@ -117,7 +119,7 @@ def points_in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 
     return np.asarray(inside & (z > -box.size[0, 2] / 2 + foot) & (z < half[2]), np.bool_)
 
 
-def projected(box: Boxes3D, camera: Camera) -> F32 | None:
+def projected_box(box: Boxes3D, camera: Camera) -> F32 | None:
     """Return the (4,) image box of a 3D box, cut at the image's edge; None: it is out of view."""
     image_box = image_boxes(box, camera)[0]
     return image_box if np.isfinite(image_box).all() else None

@@ -17,7 +17,7 @@ from bevviz.model.results import (
     Opinion,
 )
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
-from bevviz.why.frame_index import FEW, PART, Traces
+from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.outcome import find_fused
 from bevviz.why.subject import Subject
 
@@ -83,7 +83,7 @@ class Verdict:
     text: str
 
 
-def find_reason(subject: Subject, evidence: Evidence, traces: Traces) -> tuple[Reason, bool]:
+def find_reason(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tuple[Reason, bool]:
     """Find the first stage that lost the subject, or the fault of its reported object.
 
     Returns:
@@ -107,7 +107,7 @@ def find_reason(subject: Subject, evidence: Evidence, traces: Traces) -> tuple[R
     return _loss_of_other_stages(subject, evidence, traces), False
 
 
-def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: Traces) -> tuple[Reason, bool]:
+def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tuple[Reason, bool]:
     """Return the reason with cameras alone, where a kept detection is reported."""
     best = evidence.best
     if not detector_ran(traces.result, subject.camera):
@@ -117,7 +117,7 @@ def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: Traces) -> 
     return (Reason.REPORTED, True) if best.kept else (_weakness(best, traces), False)
 
 
-def _flaw(subject: Subject, evidence: Evidence, named: ReportedObject, traces: Traces) -> Reason:
+def _flaw(subject: Subject, evidence: Evidence, named: ReportedObject, traces: FrameIndex) -> Reason:
     """Return the fault of a reported object, REPORTED without a fault."""
     opinions = traces.result.opinions
     if opinions is not None and subject.kind == "object":
@@ -137,7 +137,7 @@ def _flaw(subject: Subject, evidence: Evidence, named: ReportedObject, traces: T
     return Reason.SPLIT if several and part is not None and part.points < WHOLE * whole else Reason.REPORTED
 
 
-def _loss(subject: Subject, evidence: Evidence, traces: Traces) -> Reason:
+def _loss(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Reason:
     """Return the reason why our fusion reported no object."""
     if subject.kind == "detection":
         return _loss_of_detection(evidence, traces)
@@ -166,7 +166,7 @@ def _without_points(evidence: Evidence) -> Reason:
     return Reason.HIDDEN if evidence.in_front > MOST * evidence.aimed else Reason.NO_POINTS
 
 
-def _unclustered(evidence: Evidence, traces: Traces) -> Reason:
+def _unclustered(evidence: Evidence, traces: FrameIndex) -> Reason:
     """Return the reason for a subject with points but no kept cluster: the stage that took most of them."""
     aside = next((part for part in evidence.parts if not part.kept), None)
     if aside is not None and aside.points >= max(evidence.noise, len(evidence.ground)):
@@ -186,7 +186,7 @@ def detector_ran(result: FrameResult, camera: str) -> bool:
     return any(c.detections is not None for c in cameras_of(result, camera))
 
 
-def _weakness(best: Candidate, traces: Traces) -> Reason:
+def _weakness(best: Candidate, traces: FrameIndex) -> Reason:
     """Return the reason for a detection that was not kept.
 
     If a suppressed detection is below the threshold anyway, the threshold is the reason.
@@ -196,7 +196,7 @@ def _weakness(best: Candidate, traces: Traces) -> Reason:
     return Reason.SUPPRESSED if strong else Reason.BELOW_THRESHOLD
 
 
-def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: Traces) -> Reason:
+def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: FrameIndex) -> Reason:
     """Return the reason why a cluster and a detection were not matched."""
     _, fusion = camera_and_fusion(traces.result, best.camera)
     if fusion is None:
@@ -212,7 +212,7 @@ def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: Trac
     return reason
 
 
-def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: Traces) -> bool:
+def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: FrameIndex) -> bool:
     """Return whether another object in the subject's cluster named the cluster."""
     if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
         return False
@@ -220,7 +220,7 @@ def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: T
     return int(traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]) in evidence.mates
 
 
-def _fragment(evidence: Evidence, inside: int, traces: Traces) -> Reason | None:
+def _fragment(evidence: Evidence, inside: int, traces: FrameIndex) -> Reason | None:
     """Return the stage that took most of an object, None if its cluster holds at least half of it."""
     if inside >= MOST * evidence.voxels:
         return None
@@ -229,7 +229,7 @@ def _fragment(evidence: Evidence, inside: int, traces: Traces) -> Reason | None:
     return max((len(evidence.ground), Reason.GROUND), (evidence.noise, noise), (rest, Reason.SPLIT))[1]
 
 
-def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) -> Reason:
+def pair_reason(fusion: Fusion, traces: FrameIndex, detection: int, cluster: int) -> Reason:
     """Return the rule of our fusion that separates a detection and a cluster; REPORTED: they match."""
     config, pair = traces.result.config.fusion, fusion.pair(detection, cluster)
     if config.method == "centroid":
@@ -249,7 +249,7 @@ def pair_reason(fusion: Fusion, traces: Traces, detection: int, cluster: int) ->
     return Reason.OTHER_CLUSTER if decision == Decision.MATCHED else Reason.TAKEN
 
 
-def _loss_of_detection(evidence: Evidence, traces: Traces) -> Reason:
+def _loss_of_detection(evidence: Evidence, traces: FrameIndex) -> Reason:
     """Return the reason why a detection gave no object."""
     best = evidence.best
     if best is None:
@@ -272,7 +272,7 @@ def _loss_of_detection(evidence: Evidence, traces: Traces) -> Reason:
 # --- objects that our fusion did not make ------------------------------------------------------
 
 
-def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: Traces) -> Reason:
+def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Reason:
     """Return the reason why a 3D detector or the robot has no object, as far as its stages are known."""
     if subject.kind != "detection" and evidence.raw < FEW:
         return _without_points(evidence)
@@ -296,7 +296,9 @@ def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: Traces) 
     return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
 
 
-def _is_in_reported_box(subject: Subject, evidence: Evidence, named: ReportedObject, traces: Traces) -> bool:
+def _is_in_reported_box(
+    subject: Subject, evidence: Evidence, named: ReportedObject, traces: FrameIndex
+) -> bool:
     """Return whether the object of our fusion is inside the reported box."""
     row, opinions = find_fused(subject, evidence, traces), traces.result.opinions
     return row >= 0 and opinions is not None and int(opinions.partner[row]) == named.row

@@ -11,7 +11,7 @@ from bevviz.evaluate import RANGE, Truth, match
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64
 from bevviz.model.results import Decision, FrameResult, Opinion
-from bevviz.why import Questioner, Selection
+from bevviz.why import FrameExplainer, Selection
 from bevviz.why.pick import Pick
 
 FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
@@ -46,7 +46,7 @@ class Finding:
     box: F32 | None = None
 
 
-def finds(result: FrameResult, truth: Truth | None) -> list[Finding]:
+def find_findings(result: FrameResult, truth: Truth | None) -> list[Finding]:
     """Return the findings of a frame within 40 m, nearest first.
 
     With ground truth these are missed and false objects. Without it they are:
@@ -66,7 +66,9 @@ def finds(result: FrameResult, truth: Truth | None) -> list[Finding]:
     )
 
 
-def with_reasons(findings: Sequence[Finding], result: FrameResult, questioner: Questioner) -> list[Finding]:
+def with_reasons(
+    findings: Sequence[Finding], result: FrameResult, questioner: FrameExplainer
+) -> list[Finding]:
     """Return the findings with the reason of the verdict at each missed object."""
     reasons = {}
     for finding in findings:

@@ -13,14 +13,14 @@ from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.bev import footprints, seen_from_above
-from bevviz.recording.camera import over_image
-from bevviz.recording.labels import named_in_space
+from bevviz.recording.bev import bev_pixels, ground_outlines
+from bevviz.recording.camera import image_frame
+from bevviz.recording.labels import choose_named_in_3d
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, transform
 from bevviz.recording.writer import Writer
 from bevviz.stages.robot_results import in_points_frame
-from bevviz.why.frame_index import joined
-from bevviz.why.subject import one_of, projected
+from bevviz.why.frame_index import joined_boxes
+from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.findings import Finding
 
 Color = tuple[int, int, int]
@@ -46,13 +46,13 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
         layer_findings = [finding for finding in findings if finding.what == kind]
         if not layer_findings:
             continue
-        boxes = joined([_box(result, finding) for finding in layer_findings])
+        boxes = joined_boxes([_box(result, finding) for finding in layer_findings])
         labels = [
             f"{finding.name} {kind}{f': {finding.reason}' if finding.reason else ''}"
             for finding in layer_findings
         ]
         shows_label = (
-            named_in_space(boxes.center).tolist() if kind == "missed" else [False] * len(layer_findings)
+            choose_named_in_3d(boxes.center).tolist() if kind == "missed" else [False] * len(layer_findings)
         )
         writer.put(
             path,
@@ -70,7 +70,9 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
         )
         layer[path] = layer_findings
         for camera in result.frame.cameras:
-            image_boxes = [projected(one_of(boxes, index), camera) for index in range(len(layer_findings))]
+            image_boxes = [
+                projected_box(single_box(boxes, index), camera) for index in range(len(layer_findings))
+            ]
             visible_rows = [index for index, box in enumerate(image_boxes) if box is not None]
             if visible_rows:
                 image = f"{entities.image(camera.name)}/{kind}"
@@ -78,7 +80,7 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
                 style = {"colors": [color], "draw_order": 35.0, "show_labels": False}
                 writer.put(
                     image,
-                    over_image(camera.name),
+                    image_frame(camera.name),
                     boxes2d(xyxy, [labels[index] for index in visible_rows], **style),
                 )
                 layer[image] = [layer_findings[index] for index in visible_rows]
@@ -92,11 +94,11 @@ def _box(result: FrameResult, finding: Finding) -> Boxes3D:
     """Return the box of a finding in the frame of the points, as one row."""
     row = finding.pick.row
     if finding.pick.kind == "object" and result.objects is not None:
-        return one_of(result.objects.boxes, row)
+        return single_box(result.objects.boxes, row)
     if finding.pick.kind == "cluster" and result.clusters is not None:
-        return one_of(result.clusters.boxes(result.config.clustering), row)
+        return single_box(result.clusters.boxes(result.config.clustering), row)
     assert result.frame.truth is not None
-    return one_of(in_points_frame(result.frame, result.frame.truth), row)
+    return single_box(in_points_frame(result.frame, result.frame.truth), row)
 
 
 def _log_above(
@@ -106,11 +108,11 @@ def _log_above(
     reach = np.array([config.range_x, config.range_y], np.float32)
     inside: list[int] = np.flatnonzero((np.abs(boxes.center[:, :2]) < reach).all(axis=1)).tolist()
     if inside:
-        outlines = footprints(geometry.corners(boxes)[inside])
+        outlines = ground_outlines(geometry.corners(boxes)[inside])
         writer.put(
             path,
             rr.LineStrips2D(
-                seen_from_above(config, np.eye(4), outlines),
+                bev_pixels(config, np.eye(4), outlines),
                 colors=[color],
                 radii=rr.Radius.ui_points(1.5),
                 labels=[labels[row] for row in inside],

@@ -14,9 +14,9 @@ from bevviz.live.encoder import Packet
 from bevviz.live.output import Output
 from bevviz.live.runtime import Live
 from bevviz.recording import blueprints
-from bevviz.recording.frame_logger import Context
+from bevviz.recording.frame_logger import RecordingContext
 from bevviz.recording.sinks import APPLICATION
-from bevviz.workbench.routes import Heard
+from bevviz.workbench.routes import PageState
 
 AHEAD = 10  # pieces that may be sent before the page's viewer has drawn the first of them
 WHOLE = 3  # self-contained packets that are kept, with all packets after the oldest of them
@@ -28,7 +28,7 @@ class _Piece:
 
     number: int
     data: bytes  # with the header that every recording begins with
-    context: Context | None  # only for a piece that a page can begin with
+    context: RecordingContext | None  # only for a piece that a page can begin with
 
 
 class PageProgress:
@@ -39,7 +39,7 @@ class PageProgress:
         clock: returns the time in seconds.
     """
 
-    def __init__(self, state: Heard, clock: Callable[[], float]) -> None:
+    def __init__(self, state: PageState, clock: Callable[[], float]) -> None:
         self._state, self._clock = state, clock
         self._sent: deque[float] = deque()  # send times of the pieces that are not drawn yet
         self._drawn = 0
@@ -70,7 +70,7 @@ class PageProgress:
             return self._sent[0] if self._sent else None
 
 
-class LiveFilm(Output):
+class LiveBuffer(Output):
     """Buffer of the newest pieces of the recording. A page that is too slow continues at the newest piece.
 
     Args:
@@ -106,7 +106,7 @@ class LiveFilm(Output):
         return max((page.lag for page in self._pages.copy()), default=None)
 
     @contextmanager
-    def shown(self, state: Heard) -> Iterator[PageProgress]:
+    def shown(self, state: PageState) -> Iterator[PageProgress]:
         """Return a context in which a page is connected."""
         page = PageProgress(state, self._encoder.clock)
         self._pages.append(page)
@@ -149,7 +149,7 @@ class LiveFilm(Output):
         head.append(self._encoder.prelude(start.context, blueprint=False))
         return head + [piece.data for piece in pieces if piece.number >= start.number], following
 
-    def _layout(self, context: Context) -> bytes:
+    def _layout(self, context: RecordingContext) -> bytes:
         recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
         stream = rr.binary_stream(recording)
         layout = blueprints.load("workbench_live", context.scene, context.config)
@@ -162,7 +162,7 @@ class LiveFilm(Output):
         self._put(self._encoder.header + packet.shown, packet.context if packet.whole else None)
         return True
 
-    def _put(self, data: bytes, context: Context | None) -> None:
+    def _put(self, data: bytes, context: RecordingContext | None) -> None:
         with self._lock:
             self._pieces.append(_Piece(self._next, data, context))
             self._next += 1

@@ -19,21 +19,21 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 from bevviz.workbench.access import HOSTS, Guard
-from bevviz.workbench.live_session import LiveBench
+from bevviz.workbench.live_session import LiveSession
 from bevviz.workbench.page_connection import PageConnection, news_event
 from bevviz.workbench.routes import Site, page_state, site_routes
 from bevviz.workbench.server import Server, bound_socket, viewer_folder
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench
+    from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.startup import SessionStartup
 
 PATIENCE = 3.0  # seconds that close() waits for the threads of the page
 
 
-class LivePage(Closing):
+class LivePage(Closable):
     """Server of the page, in threads of its own, until it is closed.
 
     Args:
@@ -47,7 +47,7 @@ class LivePage(Closing):
         address: address of the page, with its token.
     """
 
-    def __init__(self, workbench: LiveBench, port: int | None) -> None:
+    def __init__(self, workbench: LiveSession, port: int | None) -> None:
         self._workbench = workbench
         viewer, token = viewer_folder(), secrets.token_urlsafe(16)
         news_event = bound_socket(port)
@@ -77,10 +77,10 @@ class _OpenSession:
 
     error = None
 
-    def __init__(self, workbench: LiveBench) -> None:
+    def __init__(self, workbench: LiveSession) -> None:
         self._workbench = workbench
 
-    async def session(self) -> LiveBench:
+    async def session(self) -> LiveSession:
         """Return the workbench session."""
         return self._workbench
 
@@ -88,7 +88,7 @@ class _OpenSession:
 class LivePageConnection(PageConnection):
     """Connection to one page of a running robot."""
 
-    def __init__(self, workbench: LiveBench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+    def __init__(self, workbench: LiveSession, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
         # A live session has every method that is called below.
         super().__init__(cast(Any, workbench), socket, desk, run)
         self._live = workbench
@@ -111,13 +111,13 @@ class LivePageConnection(PageConnection):
 class LiveSite(Site):
     """Request handlers of the page of a running robot."""
 
-    def __init__(self, workbench: LiveBench, viewer: Path, version: str, token: str, port: int) -> None:
+    def __init__(self, workbench: LiveSession, viewer: Path, version: str, token: str, port: int) -> None:
         super().__init__(
             cast("SessionStartup", _OpenSession(workbench)), viewer, version, token, port, "live"
         )
         self._live = workbench
 
-    def _visit(self, workbench: Bench, socket: WebSocket) -> PageConnection:
+    def _visit(self, workbench: WorkbenchSession, socket: WebSocket) -> PageConnection:
         return LivePageConnection(self._live, socket, self._desk, self._run)
 
     async def page(self, request: Request) -> Response:

@@ -10,28 +10,28 @@ from typing import Any
 
 import rerun as rr
 
-from bevviz.config import Config, revised
+from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
 from bevviz.live.runtime import Live
 from bevviz.live.thinning import chosen
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.variants import Variants
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION
-from bevviz.support.contexts import Closing
-from bevviz.why import Answer, Questioner
+from bevviz.support.contexts import Closable
+from bevviz.why import Answer, FrameExplainer
 from bevviz.why.log import mark_answers
 from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection, surroundings
+from bevviz.why.pick_answers import selection_of, surroundings_of
 from bevviz.workbench.finding_list import FindingList
-from bevviz.workbench.findings import finds, with_reasons
-from bevviz.workbench.live_buffer import LiveFilm
-from bevviz.workbench.trials import attempt
+from bevviz.workbench.findings import find_findings, with_reasons
+from bevviz.workbench.live_buffer import LiveBuffer
+from bevviz.workbench.trials import trial_effects
 
 KEPT = 4  # held frames that are kept
 TRIED = 2  # results of held frames with other values that are kept
@@ -65,7 +65,7 @@ class RobotDrive:
         return self._live.session
 
 
-class LiveBench(Closing):
+class LiveSession(Closable):
     """Workbench session of a running robot.
 
     Its newest frames can be asked about. Changed parameters are in force for all later frames. Ask
@@ -80,7 +80,7 @@ class LiveBench(Closing):
 
     def __init__(self, live: Live) -> None:
         self.live, self.drive = live, RobotDrive(live)
-        self.film = LiveFilm(live, live.config.live.output_queue)
+        self.film = LiveBuffer(live, live.config.live.output_queue)
         self.truth_of: Callable[..., Truth | None] | None = None
         self.opening: int | None = None  # None: the page opens at the newest frame.
         self.entries, self.notes_changed = FindingList(), -1
@@ -90,12 +90,12 @@ class LiveBench(Closing):
         self._tried_results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._settings: Settings = ()
         self._variants = Variants(live.session.loader)
-        self._questioner: Questioner | None = None
+        self._questioner: FrameExplainer | None = None
         self._listeners: list[Callable[[], None]] = []
         recording = rr.RecordingStream(APPLICATION, recording_id=live.encoder.recording_id)
         recording.set_log_time_enabled(False)
         self._marks = rr.binary_stream(recording)
-        self._marker = Logger(recording, live.config, live.scene)
+        self._marker = FrameLogger(recording, live.config, live.scene)
         live.attach(self.film, self._see)
 
     def close(self) -> None:
@@ -145,7 +145,7 @@ class LiveBench(Closing):
         frames = sorted((result.frame.stamp, result.frame.index) for result in self._held())
         if not frames:
             raise UserError("no frame has come yet")
-        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.SLACK]
+        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.TIME_TOLERANCE]
         if not numbers:
             raise UserError(
                 f"that frame is gone: the newest {self._newest.maxlen} can be asked about "
@@ -167,7 +167,7 @@ class LiveBench(Closing):
             UserError: no frame has come yet.
         """
         frames = sorted((held_result.frame.stamp, held_result.frame.index) for held_result in self._held())
-        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.SLACK]
+        numbers = [index for frame_stamp, index in frames if frame_stamp <= stamp + entities.TIME_TOLERANCE]
         if not frames:
             raise UserError("no frame has come yet")
         result = self.look(numbers[-1] if numbers else frames[0][1])
@@ -177,7 +177,7 @@ class LiveBench(Closing):
             self._kept.move_to_end(index)
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
-        findings = finds(result, None if self.truth_of is None else self.truth_of(result.frame))
+        findings = find_findings(result, None if self.truth_of is None else self.truth_of(result.frame))
         self.entries.replace(LISTED)
         self.entries.add(with_reasons(findings, result, self._new_questioner(result)))
         for listener in tuple(self._listeners):
@@ -195,12 +195,12 @@ class LiveBench(Closing):
             raise UserError(f"frame {number} is gone: hold one with H, and ask then")
         if not settings:
             return result
-        config = revised(self.live.config, settings)
+        config = changed_config(self.live.config, settings)
         if config == result.config:
             return result
         key = number, settings
         if key not in self._tried_results:
-            self._tried_results[key] = describe(self._variants.perceive(result.frame, config))
+            self._tried_results[key] = add_explanations(self._variants.perceive(result.frame, config))
             while len(self._tried_results) > TRIED:
                 self._tried_results.popitem(last=False)
         return self._tried_results[key]
@@ -229,11 +229,11 @@ class LiveBench(Closing):
         """
         result = self.look(number, settings)
         questioner, candidates = self._candidates(result, target)
-        answers = candidates or questioner.ask(selection(target))
+        answers = candidates or questioner.ask(selection_of(target))
         if not answers:
             raise UserError(f"there is nothing to say about {target}")
         answer = answers[0]
-        if not candidates and (nearby := surroundings(target, answer)) is not None:
+        if not candidates and (nearby := surroundings_of(target, answer)) is not None:
             candidates = questioner.candidates(nearby)
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
         self.film.add(self._marks.read())
@@ -246,17 +246,17 @@ class LiveBench(Closing):
             UserError: as ``ask``.
         """
         questioner, candidates = self._candidates(self.look(number, settings), target)
-        return questioner.with_hints((candidates or questioner.ask(selection(target)))[0])
+        return questioner.with_hints((candidates or questioner.ask(selection_of(target)))[0])
 
-    def _candidates(self, result: FrameResult, target: Pick) -> tuple[Questioner, list[Answer]]:
+    def _candidates(self, result: FrameResult, target: Pick) -> tuple[FrameExplainer, list[Answer]]:
         if self._questioner is None or self._questioner.traces.result is not result:
             self._questioner = self._new_questioner(result)
-        candidates = self._questioner.candidates(selection(target)) if target.is_place else []
+        candidates = self._questioner.candidates(selection_of(target)) if target.is_place else []
         return self._questioner, list(candidates)
 
-    def _new_questioner(self, result: FrameResult) -> Questioner:
+    def _new_questioner(self, result: FrameResult) -> FrameExplainer:
         session = self.live.session
-        return Questioner(result, session.loader, session.stages.class_names)
+        return FrameExplainer(result, session.loader, session.stages.class_names)
 
     def go_on(self) -> None:
         """Do nothing: a robot does not wait for a page."""
@@ -280,10 +280,10 @@ class LiveBench(Closing):
         """
         before = self.look(number)
         self.change(settings)
-        after = describe(self._variants.perceive(before.frame, self.live.config))
+        after = add_explanations(self._variants.perceive(before.frame, self.live.config))
         truth_row = target.row if target is not None and target.kind == "truth" else -1
         truth = None if self.truth_of is None else self.truth_of(before.frame)
-        return attempt(before, after, truth, truth_row)
+        return trial_effects(before, after, truth, truth_row)
 
     def change(self, settings: Settings) -> None:
         """Change parameters of the running robot.

@@ -22,8 +22,8 @@ from bevviz.errors import UserError, first_line
 from bevviz.recording import entities, rerun_cli
 from bevviz.recording.ports import FIRST_DATA_PORT, LOOPBACK, free_port
 from bevviz.recording.sinks import check_viewer
-from bevviz.support.contexts import Closing
-from bevviz.workbench.recording_buffer import Film
+from bevviz.support.contexts import Closable
+from bevviz.workbench.recording_buffer import RecordingBuffer
 
 LOOK = 0.2  # seconds between two queries of the viewer's time
 TIMELINES = (entities.STAMP, entities.TRIED)  # timelines that the page knows
@@ -32,7 +32,7 @@ MAGIC = 4  # bytes that begin every recording
 Event = dict[str, Any]  # same fields as an event of the web viewer
 
 
-class NativeViewer(Closing):
+class NativeViewer(Closable):
     """A native viewer, with one thread that sends it the recording and one that watches its time.
 
     Args:
@@ -44,7 +44,7 @@ class NativeViewer(Closing):
         UserError: the viewer cannot be started or reached, or is too old to report its time.
     """
 
-    def __init__(self, films: Sequence[Film], recording_id: str, url: str | None = None) -> None:
+    def __init__(self, films: Sequence[RecordingBuffer], recording_id: str, url: str | None = None) -> None:
         self._films, self._recording_id = films, recording_id
         self._url = url
         self._listeners: list[Callable[[Event], None]] = []
@@ -58,7 +58,7 @@ class NativeViewer(Closing):
         """Stop the relay. The viewer's window stays open until the user closes it."""
         self._ended.set()
         self._wake.set()
-        rerun_cli.end(self._relay)
+        rerun_cli.stop(self._relay)
 
     def _open(self) -> rerun_cli.Process:
         url = self._url or self._start()
@@ -88,7 +88,7 @@ class NativeViewer(Closing):
 
     def _start_relay(self, url: str) -> rerun_cli.Process:
         relay = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, self._recording_id]
-        return rerun_cli.spawn(rerun_cli.tied(relay))
+        return rerun_cli.spawn(rerun_cli.ending_with_parent(relay))
 
     def _start(self) -> str:
         port = free_port(FIRST_DATA_PORT)

@@ -18,7 +18,7 @@ from bevviz.support.loggers import logger
 if TYPE_CHECKING:
     from bevviz.why import Answer
     from bevviz.why.pick import Pick
-    from bevviz.workbench.session import Bench, Settings
+    from bevviz.workbench.session import Settings, WorkbenchSession
 
 BESIDE = 6  # further answers that are listed
 TOGETHER = 0.05  # seconds in which news are collected before they are sent
@@ -36,7 +36,9 @@ class PageConnection:
         run: id of this run of the server.
     """
 
-    def __init__(self, workbench: Bench, socket: WebSocket, desk: ThreadPoolExecutor, run: str) -> None:
+    def __init__(
+        self, workbench: WorkbenchSession, socket: WebSocket, desk: ThreadPoolExecutor, run: str
+    ) -> None:
         self._workbench, self._socket, self._desk, self._run = workbench, socket, desk, run
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -248,7 +250,7 @@ def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
             }
 
 
-def _notes(workbench: Bench) -> dict[str, Any]:
+def _notes(workbench: WorkbenchSession) -> dict[str, Any]:
     try:
         notes = list(workbench.notes)
     except UserError as error:

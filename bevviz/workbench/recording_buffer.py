@@ -7,11 +7,11 @@ import tempfile
 import threading
 from collections.abc import Callable
 
-from bevviz.support.contexts import Closing
-from bevviz.support.files import on_disk
+from bevviz.support.contexts import Closable
+from bevviz.support.files import catch_full_disk
 
 
-class Film(Closing):
+class RecordingBuffer(Closable):
     """Pieces of a recording in the order of their creation. Each is a whole ``.rrd``. They are kept on disk.
 
     Any thread may call ``add``. Every reader has its own position.
@@ -21,7 +21,7 @@ class Film(Closing):
     """
 
     def __init__(self) -> None:
-        with on_disk():
+        with catch_full_disk():
             self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, the file stays open until the buffer is closed
         self._ends = [0]
         self._lock = threading.Lock()
@@ -44,7 +44,7 @@ class Film(Closing):
             return
         with self._lock:
             view, end = memoryview(piece), self._ends[-1]
-            with on_disk():
+            with catch_full_disk():
                 while view:
                     written = os.pwrite(self._file.fileno(), view, end)
                     view, end = view[written:], end + written

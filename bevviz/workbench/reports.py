@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bevviz.bags.source import iso
-from bevviz.config import revised
+from bevviz.config import changed_config
 from bevviz.errors import UserError, first_line
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench, Settings
+    from bevviz.workbench.session import Settings, WorkbenchSession
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
@@ -81,7 +81,7 @@ class ReportMaker:
         folder: output folder, see ``folder_of``.
     """
 
-    def __init__(self, workbench: Bench, on_change: Callable[[], None], folder: Path) -> None:
+    def __init__(self, workbench: WorkbenchSession, on_change: Callable[[], None], folder: Path) -> None:
         self._workbench, self._on_change, self._folder = workbench, on_change, folder
         self._thread: threading.Thread | None = None
         self.made: list[ReportJob] = []
@@ -113,7 +113,7 @@ class ReportMaker:
         low, high = received - round(before * 1e9), received + round(after * 1e9)
         request = ReportRequest(
             paths=workbench.paths,
-            config=revised(workbench.drive.config, settings),
+            config=changed_config(workbench.drive.config, settings),
             at=iso(received),
             before=before,
             after=after,

@@ -23,7 +23,7 @@ from bevviz.workbench.page_connection import PageConnection, news_event
 from bevviz.workbench.startup import SessionStartup
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench
+    from bevviz.workbench.session import WorkbenchSession
 
 Kind = Literal["page", "native", "live"]  # viewer in the page, native viewer, page of a running robot
 
@@ -116,13 +116,13 @@ class Site:
 
     async def config(self, request: Request) -> Response:
         """Return the configuration with the tried settings as a YAML file."""
-        from bevviz.config import dump, revised
+        from bevviz.config import changed_config, config_yaml
 
         workbench = await self._startup.session()
         if workbench is None:
             return PlainTextResponse("the drive cannot be opened\n", 503)
         try:
-            text = dump(revised(workbench.drive.config, request.query_params.getlist("set")))
+            text = config_yaml(changed_config(workbench.drive.config, request.query_params.getlist("set")))
         except UserError as error:
             return PlainTextResponse(str(error), 400)
         headers = {"Content-Disposition": 'attachment; filename="bevviz.yaml"'}
@@ -196,7 +196,7 @@ class Site:
                 return
             await self._visit(workbench, socket).stay()
 
-    def _visit(self, workbench: Bench, socket: WebSocket) -> PageConnection:
+    def _visit(self, workbench: WorkbenchSession, socket: WebSocket) -> PageConnection:
         return PageConnection(workbench, socket, self._desk, self._run)
 
     async def native(self, socket: WebSocket) -> None:
@@ -208,7 +208,7 @@ class Site:
         await workbench.native.talk(socket)
 
 
-class Heard:
+class PageState:
     """State of a page, from its messages on one socket.
 
     Attributes:
@@ -224,9 +224,9 @@ class Heard:
 
 
 @contextlib.asynccontextmanager
-async def page_state(socket: WebSocket, news: asyncio.Event) -> AsyncIterator[Heard]:
+async def page_state(socket: WebSocket, news: asyncio.Event) -> AsyncIterator[PageState]:
     """Yield the state of a page, updated by its messages, and set ``more`` at each of them."""
-    state = Heard()
+    state = PageState()
 
     async def listen() -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):

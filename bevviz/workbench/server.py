@@ -15,18 +15,18 @@ from bevviz.errors import UserError
 from bevviz.workbench.access import HOSTS
 from bevviz.workbench.routes import VIEWER, Kind, application
 from bevviz.workbench.startup import SessionStartup
-from bevviz.workbench.token import kept_token
+from bevviz.workbench.token import persistent_token
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
-    from bevviz.workbench.session import Bench
+    from bevviz.workbench.session import WorkbenchSession
 
 PORT = 9880  # The default is fixed, because browsers cache the compiled viewer by its address.
 
 
 def serve(
-    make: Callable[[], Bench],
+    make: Callable[[], WorkbenchSession],
     drive: str,
     port: int | None,
     ready: Callable[[str], None],
@@ -48,7 +48,7 @@ def serve(
     viewer = viewer_folder()
     with bound_socket(port) as listening:
         port = listening.getsockname()[1]
-        with kept_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
+        with persistent_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
             app = application(startup, viewer, version("rerun-sdk"), token, port, kind)
 
             def begin() -> None:

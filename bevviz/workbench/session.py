@@ -16,32 +16,32 @@ import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import Onsets
-from bevviz.config import Config, revised
+from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import Truth
 from bevviz.model.frame import Frame
-from bevviz.model.protocols import Frames, Items, Observer
+from bevviz.model.protocols import FrameSource, Items, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
 from bevviz.pipeline.notes import Note, Notes
-from bevviz.pipeline.perceive import describe
+from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
 from bevviz.pipeline.variants import Variants, check_same_frames
 from bevviz.recording import blueprints, entities
-from bevviz.recording.frame_logger import Logger
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION
-from bevviz.recording.writer import WAIT
-from bevviz.support.contexts import Closing
-from bevviz.why import Answer, Questioner
+from bevviz.recording.writer import SCALAR_WAIT
+from bevviz.support.contexts import Closable
+from bevviz.why import Answer, FrameExplainer
 from bevviz.why.log import mark_answers
 from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection, surroundings
+from bevviz.why.pick_answers import selection_of, surroundings_of
 from bevviz.workbench.finding_list import FindingList
-from bevviz.workbench.findings import Finding, finds, with_reasons
+from bevviz.workbench.findings import Finding, find_findings, with_reasons
 from bevviz.workbench.findings_layer import FindingRows, log_layer
-from bevviz.workbench.recording_buffer import Film
+from bevviz.workbench.recording_buffer import RecordingBuffer
 from bevviz.workbench.reports import ReportMaker, folder_of
-from bevviz.workbench.trials import TrialRunner, attempt, tried_logger
+from bevviz.workbench.trials import TrialRunner, trial_effects, tried_logger
 from bevviz.workbench.truth_frames import TruthOf
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ BOTH = (entities.STAMP, entities.TRIED)
 Settings = tuple[str, ...]
 
 
-class Bench(Closing):
+class WorkbenchSession(Closable):
     """Workbench session of one drive.
 
     Ask questions from one thread only. Listeners are called from any thread. A result of the run is logged
@@ -87,14 +87,14 @@ class Bench(Closing):
     def __init__(
         self,
         drive: Drive,
-        again: Frames,
+        again: FrameSource,
         paths: Sequence[Path],
         truth_of: TruthOf | None = None,
         first: int = 0,
     ) -> None:
         self.drive, self.again, self.paths, self.truth_of = drive, again, paths, truth_of
         self._first = first
-        self.film, self.desk = Film(), Film()
+        self.film, self.desk = RecordingBuffer(), RecordingBuffer()
         self.entries = FindingList()
         self.opening: int | None = None
         self.done, self.over, self.error = 0, False, ""
@@ -111,7 +111,7 @@ class Bench(Closing):
         self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
-        self._last_questioner: Questioner | None = None
+        self._last_questioner: FrameExplainer | None = None
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
         self.native: NativeViewer | None = None
@@ -120,10 +120,10 @@ class Bench(Closing):
         self._desk, self._desk_stream = self.stream()
         layout = blueprints.load("workbench", drive.scene, drive.config)
         self._main.send_blueprint(layout, make_active=True)
-        self._logger = Logger(self._main, drive.config, drive.scene, wait=WAIT, stamps=BOTH)
+        self._logger = FrameLogger(self._main, drive.config, drive.scene, wait=SCALAR_WAIT, stamps=BOTH)
         self._logger.apart = True  # Pages receive frames in any order, so each is complete.
         self._logger.log_static()
-        self._desk_logger = Logger(self._desk, drive.config, drive.scene, stamps=BOTH)
+        self._desk_logger = FrameLogger(self._desk, drive.config, drive.scene, stamps=BOTH)
         self._tried_logger = tried_logger(self._desk, drive.session, self)
         self.trials, self.reports = (
             TrialRunner(self, self.tell),
@@ -185,7 +185,7 @@ class Bench(Closing):
     def _run(self) -> None:
         try:
             first = self.look(self._first)
-            self._show(first, finds(first, self.truth(first.frame)))
+            self._show(first, find_findings(first, self.truth(first.frame)))
             self._go.wait(FIRST)
             session = self.drive.new_session()
             run(self.again, session, [_RunObserver(self)], stop=self._stop)
@@ -203,10 +203,12 @@ class Bench(Closing):
     def see(self, result: FrameResult) -> None:
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
-        findings = finds(result, self.truth(frame))
+        findings = find_findings(result, self.truth(frame))
         if any(finding.what == "missed" for finding in findings):
             names = self.drive.session.stages.class_names
-            findings = with_reasons(findings, result, Questioner(result, self.drive.session.loader, names))
+            findings = with_reasons(
+                findings, result, FrameExplainer(result, self.drive.session.loader, names)
+            )
         self._show(result, findings)
         self._reached = max(self._reached, frame.stamp)
         if result.tracks is not None:
@@ -244,7 +246,7 @@ class Bench(Closing):
 
     def _draw(
         self,
-        logger: Logger,
+        logger: FrameLogger,
         result: FrameResult,
         findings: Sequence[Finding],
         *,
@@ -255,7 +257,7 @@ class Bench(Closing):
         logger.log(result, beside=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
         self._layers[result.frame.index, tried] = layers[0]
 
-    def draw_tried(self, logger: Logger, result: FrameResult, findings: Sequence[Finding]) -> None:
+    def draw_tried(self, logger: FrameLogger, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Log a frame with other values beside the result of the run."""
         logger.refresh(self._logger.results)
         # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
@@ -295,9 +297,9 @@ class Bench(Closing):
         stamps = list(self._stamps)
         if not stamps:
             raise UserError("no frame has been run yet")
-        index = bisect.bisect_right(stamps, (stamp + entities.SLACK, 2**62)) - 1
+        index = bisect.bisect_right(stamps, (stamp + entities.TIME_TOLERANCE, 2**62)) - 1
         at, number = stamps[max(index, 0)]
-        if self.over or stamp <= self._reached or abs(stamp - at) <= entities.SLACK:
+        if self.over or stamp <= self._reached or abs(stamp - at) <= entities.TIME_TOLERANCE:
             return number
         return self._find_frame(stamp, number)
 
@@ -306,9 +308,9 @@ class Bench(Closing):
         with self._looking:
             scans, frame = self.drive.frames.scans, self.look(start).frame
             number = int(np.abs(scans - (stamp + int(scans[start]) - frame.stamp)).argmin())
-            while number > 0 and self._stamp_of(number) > stamp + entities.SLACK:
+            while number > 0 and self._stamp_of(number) > stamp + entities.TIME_TOLERANCE:
                 number -= 1
-            while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + entities.SLACK:
+            while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + entities.TIME_TOLERANCE:
                 number += 1
             return number
 
@@ -319,7 +321,7 @@ class Bench(Closing):
 
     def film_row(self, stamp: int) -> int | None:
         """Return the row in ``film`` of the frame that a viewer shows at a stamp."""
-        index = bisect.bisect_right(self._stamps, (stamp + entities.SLACK, 2**62)) - 1
+        index = bisect.bisect_right(self._stamps, (stamp + entities.TIME_TOLERANCE, 2**62)) - 1
         return self._rows.get(self._stamps[index][0]) if index >= 0 else None
 
     def truth(self, frame: Frame) -> Truth | None:
@@ -342,11 +344,11 @@ class Bench(Closing):
     def _look(self, number: int, settings: Settings) -> FrameResult:
         key = number, settings
         if key not in self._results:
-            config = revised(self.drive.config, settings) if settings else self.drive.config
+            config = changed_config(self.drive.config, settings) if settings else self.drive.config
             check_same_frames({"the drive": self.drive.config, "what is tried": config})
             known_frames = [result.frame for (n, _), result in self._results.items() if n == number]
             frame = known_frames[0] if known_frames else self.drive.raw(number)
-            self._results[key] = describe(self._variants.perceive(frame, config))
+            self._results[key] = add_explanations(self._variants.perceive(frame, config))
             while len(self._results) > KEPT:
                 self._results.popitem(last=False)
         self._results.move_to_end(key)
@@ -371,13 +373,13 @@ class Bench(Closing):
             UserError: there is no such object in the frame.
         """
         questioner = self._questioner(self.look(number, settings))
-        selected = selection(target)
+        selected = selection_of(target)
         candidates = questioner.candidates(selected) if target.is_place else []
         answers = candidates or questioner.ask(selected)
         if not answers:
             raise UserError(f"there is nothing to say about {target}")
         answer = answers[0]
-        if not candidates and (nearby := surroundings(target, answer)) is not None:
+        if not candidates and (nearby := surroundings_of(target, answer)) is not None:
             candidates = questioner.candidates(nearby)
         others = [other for other in candidates if other.subject.key != answer.subject.key]
         self._mark(questioner.traces.result, answer)
@@ -391,7 +393,7 @@ class Bench(Closing):
             UserError: as ``ask``.
         """
         questioner = self._questioner(self.look(number, settings))
-        selected = selection(target)
+        selected = selection_of(target)
         candidates = questioner.candidates(selected) if target.is_place else []
         answer = questioner.with_hints((candidates or questioner.ask(selected))[0])
         self._keep(number, settings, target, answer)
@@ -442,11 +444,11 @@ class Bench(Closing):
         self.notes_changed += 1
         self.tell()
 
-    def _questioner(self, result: FrameResult) -> Questioner:
+    def _questioner(self, result: FrameResult) -> FrameExplainer:
         """Return the questioner of a result. Further questions about it reuse the same one."""
         if self._last_questioner is None or self._last_questioner.traces.result is not result:
             session = self.drive.session
-            self._last_questioner = Questioner(result, session.loader, session.stages.class_names)
+            self._last_questioner = FrameExplainer(result, session.loader, session.stages.class_names)
         return self._last_questioner
 
     def _mark(self, result: FrameResult, answer: Answer) -> None:
@@ -461,7 +463,7 @@ class Bench(Closing):
         Raises:
             UserError: a parameter is unknown, or a value is wrong.
         """
-        return revised(self.drive.config, settings)
+        return changed_config(self.drive.config, settings)
 
     def attempt(self, number: int, settings: Settings, target: Pick | None = None) -> dict[str, Any]:
         """Log a frame with other values, and return their effects.
@@ -476,17 +478,17 @@ class Bench(Closing):
         """
         before, after = self.look(number), self.look(number, settings)
         truth = self.truth(after.frame)
-        self.draw_tried(self._tried_logger, after, finds(after, truth))
+        self.draw_tried(self._tried_logger, after, find_findings(after, truth))
         self._tried_logger.flush()
         self.desk.add(self._desk_stream.read())
         truth_row = target.row if target is not None and target.kind == "truth" else -1
-        return attempt(before, after, truth, truth_row)
+        return trial_effects(before, after, truth, truth_row)
 
 
 class _RunObserver(Observer[FrameResult]):
     """Observer of the background run. It passes each frame to the workbench session."""
 
-    def __init__(self, workbench: Bench) -> None:
+    def __init__(self, workbench: WorkbenchSession) -> None:
         self._workbench = workbench
 
     def begin(self, items: Items[object]) -> None:

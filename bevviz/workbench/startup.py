@@ -7,13 +7,13 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench
+    from bevviz.workbench.session import WorkbenchSession
 
 
-class SessionStartup(Closing):
+class SessionStartup(Closable):
     """Start-up that makes the workbench session in a thread of its own.
 
     Args:
@@ -21,9 +21,9 @@ class SessionStartup(Closing):
         failed: called from that thread if ``make`` raises.
     """
 
-    def __init__(self, make: Callable[[], Bench], failed: Callable[[], None]) -> None:
+    def __init__(self, make: Callable[[], WorkbenchSession], failed: Callable[[], None]) -> None:
         self._make, self._failed = make, failed
-        self._workbench: Bench | None = None
+        self._workbench: WorkbenchSession | None = None
         self._over = threading.Event()
         self._closed = False
         self._lock = threading.Lock()
@@ -50,7 +50,7 @@ class SessionStartup(Closing):
             workbench.start()
         self._over.set()
 
-    async def session(self) -> Bench | None:
+    async def session(self) -> WorkbenchSession | None:
         """Wait until the session is made, and return it. None: it could not be made."""
         while not self._over.is_set():
             await asyncio.sleep(0.02)

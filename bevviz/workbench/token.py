@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 @contextmanager
-def kept_token(port: int, drive: str) -> Iterator[str]:
+def persistent_token(port: int, drive: str) -> Iterator[str]:
     """Yield the token for the server of a drive at a port.
 
     A token that a killed server of the same drive left at the same port is used again. Otherwise the token is

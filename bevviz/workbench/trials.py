@@ -10,26 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.config import changes, revised
+from bevviz.config import changed_config, changes
 from bevviz.errors import UserError, first_line
-from bevviz.evaluate import Score, Truth
-from bevviz.model.counts import OPINIONS, opinions_in
+from bevviz.evaluate import ObjectScore, Truth
+from bevviz.model.counts import OPINIONS, count_opinions
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.variants import check_same_frames
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import Logger
-from bevviz.recording.writer import WAIT
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.why.frame_index import truth_subjects
 from bevviz.why.pick import Pick
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
-from bevviz.workbench.findings import Finding, finds, fixed_position
+from bevviz.workbench.findings import Finding, find_findings, fixed_position
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Bench, Settings
+    from bevviz.workbench.session import Settings, WorkbenchSession
 
 DIFFERENCES = ("fixed", "broken", "new false", "false gone", "new", "gone")  # kinds of findings
 
@@ -59,7 +59,7 @@ class Trial:
     done: int = 0
     strip: list[tuple[int, int, int]] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
-    scores: tuple[Score, Score] = field(default_factory=lambda: (Score(), Score()))
+    scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
     known: bool = False
     stop: threading.Event = field(default_factory=threading.Event)
 
@@ -92,7 +92,7 @@ class TrialRunner:
         on_change: called when the state of the trial has changed.
     """
 
-    def __init__(self, workbench: Bench, on_change: Callable[[], None]) -> None:
+    def __init__(self, workbench: WorkbenchSession, on_change: Callable[[], None]) -> None:
         self._workbench, self._on_change = workbench, on_change
         self._recording, self.film = workbench.stream()
         self._thread: threading.Thread | None = None
@@ -105,7 +105,7 @@ class TrialRunner:
             UserError: nothing is changed, a parameter is unknown, or a value is wrong.
         """
         workbench = self._workbench
-        config = revised(workbench.drive.config, settings)
+        config = changed_config(workbench.drive.config, settings)
         check_same_frames({"the drive": workbench.drive.config, "what is tried": config})
         if not changes(workbench.drive.config, config):
             raise UserError("nothing is changed: press a hint, or change a parameter first")
@@ -151,7 +151,9 @@ class TrialRunner:
 class _TrialObserver(Observer[FrameResult]):
     """Observer of a trial. It logs each frame with the other values and counts the changes."""
 
-    def __init__(self, workbench: Bench, trial: Trial, logger: Logger, show: Callable[[], None]) -> None:
+    def __init__(
+        self, workbench: WorkbenchSession, trial: Trial, logger: FrameLogger, show: Callable[[], None]
+    ) -> None:
         self._workbench, self._trial, self._logger, self._show = workbench, trial, logger, show
 
     def begin(self, items: Items[object]) -> None:
@@ -160,7 +162,7 @@ class _TrialObserver(Observer[FrameResult]):
     def see(self, result: FrameResult) -> None:
         workbench, trial, frame = self._workbench, self._trial, result.frame
         before, truth = workbench.objects(frame.index), workbench.truth(frame)
-        workbench.draw_tried(self._logger, result, finds(result, truth))
+        workbench.draw_tried(self._logger, result, find_findings(result, truth))
         subjects = truth_subjects(frame, workbench.drive.session.stages.class_names)
         side_effects = effects(before, result.objects, subjects)
         findings = list(difference_findings(result, side_effects, subjects, before))
@@ -187,10 +189,15 @@ class _TrialObserver(Observer[FrameResult]):
         self._show()
 
 
-def tried_logger(recording: Any, session: Session, workbench: Bench) -> Logger:
+def tried_logger(recording: Any, session: Session, workbench: WorkbenchSession) -> FrameLogger:
     """Return a logger that writes tried results on a timeline of their own, beside those of the run."""
-    return Logger(
-        recording, session.config, workbench.drive.scene, wait=WAIT, stamps=(entities.TRIED,), inputs=False
+    return FrameLogger(
+        recording,
+        session.config,
+        workbench.drive.scene,
+        wait=SCALAR_WAIT,
+        stamps=(entities.TRIED,),
+        inputs=False,
     )
 
 
@@ -230,7 +237,7 @@ def difference_findings(
             yield make_finding(kind, effect.name, center, Pick("object", effect.before)), False
 
 
-def attempt(
+def trial_effects(
     before: FrameResult, after: FrameResult, truth: Truth | None, truth_row: int = -1
 ) -> dict[str, Any]:
     """Return the effects of other values on one frame, for the page.
@@ -256,7 +263,7 @@ def attempt(
 
 def _opinions(before: FrameResult, after: FrameResult) -> dict[str, list[int | None]]:
     """Return the counts of opinions that changed, before and after. None: the objects are our own."""
-    counts_before, counts_after = opinions_in(before), opinions_in(after)
+    counts_before, counts_after = count_opinions(before), count_opinions(after)
     counts = {opinion: [counts_before.get(opinion), counts_after.get(opinion)] for opinion in OPINIONS}
     return {
         opinion.replace("_", " "): [old, new]
@@ -284,7 +291,7 @@ def _names(result: FrameResult) -> list[str]:
 
 
 def _f1(result: FrameResult, truth: Truth) -> float | None:
-    score = Score()
+    score = ObjectScore()
     if result.objects is None:
         return None
     score.add(result.objects, truth)

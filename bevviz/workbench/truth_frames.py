@@ -9,12 +9,12 @@ import numpy as np
 
 from bevviz.evaluate import Truth
 from bevviz.model.frame import I64, Frame, LabelledBoxes3D, Scene
-from bevviz.model.protocols import Frames
+from bevviz.model.protocols import FrameSource
 
 TruthOf = Callable[[Frame], Truth | None]
 
 
-class Labelled:
+class LabelledFrames:
     """A source of frames that adds the ground truth to each frame.
 
     Args:
@@ -22,7 +22,7 @@ class Labelled:
         truth_of: returns the ground truth of a frame.
     """
 
-    def __init__(self, frames: Frames, truth_of: TruthOf) -> None:
+    def __init__(self, frames: FrameSource, truth_of: TruthOf) -> None:
         self._frames, self._truth_of = frames, truth_of
 
     @property

@@ -33,7 +33,7 @@ from bevviz.bags.mcap import (
     read_times,
     unpack_chunk,
 )
-from bevviz.bags.reader import LAST_TIME, Bytes, MemoryBytes
+from bevviz.bags.reader import LAST_TIME, FileBytes, MemoryBytes
 
 RECORD_START = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
@@ -73,7 +73,9 @@ class RecordWalker:
         span: first and last plausible log time of a message found by searching; None: not known yet.
     """
 
-    def __init__(self, source: Bytes, channels: Container[int], span: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, source: FileBytes, channels: Container[int], span: tuple[int, int] | None = None
+    ) -> None:
         self._source, self._channels, self._span = source, channels, span
         self.broken = self.passed = 0  # places without a sound record, and their bytes
 
@@ -256,7 +258,7 @@ class RecordWalker:
         return None
 
 
-def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> None:
+def scan(file: FileBytes, result: ScanResult, report: Callable[[int], object]) -> None:
     """Scan a file from front to back, with the content of every chunk."""
     channels = Channels()
     walker = RecordWalker(file, channels)
@@ -285,7 +287,7 @@ def scan(file: Bytes, result: ScanResult, report: Callable[[int], object]) -> No
     result.index.connections = channels.connections(result.finish(channels, outside))
 
 
-def _read_head(file: Bytes, body: int, end: int) -> Chunk:
+def _read_head(file: FileBytes, body: int, end: int) -> Chunk:
     first, last, size, crc, name_size = CHUNK_HEAD.unpack(file.read(body, CHUNK_HEAD.size))
     name = file.read(body + CHUNK_HEAD.size, name_size).decode()
     data = body + CHUNK_HEAD.size + name_size + 8
@@ -293,7 +295,7 @@ def _read_head(file: Bytes, body: int, end: int) -> Chunk:
     return Chunk(first, last, data, min(end, file.size) - data, size, name, {}, crc, times={}, cut=cut)
 
 
-def _describe(file: Bytes, chunk: Chunk, channels: Channels, result: ScanResult) -> None:
+def _describe(file: FileBytes, chunk: Chunk, channels: Channels, result: ScanResult) -> None:
     """Fill in the messages and channels of a chunk."""
     times: dict[int, array[int]] = defaultdict(lambda: array("q"))
     data, chunk.damage, _ = unpack_chunk(file, chunk)
@@ -311,7 +313,7 @@ def _describe(file: Bytes, chunk: Chunk, channels: Channels, result: ScanResult)
     chunk.fill(times)
 
 
-def read_messages(file: Bytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
+def read_messages(file: FileBytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
     """Return the messages of a chunk on the channels of its index, and the damage of its content."""
     content, damage, checked = unpack_chunk(file, chunk)
     data = memoryview(content)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.bags.reader import Bytes
+from bevviz.bags.reader import FileBytes
 
 MAGIC = b"SQLite format 3\0"
 LEAF = 0x0D  # first byte of a page with table rows
@@ -23,9 +23,9 @@ class Pages:
     """Pages of a file, numbered from 1. A page in the log replaces that of the file."""
 
     def __init__(self, path: Path) -> None:
-        self._file = Bytes(path)
+        self._file = FileBytes(path)
         log = log_path(path)
-        self._log = Bytes(log) if log.exists() else None
+        self._log = FileBytes(log) if log.exists() else None
         self.in_log: dict[int, int] = {}  # offset of the newest version by page number
         self.log_frames = 0  # number of log frames with a wrong checksum
         head = self._file.read(0, 100)
@@ -89,7 +89,7 @@ class Pages:
         if self._log is not None:
             self._log.close()
 
-    def _read_log(self, log: Bytes) -> None:
+    def _read_log(self, log: FileBytes) -> None:
         """Find the newest committed version of each page in the log, without frames of a wrong checksum."""
         head = log.read(0, LOG_HEAD.size)
         if len(head) < LOG_HEAD.size:

@@ -9,14 +9,14 @@ from urllib.parse import urlsplit
 
 from bevviz.errors import UserError, first_line
 from bevviz.fleet.engine.task import JobResult, JobResults, Task
-from bevviz.recording.ports import answers
-from bevviz.support.contexts import Closing
+from bevviz.recording.ports import is_listening
+from bevviz.support.contexts import Closable
 
 WAITING = 2  # jobs for each thread of the cluster, so that no thread has to wait for the next one
 TICK = 0.2  # seconds
 
 
-class Cluster(Closing):
+class Cluster(Closable):
     """Existing Dask cluster.
 
     If a worker dies, the cluster runs its job again on another one. Its setting
@@ -35,7 +35,7 @@ class Cluster(Closing):
         except ImportError:
             raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
         url = urlsplit(address)
-        if url.hostname and url.port and not answers(url.hostname, url.port):
+        if url.hostname and url.port and not is_listening(url.hostname, url.port):
             raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
         try:
             self._client = Client(address, timeout="10s")

@@ -15,7 +15,7 @@ from multiprocessing.context import SpawnProcess
 
 from bevviz.fleet.engine.task import JobResult, JobResults, Task
 from bevviz.support import progress
-from bevviz.support.contexts import Closing
+from bevviz.support.contexts import Closable
 
 # concurrent.futures does not fit: a worker that dies breaks the pool and all its jobs.
 
@@ -33,7 +33,7 @@ class _Worker:
     job: Task | None = None
 
 
-class Processes(Closing):
+class Processes(Closable):
     """Worker processes, started at once.
 
     Args:
@@ -46,7 +46,7 @@ class Processes(Closing):
         self._idle: list[_Worker] = []
         try:
             while len(self._idle) < count:
-                self._idle.append(self._start(speaks=progress.heard() and not self._idle))
+                self._idle.append(self._start(speaks=progress.has_receiver() and not self._idle))
         except BaseException:
             self.close()
             raise
@@ -182,7 +182,9 @@ def _end(worker: _Worker) -> None:
 def _work(pipe: Connection, threads: int, speaks: bool) -> None:
     """Run jobs in the worker process until the other end of the pipe is closed."""
     # Workers compile the stages at the same time. Only one of them reports it.
-    progress.to((lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False)
+    progress.set_receiver(
+        (lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False
+    )
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ["OMP_NUM_THREADS"] = str(threads)  # Open3D reads it when it is loaded.
     import cv2

@@ -20,7 +20,7 @@ from bevviz.stages.detector.masks import masks as make_masks
 from bevviz.stages.detector.metadata import DEFAULT_STRIDE, stated_size, stated_stride
 from bevviz.stages.detector.names import metadata_names, read_names
 from bevviz.stages.detector.providers import open_session
-from bevviz.stages.detector.session import NetworkSession, listed, reading
+from bevviz.stages.detector.session import NetworkSession, list_tensors, reading_answer
 from bevviz.stages.detector.suppression import nms
 from bevviz.support.text import did_you_mean
 
@@ -97,7 +97,7 @@ class Detector:
             names=names,
             outputs=self._probe(),
         )
-        with reading(self._where):
+        with reading_answer(self._where):
             self._head = find_head(facts)
         self.names, self.layout = self._head.names, self._head.layout
         self._wanted = self._wanted_classes()
@@ -149,7 +149,7 @@ class Detector:
             UserError: as in ``__call__``.
         """
         config, where = self._config, inference.where
-        with reading(self._where):
+        with reading_answer(self._where):
             xyxy, score, class_id, table_row = self._head.candidates(
                 inference.outputs, where.input_size, config.explain_threshold
             )
@@ -181,7 +181,7 @@ class Detector:
         if self._head.prototypes:
             kept = np.flatnonzero(state[row] == DetectionState.KEPT)
             mask_rows = table_row[order[row[kept]]]
-            with reading(self._where):
+            with reading_answer(self._where):
                 weights = self._head.coefficients(inference.outputs, mask_rows)
                 masks = make_masks(
                     weights, inference.outputs[-1][0], input_xyxy[row[kept]], kept, len(row), where
@@ -200,7 +200,7 @@ class Detector:
     def _check_inputs(self, image: Any, others: list[Any]) -> None:
         """Raise a UserError if the inputs are not those of a detector."""
         shape = image.shape
-        inputs = listed((i.name, i.shape) for i in (image, *others))
+        inputs = list_tensors((i.name, i.shape) for i in (image, *others))
         batch = shape[0] if self._rank == 4 and isinstance(shape[0], int) else 1
         sizes = [i.type == "tensor(int64)" and len(i.shape) == 2 and i.shape[1] == 2 for i in others]
         if self._rank not in (3, 4) or shape[-3] != 3 or len(sizes) > 1 or not all(sizes):

@@ -18,7 +18,7 @@ from bevviz.stages.detector import outputs as read
 from bevviz.stages.detector.image import ImageFit, InputFormat, Resampling
 from bevviz.stages.detector.names import COCO, COCO_CATEGORIES, MAX_CLASSES, default_names
 from bevviz.stages.detector.outputs import BoxFormat, Candidates, ListedBoxes, ScoredBoxes
-from bevviz.stages.detector.session import clip, listed
+from bevviz.stages.detector.session import clip, list_tensors
 
 CLASS_OFFSET = 7680.0  # pixels by which Ultralytics shifts the boxes of each class in its NMS
 
@@ -392,7 +392,7 @@ def find_head(facts: ModelFacts) -> Head:
         if match is not None:
             reason = match
             break
-    shapes = listed((name, np.shape(output)) for name, output in facts.outputs.items())
+    shapes = list_tensors((name, np.shape(output)) for name, output in facts.outputs.items())
     raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
 
 

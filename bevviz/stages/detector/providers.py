@@ -41,7 +41,7 @@ def open_session(path: Path, asked: str, options: ort.SessionOptions, where: str
     """
     session, failed = _open_with_reasons(path, asked, options, where or f"detector.model {path}")
     for name, reason in failed.items():
-        tell(f"the network runs on {session.provider}: {name} is installed, but {reason}")
+        say_once(f"the network runs on {session.provider}: {name} is installed, but {reason}")
     return session
 
 
@@ -68,7 +68,7 @@ def _open_with_reasons(
         chosen = [name for name in available if name.lower() == wanted]
         if not chosen:
             raise UserError(f"detector.provider {asked}: not here; available: {', '.join(available)}")
-        if reason := obstacle(chosen[0]):
+        if reason := why_unavailable(chosen[0]):
             raise UserError(f"detector.provider {asked}: {reason}")
         session = NetworkSession(path, chosen, options, where, f"{where} on detector.provider {asked}")
         if session.provider != chosen[0]:
@@ -81,7 +81,7 @@ def _open_with_reasons(
     for name in [name for name in PROVIDERS if name in available]:
         if name == "CPU":
             session = NetworkSession(path, [name], options, where)
-        elif reason := obstacle(name):
+        elif reason := why_unavailable(name):
             failed[name] = reason
             continue
         else:
@@ -97,7 +97,7 @@ def _open_with_reasons(
 
 
 @lru_cache
-def obstacle(name: str) -> str:
+def why_unavailable(name: str) -> str:
     """Return why an installed execution provider cannot be loaded, empty if no reason is known."""
     folder = Path(ort.__file__).parent / "capi"
     if not (folder / LIBRARIES.get(name, "")).is_file():
@@ -116,6 +116,6 @@ def obstacle(name: str) -> str:
 
 
 @lru_cache
-def tell(line: str) -> None:
+def say_once(line: str) -> None:
     """Print a line, once for each text."""
     progress.say(line)

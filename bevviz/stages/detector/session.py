@@ -179,14 +179,14 @@ class NetworkSession:
     def _check_answer(self, names: Sequence[str], arrays: Sequence[Any]) -> None:
         """Check the size of the outputs."""
         if sum(array.size for array in arrays) > MAX_OUTPUT_NUMBERS:
-            shapes = listed((name, np.shape(array)) for name, array in zip(names, arrays, strict=True))
+            shapes = list_tensors((name, np.shape(array)) for name, array in zip(names, arrays, strict=True))
             raise UserError(
                 f"{self.where}: answers more than {MAX_OUTPUT_NUMBERS:,} numbers: {shapes}; {SIZE_HINT}"
             )
 
 
 @contextmanager
-def reading(where: str) -> Iterator[None]:
+def reading_answer(where: str) -> Iterator[None]:
     """Convert errors while reading a network's answer, which may have any shape and any numbers.
 
     Raises:
@@ -204,7 +204,7 @@ def reading(where: str) -> Iterator[None]:
         ) from None
 
 
-def listed(tensors: Iterable[tuple[str, Any]]) -> str:
+def list_tensors(tensors: Iterable[tuple[str, Any]]) -> str:
     """List names and shapes of inputs or outputs for an error message, with a limited length.
 
     >>> listed([("images", [1, 3, 640, 640]), ("scale", (1, 2))])

@@ -16,7 +16,7 @@ import numpy as np
 
 from bevviz.config.pillars import PillarParams
 from bevviz.model.frame import F32, F64, I64
-from bevviz.stages.detector.session import listed
+from bevviz.stages.detector.session import list_tensors
 
 MAX_LOG_SIZE = 10.0  # largest logarithm of a size; larger values would overflow
 
@@ -65,7 +65,7 @@ def find_head(outputs: Mapping[str, Any], params: PillarParams) -> Head:
     try:
         return _find_anchors(outputs, params) if params.anchors else _find_centers(outputs, params)
     except ValueError as error:
-        shapes = listed((name, np.shape(output)) for name, output in outputs.items())
+        shapes = list_tensors((name, np.shape(output)) for name, output in outputs.items())
         raise ValueError(f"{error}; its outputs: {shapes}") from None
 
 
@@ -215,14 +215,14 @@ class Anchors:
         cells, which = rows // each, (np.arange(len(rows)), rows % each)
         columns = self.box.at(outputs, cells)
         deltas = columns.reshape(len(rows), each, columns.shape[1] // each)[which][:, :7]
-        boxes = decoded(deltas.astype(np.float64), self.anchors[rows])
+        boxes = decode_boxes(deltas.astype(np.float64), self.anchors[rows])
         if self.direction is not None:
             facing = self.direction.at(outputs, cells).reshape(len(rows), each, 2)[which].argmax(axis=1)
             boxes[:, 6] = resolve_direction(boxes[:, 6], facing, params)
         return Candidates(boxes, score[rows, class_id], class_id, np.zeros(len(rows), np.int64))
 
 
-def places(shape: tuple[int, int], params: PillarParams) -> F64:
+def anchor_boxes(shape: tuple[int, int], params: PillarParams) -> F64:
     """Return the anchors of a map with (ny, nx) cells as (ny * nx * anchors * rotations, 7).
 
     Rotations vary fastest.
@@ -244,7 +244,7 @@ def places(shape: tuple[int, int], params: PillarParams) -> F64:
     return grid.reshape(-1, 7)
 
 
-def decoded(deltas: F64, anchors: F64) -> F64:
+def decode_boxes(deltas: F64, anchors: F64) -> F64:
     """Return the (K, 7) boxes of offsets relative to these anchors (Yan et al. 2018, SECOND)."""
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     boxes = np.empty_like(anchors)
@@ -304,7 +304,7 @@ def _find_anchors(outputs: Mapping[str, Any], params: PillarParams) -> Anchors:
         raise ValueError(
             f"output {roles['direction']} tells front from back, and objects.direction_offset is not set"
         )
-    return Anchors(maps["score"], maps["box"], maps.get("direction"), places(shape, params), params)
+    return Anchors(maps["score"], maps["box"], maps.get("direction"), anchor_boxes(shape, params), params)
 
 
 # --- boxes relative to centres -----------------------------------------------------------------

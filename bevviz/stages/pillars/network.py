@@ -13,8 +13,8 @@ import onnxruntime as ort
 from bevviz.config.pillars import MAX_POINTS, PillarParams
 from bevviz.errors import UserError
 from bevviz.model.frame import F32, Boxes3D
-from bevviz.stages.detector.providers import open_session, tell
-from bevviz.stages.detector.session import NetworkSession, clip, listed, reading
+from bevviz.stages.detector.providers import open_session, say_once
+from bevviz.stages.detector.session import NetworkSession, clip, list_tensors, reading_answer
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import find_head
 from bevviz.stages.pillars.nms import survivors
@@ -177,7 +177,7 @@ class PillarNetwork:
         """Return the input of the second file."""
         inputs, (nx, ny) = self._session.inputs, self._params.grid
         shape = inputs[0].shape
-        inputs_text = listed((i.name, i.shape) for i in inputs)
+        inputs_text = list_tensors((i.name, i.shape) for i in inputs)
         known = len(inputs) == 1 and len(shape) == 4 and isinstance(shape[1], int)
         if not known or inputs[0].type not in FLOATS:
             raise UserError(
@@ -208,7 +208,7 @@ class ObjectNetwork:
     def __init__(self, network: PillarNetwork, params: PillarParams) -> None:
         self.network = network
         self._params = params
-        with reading(network.where):
+        with reading_answer(network.where):
             self._head = find_head(network.probe.outputs, params)
         self.interpret(network.probe)  # also compiles the kernels for the first cloud
 
@@ -236,13 +236,13 @@ class ObjectNetwork:
         """Apply the thresholds to the network's output. The result is that of ``__call__``."""
         params, where = self._params, self.network.where
         if output.left_out_pillars:
-            tell(
+            say_once(
                 f"{where}: clouds hold more than {params.max_pillars:,} pillars (objects.max_pillars); "
                 "those that come last are left out"
             )
         if not output.outputs:
             return Boxes3D.empty(), np.zeros(0, np.float32), []
-        with reading(where):
+        with reading_answer(where):
             candidates = self._head.candidates(output.outputs)
         is_valid = np.isfinite(candidates.boxes).all(axis=1)
         is_valid &= ((candidates.boxes[:, 3:6] > 0) & (candidates.boxes[:, 3:6] < MAX_BOX_SIDE)).all(axis=1)
@@ -276,7 +276,7 @@ def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession
 def _inputs(session: NetworkSession, where: str, *, alone: bool) -> dict[str, Any]:
     """Return role -> input. The number of axes of an input determines its role."""
     inputs = session.inputs
-    inputs_text = listed((i.name, i.shape) for i in inputs)
+    inputs_text = list_tensors((i.name, i.shape) for i in inputs)
     roles: dict[str, Any] = {}
     for node in inputs:
         shape = node.shape
