@@ -8,8 +8,6 @@
 import os
 import sys
 
-from bevviz.support.version import __version__
-
 # Do not import ``typing`` or ``__future__`` here: Python prints a traceback for an interrupt during them.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from bevviz.errors import UserError
     from bevviz.model.frame import Frame
     from bevviz.model.results import FrameResult
+    from bevviz.support.version import __version__
 
 __all__ = ["Config", "Drive", "Frame", "FrameResult", "UserError", "__version__", "open", "simulate"]
 
@@ -33,6 +32,7 @@ _HOMES = {
     "Frame": ("bevviz.model.frame", "Frame"),
     "FrameResult": ("bevviz.model.results", "FrameResult"),
     "UserError": ("bevviz.errors", "UserError"),
+    "__version__": ("bevviz.support.version", "__version__"),
     "open": ("bevviz.drive", "open_drive"),
     "simulate": ("bevviz.drive", "simulate"),
 }

@@ -283,8 +283,8 @@ def test_a_temporary_folder_does_not_outlive_its_process_for_long(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     script = (
         "import os, signal, tempfile; tempfile.tempdir = os.getcwd()\n"
-        "from bevviz.support.files import Scratch\n"
-        "s = Scratch(); s.new(); os.kill(os.getpid(), signal.SIGKILL)\n"
+        "from bevviz.support.files import ScratchFolder\n"
+        "s = ScratchFolder(); s.new(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=PATIENCE)
     assert done.returncode == -signal.SIGKILL
@@ -380,10 +380,10 @@ def test_a_link_to_a_file_of_another_kind_is_refused() -> None:
 
 def test_of_two_that_begin_together_one_goes_on() -> None:
     script = (
-        "import sys, time; from pathlib import Path; from bevviz.support.files import claim\n"
+        "import sys, time; from pathlib import Path; from bevviz.support.files import claim_target\n"
         "from bevviz.errors import UserError\n"
         "sys.stdin.readline()\n"
-        "try: claim(Path('a.rrd'), 'recording'); print('mine', flush=True); sys.stdin.readline()\n"
+        "try: claim_target(Path('a.rrd'), 'recording'); print('mine', flush=True); sys.stdin.readline()\n"
         "except UserError as error: print(error, flush=True)\n"
     )
     command = [sys.executable, "-c", script]

@@ -49,8 +49,8 @@ def test_a_signal_ends_what_has_nothing_to_end(tmp_path: Path, number: signal.Si
     script = (
         "import os, tempfile; tempfile.tempdir = os.getcwd()\n"
         "from bevviz.cli import interrupts\n"
-        "from bevviz.support.files import Scratch\n"
-        "interrupts.install(); Scratch().new()\n"
+        "from bevviz.support.files import ScratchFolder\n"
+        "interrupts.install(); ScratchFolder().new()\n"
         "assert os.listdir()\n"
         "try:\n"
         f"    os.kill(os.getpid(), {number})\n"
@@ -67,12 +67,12 @@ def test_a_file_that_is_being_written_gets_its_end(tmp_path: Path, number: signa
     script = (
         "import os; from pathlib import Path\n"
         "from bevviz.cli import interrupts\n"
-        "from bevviz.support.files import written\n"
+        "from bevviz.support.files import atomic_write\n"
         "interrupts.install()\n"
         "try:\n"
-        "    with written(Path('a.txt'), 'file') as given:\n"
+        "    with atomic_write(Path('a.txt'), 'file') as given:\n"
         f"        given.path.write_text('half'); os.kill(os.getpid(), {number})\n"
-        "except KeyboardInterrupt: print(interrupts.came())\n"
+        "except KeyboardInterrupt: print(interrupts.signal_came())\n"
     )
     assert python(script, tmp_path).stdout == "True\n"
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
@@ -86,7 +86,7 @@ def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: si
         f"signal.signal({number}, signal.SIG_IGN)\n"
         "import bevviz.__main__; from bevviz.cli import interrupts\n"
         "interrupts.install()\n"
-        "with interrupts.terminable() as ended:\n"
+        "with interrupts.interruptible() as ended:\n"
         f"    os.kill(os.getpid(), {number})\n"
         f"os.kill(os.getpid(), {number}); print(ended.is_set())\n"
     )
@@ -108,9 +108,9 @@ def test_what_remains_is_forgotten_in_time() -> None:
 
 def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:
     code = (
-        "import multiprocessing, os, signal\nfrom bevviz import announce\n"
+        "import multiprocessing, os, signal\nfrom bevviz.support import progress\n"
         "multiprocessing.set_start_method('spawn')\n"  # as it is in a worker
-        "assert sum(announce.bar([1, 2])) == 3\nos.kill(os.getpid(), signal.SIGKILL)"
+        "assert sum(progress.bar([1, 2])) == 3\nos.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (-signal.SIGKILL, "")
@@ -119,8 +119,8 @@ def test_a_bar_leaves_no_semaphore_where_its_process_is_killed() -> None:
 INTERRUPTED_AT = """
 import faulthandler, os, sys
 from pathlib import Path
-from bevviz import remains
 from bevviz.recording import sinks
+from bevviz.support import cleanup
 
 FILES = {sinks.__file__}
 
@@ -133,7 +133,7 @@ def interrupt_at(moment, work):
         nonlocal lines
         if frame.f_code.co_filename not in FILES:
             return None
-        if event == "line" and remains.any_unfinished():
+        if event == "line" and cleanup.is_any_unfinished():
             lines += 1
             if lines == moment:
                 raise KeyboardInterrupt

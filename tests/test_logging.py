@@ -833,11 +833,11 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         import os, signal, time
         from pathlib import Path
         from bevviz.config import load
-        from bevviz.recording.frame_logger import Logger
+        from bevviz.recording.frame_logger import FrameLogger
         from bevviz.recording.sinks import open_recording
         from tests.test_logging import SCENE, make
         with open_recording(SCENE, load(), save=Path({str(path)!r})) as sinks:
-            logger = Logger(sinks.recording, load(), SCENE)
+            logger = FrameLogger(sinks.recording, load(), SCENE)
             logger.log_static()
             for index in range(5):
                 logger.log(make(index))
