@@ -228,6 +228,7 @@ def read_messages(path: Path) -> Outcome:
     from bevviz.bags.bag import Recording
     from bevviz.messages import camera_info, clouds, detections, images, transforms
     from bevviz.messages.decoding import MessageError
+    from bevviz.messages.guard import guard
 
     of_type: dict[str, Callable[[Any, str], object]] = {
         "PointCloud2": lambda m, topic: clouds.decode_cloud(m, topic, 0),
@@ -247,7 +248,8 @@ def read_messages(path: Path) -> Outcome:
                 with contextlib.suppress(MessageError):
                     message.header()
                 decoded = recording.decode(message)
-                of_type[message.connection.msgtype.rpartition("/")[2]](decoded, message.topic)
+                decode = of_type[message.connection.msgtype.rpartition("/")[2]]
+                guard(message, decode, decoded, message.topic)
             except MessageError as error:
                 outcome.said.append(str(error))
             except Exception:
