@@ -102,7 +102,7 @@ def main() -> None:
 
 
 def track(tallies: Tallies, source: SyntheticSource, frames: int) -> None:
-    """The beginning of a drive, scan after scan, with the default preset."""
+    """Run the default preset over the first ``frames`` scans of a drive and tally the tracks."""
     session = Session(load(settings=["detector.model=demo"]))
     for index in tqdm(range(min(frames, source.total)), unit="scan", disable=None):
         shot = source.snapshot(index)
@@ -144,7 +144,7 @@ def required(shot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def add_clusters(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
-    """An object is clustered if one kept cluster holds most of its points and is mostly made of them."""
+    """Tally the clustered objects: one kept cluster holds most of the object's points and little else."""
     assert result.clusters is not None and result.voxels is not None and result.ground is not None
     assert shot.frame.truth is not None
     _, first = np.unique(result.voxels.inverse, return_index=True)

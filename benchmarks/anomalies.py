@@ -74,7 +74,7 @@ class Fault:
 
 
 def shots(seed: int, frames: int = FRAMES) -> Iterator[Shot]:
-    """An undisturbed drive, with what the demo's network sees."""
+    """Yield the frames of an undisturbed drive with the detections of the demo network."""
     detector = StageLoader().load(load(settings=["detector.model=demo"])).detector
     assert detector is not None
     source = SyntheticSource(frames, seed)
@@ -89,7 +89,7 @@ def shots(seed: int, frames: int = FRAMES) -> Iterator[Shot]:
 
 
 def _without(found: Detections, gone: Bool) -> Detections:
-    """Detections but for some. Whoever was suppressed stays so."""
+    """Return the detections without the rows ``gone``. A suppressed detection stays suppressed."""
     rows = np.flatnonzero(~gone)
     return Detections(
         found.xyxy[rows],
@@ -225,7 +225,7 @@ def measure(seeds: Sequence[int], config: Config, made: Callable[[int], Iterator
 
 
 def run(session: Session, frame: Frame, found: Detections) -> FrameResult:
-    """The next frame, without what only pictures need."""
+    """Run the stages on the next frame with these detections. Skip what only the images need."""
     detect = session.stages.detect
     assert isinstance(detect, Shown)
     detect.detections = found
@@ -249,10 +249,10 @@ def _delay(
 def targets(
     fault: Fault, window: list[Snapshot], result: FrameResult, reported: list[set[int]]
 ) -> list[Target]:
-    """What a fault can be planted on now: for each label the nearest object that was seen until now.
+    """Return the objects on which the fault can be planted now: for each label the nearest reported object.
 
-    One that was not reported in most of the last frames, or that leaves the image or gets hidden while it is
-    watched, is missed by nobody.
+    An object does not count if it was not reported in most of the last frames. It does not count either if it
+    leaves the image or gets hidden within the window.
     """
     if not fault.labels:
         return [Target(0, "")]

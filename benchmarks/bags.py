@@ -17,7 +17,7 @@ SECOND = 1_000_000_000
 
 
 def simulate(frames: int, path: Path) -> Path:
-    """The synthetic drive as a bag."""
+    """Write the synthetic drive as a bag."""
     source = SyntheticSource(frames=frames)
     write_bag(source, path, tqdm(source, total=source.total, unit="scan", desc="simulate", disable=None))
     return path
@@ -31,7 +31,7 @@ def clouds(bag: Path) -> list[Any]:
 
 
 def repeat(bag: Path, folder: Path, size: int) -> Path:
-    """A bag of ``size`` bytes: the messages of another one over and over, with the time going on."""
+    """Write a bag of ``size`` bytes: repeat the messages of another bag with stamps that continue."""
     times = -(-size // bag.stat().st_size)
     store = typestore()
     with (
@@ -51,7 +51,7 @@ def repeat(bag: Path, folder: Path, size: int) -> Path:
 
 
 def _later(message: Any, by: int) -> Any:
-    """The message itself, its stamps moved."""
+    """Shift the stamps of a message by ``by`` nanoseconds, in place, and return the message."""
     headers: Iterable[Any] = [t.header for t in getattr(message, "transforms", ())] or [message.header]
     for header in headers:
         stamp = header.stamp.sec * SECOND + header.stamp.nanosec + by

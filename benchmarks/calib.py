@@ -56,7 +56,7 @@ class Case:
 
 
 def stated_wrongly(frames: Iterable[Frame], offsets: F64) -> Iterator[Frame]:
-    """The frames with the mounting of their first camera wrong by (7,) ``offsets`` (radians, metres)."""
+    """Yield the frames with the mounting of their first camera wrong by (7,) ``offsets`` (rad, metres)."""
     stated_from_true = geometry.inverse(error_pose(offsets))
     for frame in frames:
         camera = frame.cameras[0]
@@ -77,7 +77,7 @@ class Drive:
         return self.source.map_from_base(stamp) @ self.source.base_from_lidar
 
     def planted(self, offsets: F64) -> Iterator[Frame]:
-        """The frames as a robot would deliver them whose calibration is wrong by (7,) ``offsets``."""
+        """Yield the frames as a robot delivers them whose calibration is wrong by (7,) ``offsets``."""
         camera_from_lidar = geometry.inverse(self.source.base_from_camera) @ self.source.base_from_lidar
         stated = geometry.inverse(error_pose(offsets)) @ camera_from_lidar
         for frame in self.frames:
@@ -219,7 +219,7 @@ def by_axis(cases: list[Case]) -> Iterator[str]:
 
 
 def _columns(cases: list[Case], row: int) -> str:
-    """The largest error where anything is said, the median interval there, how many hold, what is said."""
+    """Format the table columns of one axis: largest error, median interval, intervals that hold, findings."""
     axis = AXES[row]
     known = [case for case in cases if case.result.axes[row].interval < 2 * axis.prior]
     error = max((abs(case.error(row)) for case in known), default=float("nan"))
@@ -232,7 +232,7 @@ def _columns(cases: list[Case], row: int) -> str:
 
 
 def sentences(cases: list[Case]) -> Iterator[str]:
-    """What is said where nothing can be told."""
+    """Yield the reasons given where the calibration cannot be determined, with their counts."""
     said = Counter(
         f"{axis.finding}: {axis.reason}"
         for case in cases

@@ -344,7 +344,7 @@ def busy(page: Page) -> bool:
 
 
 def events(page: Page, kind: str) -> list[dict[str, Any]]:
-    """What the viewer has told of a kind."""
+    """Return the viewer's events of one kind."""
     found: list[dict[str, Any]] = page.evaluate("window.seen")
     return [event for event in found if event["type"] == kind]
 

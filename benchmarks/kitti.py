@@ -121,11 +121,11 @@ def read(root: Path, name: str) -> Shot:
 
 
 def oracle(shot: Shot, off: float = 0.0) -> DetectFunction:
-    """The labels' own boxes as detections, so that only what comes after the detector is judged.
+    """Return a detector whose detections are the label boxes, so that only the later stages are judged.
 
     Args:
         shot: the frame.
-        off: one sigma that their edges are off, as a share of their width and height.
+        off: one sigma of the error of the box edges, as a share of the box's width and height.
     """
     n = len(shot.labels)
     none = np.zeros(n, np.int32)
@@ -312,7 +312,7 @@ VISIBILITIES: dict[str, Callable[[Label], bool]] = {
 
 
 def by_visibility(tallies: Mapping[str, Tally]) -> str:
-    """The same by how much of an object the labels say is seen in the image."""
+    """Format a table of the objects found, by how visible the labels say that they are."""
     heads = [f"{name}: found, IoU 0.5" for name in VISIBILITIES]
     lines = ["| case | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
     for case, tally in tallies.items():

@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def make(path: Path, size: float, frames: int = 50) -> Path:
-    """A recording of at least so many GB."""
+    """Write a recording of at least ``size`` GB."""
     with bevviz.simulate(frames, set=["detector.model=demo"]) as drive:
         results = [without_what_is_not_logged(result) for result in drive]
         config, scene = drive.config, drive.scene
@@ -96,7 +96,7 @@ def without_what_is_not_logged(result: FrameResult) -> FrameResult:
 
 
 def later(result: FrameResult, index: int) -> FrameResult:
-    """The same frame at another time."""
+    """Return the frame's result as that of frame ``index``, with stamps to match."""
     by = (index - result.frame.index) * PERIOD
     cameras = tuple(
         replace(
@@ -166,7 +166,7 @@ def viewer(recording: Path, limit: str) -> Iterator[Watched]:
 
 
 def opened(recording: Path, limit: str, stops: int, pictures: Path | None) -> str:
-    """A row of the table."""
+    """Open the recording in the viewer and return a row of the table."""
     begun = time.perf_counter()
     with viewer(recording, limit) as watched:
         client = watched.client

@@ -82,7 +82,7 @@ def _row(packets: Path, metadata: Path, python: Path) -> str:
 
 
 def _captured(path: Path) -> list[tuple[int, bytes]]:
-    """What was sent by UDP, in an Ethernet capture with whole packets, and when."""
+    """Read the UDP payloads of an Ethernet capture with whole packets, each with its time in nanoseconds."""
     data, at, found = path.read_bytes(), 24, list[tuple[int, bytes]]()
     while at + 16 <= len(data):
         seconds, micros, size = struct.unpack_from("<III", data, at)

@@ -80,7 +80,7 @@ def networks(bag: Path, frames: int, model: Path | None) -> list[str]:
 
 
 def counted(bag: Path) -> tuple[int, int, list[int]]:
-    """Scans, finite points in all of them, and when each was received, in nanoseconds."""
+    """Count the scans of a bag and their finite points. Also return the receive times in nanoseconds."""
     points, received = 0, []
     with Recording([bag]) as recording:
         topics = [t.name for t in recording.topics if t.type.endswith("PointCloud2")]

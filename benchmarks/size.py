@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def sizes(drive: Path, model: str, folder: Path) -> list[str]:
-    """A row of the table for each kind."""
+    """Return a row of the table for each kind of recording."""
     found, whole, decided = [], 0, -1
     for keep in tqdm(KEEPS, unit="run", desc=drive.name, disable=None):
         saved = folder / "saved.rrd"

@@ -62,7 +62,7 @@ def main() -> int:
 
 
 def profile_of_docs() -> str:
-    """The profile that the documentation gives."""
+    """Return the profile that the documentation gives."""
     (profile,) = re.findall(r"```xml\n(.*?)```", DOCS.read_text(), re.DOTALL)
     return str(profile)
 
@@ -97,7 +97,7 @@ def described(topic: str, sent: list[int], found: list[tuple[int, int]]) -> str:
 
 
 def publish(seconds: float, best: bool) -> None:
-    """Prints the stamps that were sent."""
+    """Publish for ``seconds`` and print the stamps of the sent messages."""
     from sensor_msgs.msg import Image, PointCloud2, PointField
 
     node = _node("publisher")
@@ -123,7 +123,7 @@ def publish(seconds: float, best: bool) -> None:
 
 
 def receive(seconds: float, best: bool) -> None:
-    """Prints stamps with the times at which the middleware had the messages."""
+    """Receive for ``seconds``. Print the stamps with the times at which the middleware had the messages."""
     import rclpy
     from sensor_msgs.msg import Image, PointCloud2
 

@@ -248,12 +248,12 @@ class Rule:
         return self._refusal(row, main, ground, noise)
 
     def _own(self, row: int, state: DetectionState) -> list[int]:
-        """Detections of the object, under its own name."""
+        """Return the detections of the object that have its label."""
         rows = np.flatnonzero((self.owner == row) & (self.detections.state == state)).tolist()
         return [d for d in rows if self.detections.names[d] == self.labels[row]]
 
     def _weakness(self, row: int) -> Reason | None:
-        """What the detector did wrong, if anything."""
+        """Return what the detector did wrong, or None."""
         if self._own(row, DetectionState.KEPT):
             return None
         least = self.result.config.detector.conf_threshold
@@ -284,7 +284,7 @@ class Rule:
         return reason
 
     def _pair(self, d: int, k: int) -> Reason:
-        """What the fusion's rules say of a detection and a cluster."""
+        """Return what the fusion's rules say about a detection and a cluster."""
         config, pairs = self.result.config.fusion, self.fusion.pairs
         (rows,) = np.nonzero((pairs.detection == d) & (pairs.cluster == k))
         if config.method == "centroid":

@@ -62,7 +62,7 @@ class Stages:
 
 
 def bev(points: NDArray[np.float32], objects: Objects | None) -> NDArray[np.uint8]:
-    """The image of bev_visualizer_node with its default parameters."""
+    """Draw the image of bev_visualizer_node with its default parameters."""
     range_x, range_y, resolution = 10.0, 10.0, 0.05
     width, height = int(2 * range_y / resolution), int(2 * range_x / resolution)
     image = np.zeros((height, width, 3), np.uint8)

@@ -179,7 +179,7 @@ class _Again:
 
 
 def ask_all(seeds: Sequence[int], frames: int, every: int) -> dict[str, Tally]:
-    """The tally of each configuration over the drives."""
+    """Return the tally of each configuration over the drives."""
     loader = StageLoader()
     benches = {name: Bench(config, loader) for name, config in configurations().items()}
     sources = {seed: SyntheticSource(frames, seed) for seed in seeds}

@@ -52,7 +52,7 @@ class Messages:
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame_id, **seq)
 
     def cloud(self, stamp: int, points: F32, frame_id: str = LIDAR_FRAME) -> Any:
-        """A PointCloud2 of (N, 4) x, y, z, intensity."""
+        """Make a PointCloud2 of (N, 4) x, y, z, intensity."""
         field = "sensor_msgs/msg/PointField"
         fields = [
             self.make(field, name=name, offset=4 * i, datatype=7, count=1)
@@ -96,7 +96,7 @@ class Messages:
         action: int = 0,
         text: str = "",
     ) -> Any:
-        """A visualization_msgs/Marker, a cube unless it is said."""
+        """Make a visualization_msgs/Marker, by default a cube."""
         return self.make(
             "visualization_msgs/msg/Marker",
             header=self.header(START, frame_id),
@@ -151,7 +151,7 @@ class Messages:
         )
 
     def transforms(self, stamp: int, *edges: tuple[str, str, F64]) -> Any:
-        """A TFMessage of (parent, child, parent_from_child)."""
+        """Make a TFMessage of (parent, child, parent_from_child)."""
         return self.make("tf2_msgs/msg/TFMessage", transforms=[self._edge(stamp, *edge) for edge in edges])
 
     def _edge(self, stamp: int, parent: str, child: str, parent_from_child: F64) -> Any:
@@ -217,10 +217,13 @@ def kitti_items(
     lidar_frame: str = LIDAR_FRAME,
     step: int = 1,
 ) -> list[Item]:
-    """KITTI frames as a drive at 10 Hz: cloud, image, CameraInfo, and /tf_static before each scan.
+    """Return KITTI frames as a drive at 10 Hz: cloud, image, CameraInfo, and /tf_static before each scan.
 
     Args:
-        scans: how many; the frames take turns (default: each once).
+        shared: the folder of real test data.
+        messages: makes the messages; its store has the types.
+        names: of the KITTI frames.
+        scans: number of scans; the frames take turns (default: each once).
         compressed: PNG as CompressedImage, else Image.
         lidar_frame: frame_id of the clouds.
         step: only each step-th point.
@@ -250,7 +253,7 @@ def kitti_items(
 
 
 def small_items(messages: Messages | None = None, scans: int = 30, points: int = 200) -> list[Item]:
-    """A drive without KITTI: random clouds, noise images of 64 x 48 and a drive straight ahead in /tf.
+    """Make a drive without KITTI: random clouds, noise images of 64 x 48 and a drive straight ahead in /tf.
 
     The first point of scan i has x = i.
     """
@@ -292,6 +295,8 @@ def write(
 
     Args:
         path: of the bag, which must not exist.
+        items: the messages with their topics and times.
+        messages: makes the messages; its store has the types.
         form: mcap, sqlite3 or ros1.
         compression: of rosbag2 (file, message, storage) or of ROS 1 (bz2, lz4).
         topics: (name, type) of topics without messages.

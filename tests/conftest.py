@@ -32,7 +32,10 @@ FIRST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first. What fails for the lack of a quiet machine is run once more, and told as a rerun."""
+    """Sort the longest tests first, and let real-time tests fail once, as on a busy machine.
+
+    Such a failure is reported as a rerun.
+    """
     rank = {f"{name}.py": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
     for item in items:
@@ -42,7 +45,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real test data, see README.md."""
+    """Return the folder of real test data, see README.md."""
     stated = os.environ.get("BEVVIZ_DATA")
     folder = Path(stated) if stated else Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
@@ -52,7 +55,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is saved by default goes nowhere near the checkout, and no viewer opens."""
+    """Run the test in a temporary folder, so that the checkout gets no default outputs. No viewer opens."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -51,7 +51,7 @@ def oxts(number: int) -> str:
 
 
 def kitti_raw(root: Path) -> Path:
-    """A drive of four frames, the third of which has no scan, with one tracklet from frame 1 on."""
+    """Write a drive of four frames: the third has no scan, and one tracklet starts at frame 1."""
     day = root / "2011_09_26"
     drive = day / "2011_09_26_drive_0001_sync"
     for sensor in ("velodyne_points", "oxts"):
@@ -114,7 +114,7 @@ def kitti_tracking(root: Path) -> Path:
 
 
 def kitti_odometry(root: Path, *, labels: bool = True) -> Path:
-    """A sequence of three scans; with SemanticKITTI's labels: road, moving car number 5."""
+    """Write a sequence of three scans. SemanticKITTI's labels have the road and moving car number 5."""
     sequence = root / "sequences/00"
     for folder in ("velodyne", *(["labels"] if labels else [])):
         (sequence / folder).mkdir(parents=True)

@@ -21,7 +21,7 @@ DOMAINS = range(1, 102)  # the ports of higher ones are taken by the system
 
 @contextmanager
 def own_domain() -> Iterator[str]:
-    """A domain that no other test uses meanwhile: in it nobody is met by chance."""
+    """Yield a ROS domain that no other test uses at the same time, so that no other node is in it."""
     folder = Path(tempfile.gettempdir()) / "bevviz-test-domains"
     folder.mkdir(exist_ok=True)
     for number in random.sample(DOMAINS, len(DOMAINS)):
@@ -41,7 +41,7 @@ def own_domain() -> Iterator[str]:
 
 @contextmanager
 def own_graph() -> Iterator[pytest.MonkeyPatch]:
-    """The environment of a graph of its own, on this machine only."""
+    """Set up the environment of a separate ROS graph that is limited to this machine."""
     with own_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", number)
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -50,7 +50,7 @@ def own_graph() -> Iterator[pytest.MonkeyPatch]:
 
 @contextmanager
 def playing(play: Play) -> Iterator[None]:
-    """A robot in a process of its own."""
+    """Run a robot in its own process."""
     with subprocess.Popen(play.arguments(), cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "playing\n"
@@ -60,5 +60,5 @@ def playing(play: Play) -> Iterator[None]:
 
 
 def alone(folder: Path) -> dict[str, str]:
-    """The environment of a ``bevviz live`` that nobody else's is taken for: they are found by folders."""
+    """Return the environment of a ``bevviz live`` that no other run finds. Runs are found by folders."""
     return {"PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(folder), "TMPDIR": str(folder)}

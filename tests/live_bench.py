@@ -16,7 +16,7 @@ from bevviz.workbench.live_session import LiveSession
 
 @contextmanager
 def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveSession]:
-    """That of a run over the frames of these results, with ``key=value`` settings."""
+    """Yield the live session of a run over the frames of these results, with ``key=value`` settings."""
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
     live = Live(
         source,

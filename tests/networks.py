@@ -31,7 +31,7 @@ def save(
     inputs: Sequence[Input],
     metadata: Mapping[str, str] | None = None,
 ) -> str:
-    """A network of these nodes; ``outputs`` has shape and type by name."""
+    """Save a network of these nodes; ``outputs`` has shape and type by name."""
     graph = helper.make_graph(
         list(nodes),
         "test",
@@ -52,7 +52,7 @@ def answer(
     inputs: Sequence[Input],
     metadata: Mapping[str, str] | None = None,
 ) -> str:
-    """A network that answers this to every image."""
+    """Save a network that gives these outputs for every image."""
     nodes = [node("Identity", [f"constant_{name}"], [name]) for name in outputs]
     kinds = {n: (o.shape, helper.np_dtype_to_tensor_dtype(o.dtype)) for n, o in outputs.items()}
     weights = {f"constant_{name}": np.ascontiguousarray(output) for name, output in outputs.items()}

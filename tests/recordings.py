@@ -44,11 +44,11 @@ class Recording:
                     self.times[name][row["frame"]] = row[name]
 
     def column(self, entity: str, component: str) -> list[Any]:
-        """A component's values in order of frame."""
+        """Return the values of a component in order of frame."""
         return [value for _, value in sorted(self.at[entity][component].items())]
 
     def text(self, entity: str) -> list[str]:
-        """A text document's content in order of frame."""
+        """Return the contents of a text document in order of frame."""
         return [value[0] for value in self.column(entity, "TextDocument:text")]
 
     def cleared(self, entity: str) -> set[int]:

@@ -93,7 +93,7 @@ def _bytes(topic: str, message: Any) -> bytes:
 
 
 def _shifted(message: Any, nanoseconds: int) -> Any:
-    """The same message, with its stamps moved."""
+    """Return the message with its stamps shifted."""
     headers = [t.header for t in message.transforms] if hasattr(message, "transforms") else [message.header]
     moved = [_moved(header, nanoseconds) for header in headers]
     if hasattr(message, "transforms"):

@@ -38,7 +38,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def make(folder: Path, form: str = "mcap", compression: str = "", name: str = "", **options: Any) -> Path:
-    """A small drive; ``options`` of ``bags.small_items``."""
+    """Write a small drive; ``options`` are those of ``bags.small_items``."""
     messages = bags.Messages(form == "ros1")
     name = name or f"drive_{form}_{compression or 'plain'}"
     path = folder / (f"{name}.bag" if form == "ros1" else name)
@@ -48,7 +48,7 @@ def make(folder: Path, form: str = "mcap", compression: str = "", name: str = ""
 
 
 def storage_file(bag: Path) -> Path:
-    """The one file of a bag that holds its messages."""
+    """Return the one file of a bag that holds its messages."""
     return bag if bag.is_file() else next(f for f in bag.iterdir() if f.name != "metadata.yaml")
 
 
@@ -58,7 +58,7 @@ def frames_of(*paths: Path, config: Config | None = None, **options: Any) -> lis
 
 
 def scans(frames: Sequence[Frame]) -> list[int]:
-    """Number of the scan that each frame is of: the x of its first point."""
+    """Return the scan number of each frame: the x of its first point."""
     return [int(frame.points[0, 0]) for frame in frames]
 
 

@@ -469,7 +469,7 @@ def recount(path: Path) -> None:
 
 @pytest.fixture
 def done(tmp_path: Path) -> Job:
-    """A bag whose result is complete."""
+    """Return the job of a bag whose result is complete."""
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=2))
     (job,) = make_jobs([bag], tmp_path / "runs", load(), FrameSelection(), "debug")
     job.folder.mkdir()

@@ -33,7 +33,7 @@ def named(b: Boxes3D, *names: str) -> Objects:
 
 
 def expected(points: F32, objects: Objects | None) -> U8:
-    """The tutorial's image for its defaults: 10 m, 10 m, 0.05 m -> 400 x 400, one point after another."""
+    """Draw the tutorial's image point by point with its defaults: 10 m, 10 m, 0.05 m -> 400 x 400."""
     image = np.zeros((400, 400, 3), np.uint8)
     for x, y, _ in points:
         u = np.floor((np.float32(10) - y) / np.float32(0.05))

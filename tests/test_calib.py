@@ -86,7 +86,7 @@ def test_a_fence_is_not_taken_for_its_neighbour(turn: float) -> None:
 
 
 def fence(seed: int) -> Frame:
-    """Posts at 5 to 25 m, a little irregular, before a wall; the camera stands where the LiDAR stands."""
+    """Make a frame of slightly irregular posts at 5 to 25 m before a wall, with the camera at the LiDAR."""
     rng = np.random.default_rng(seed)
     place = np.radians(np.arange(-40.0, 40.0, 2.0) + rng.uniform(-0.3, 0.3, 40))
     top, reach = np.radians(rng.uniform(1, 6, 40)), np.append(rng.uniform(5, 25, 40), 60.0)
@@ -193,7 +193,7 @@ def kitti(ten: list[Frame]) -> list[Frame]:
 
 
 def of_kitti(frames: Sequence[Frame], **planted: float) -> Calibration:
-    """What is found where an error is planted. KITTI's own calibration is taken for the truth."""
+    """Calibrate with a planted error. KITTI's own calibration is the ground truth."""
     wrong = stated_wrongly(frames, offsets(**planted))
     return calibrate(gather(wrong, ["camera"], lambda frame, stamp: None)["camera"])
 
@@ -371,7 +371,7 @@ def test_edges_of_a_wall_before_a_wall() -> None:
 
 @pytest.fixture(scope="module")
 def turned(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of that drive whose camera is stated 1 degree too far right."""
+    """Write a bag of that drive whose stated camera mounting is 1 degree too far right."""
     path = tmp_path_factory.mktemp("calib") / "turned.mcap"
     source = SyntheticSource(80, 0, weave=True, plant=["turned_camera"])
     write_bag(source, path, drive.frames)

@@ -33,7 +33,7 @@ Capture = pytest.CaptureFixture[str]
 
 
 def error_of(capsys: Capture, *arguments: str | Path) -> str:
-    """The one line that a wrong call prints."""
+    """Return the one line that a wrong call prints."""
     assert main([str(a) for a in arguments]) == 2
     said = capsys.readouterr().err
     assert said.startswith("bevviz: error: ")
@@ -42,7 +42,7 @@ def error_of(capsys: Capture, *arguments: str | Path) -> str:
 
 
 def small_bag(change: Callable[[list[bags.Item], bags.Messages], None] | None = None, scans: int = 5) -> Path:
-    """A bag in the working directory, its messages changed on the way."""
+    """Write a bag into the working directory. ``change`` may modify its messages first."""
     messages = bags.Messages()
     items = bags.small_items(messages, scans=scans)
     if change is not None:
@@ -51,7 +51,7 @@ def small_bag(change: Callable[[list[bags.Item], bags.Messages], None] | None = 
 
 
 def replaced(topic: str, make: Callable[[bags.Messages, int], Any]) -> Callable[..., None]:
-    """A change of a bag: other messages on one topic."""
+    """Return a change of a bag that replaces the messages of one topic."""
 
     def change(items: list[bags.Item], messages: bags.Messages) -> None:
         for i, item in enumerate(items):
@@ -101,7 +101,7 @@ def test_info_names_sensors_and_what_is_missing(capsys: Capture) -> None:
 
 
 def test_several_numbers_may_begin_below_zero() -> None:
-    """argparse takes lone negative numbers for values, but not -5,1,0."""
+    """Check that -5,1,0 is a value. argparse itself accepts only single negative numbers."""
     assert join_negative_numbers(["why", "--point", "-5,1,0", "--at", "-3"]) == [
         "why",
         "--point=-5,1,0",
@@ -178,7 +178,7 @@ def test_a_bag_without_a_lidar(capsys: Capture) -> None:
 
 
 def told_of_the_model(capsys: Capture) -> str:
-    """The line about a model that no image is shown to, which comes once."""
+    """Return the line about a model that gets no images. It is printed once."""
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "detector.model" in line]
     return line

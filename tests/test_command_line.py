@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refused(capsys: Capture, *arguments: str) -> list[str]:
-    """The two lines about a call that argparse refuses."""
+    """Return the two lines about a call that argparse refuses."""
     with pytest.raises(SystemExit) as ended:
         main(list(arguments))
     assert ended.value.code == 2
@@ -183,7 +183,7 @@ def test_json_never_takes_the_bag_for_its_file() -> None:
 
 
 def completed(line: str) -> list[str]:
-    """What a shell is offered behind a line."""
+    """Return the completions that a shell offers behind a line."""
     given = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
     given |= {"_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(Path("offered").resolve())}
     Path("offered").touch()

@@ -279,7 +279,7 @@ def test_no_topic_of_the_robot(topics: tuple[str, ...], asked: str, message: str
 
 @pytest.fixture(scope="module")
 def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    """A bag and a model."""
+    """Return a bag and a model."""
     bag = bags.write(tmp_path_factory.mktemp("kitti") / "kitti", bags.kitti_items(shared))
     return str(bag), str(shared / "models/yolox_nano.onnx")
 

@@ -69,7 +69,7 @@ def points(seed: int) -> F32:
 
 
 def draco(data: bytes) -> Any:
-    """The message of the twelve points."""
+    """Make the message of the twelve points."""
     made = messages()
     field = "sensor_msgs/msg/PointField"
     fields = [made.make(field, name=n, offset=at, datatype=kind, count=1) for n, at, kind in FIELDS]

@@ -39,7 +39,7 @@ def never(text: str) -> None:
 
 
 def say(path: Path, *lines: bytes) -> bytes:
-    """What a process answers to whatever is sent to it."""
+    """Send lines to the process at a socket and return its answer."""
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(5)
         connection.connect(str(path))

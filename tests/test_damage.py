@@ -30,7 +30,7 @@ Found = list[tuple[str, int, bytes]]
 
 
 def whole(name: str) -> Found:
-    """What was written."""
+    """Return the messages that were written."""
     return [(topic, time, data) for topic, _, time, data in items(name.startswith("ros1"))]
 
 

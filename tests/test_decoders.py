@@ -163,7 +163,7 @@ def test_a_foxglove_cloud_is_a_point_cloud_in_live_as_in_bags(
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An installed package with a decoder."""
+    """Install a package with a decoder."""
     metadata = tmp_path / "my_lidar-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my_lidar\nVersion: 1.0\n")

@@ -38,14 +38,14 @@ def constant(
     inputs: tuple[Input, ...] = (image_input(1, 3, H, W),),
     metadata: dict[str, str] | None = None,
 ) -> str:
-    """A network that answers these outputs to every image."""
+    """Save a network that gives these outputs for every image."""
     return networks.answer(path, {f"output{i}": o for i, o in enumerate(outputs)}, inputs, metadata)
 
 
 def head(
     layout: str, boxes: NDArray[Any], score: NDArray[Any], classes: NDArray[Any], count: int = 3
 ) -> NDArray[Any]:
-    """The output in which a network of this layout states boxes x0, y0, x1, y1 of its input."""
+    """Encode boxes x0, y0, x1, y1 of the network input as the output of a network of this layout."""
     center, size = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
     by_class = np.zeros((len(boxes), count))
     if layout == "end-to-end":
@@ -115,7 +115,7 @@ def test_every_layout_gives_its_boxes_in_image_pixels(
 
 
 def color_network(path: Path, layout: str) -> str:
-    """A network that sees: class c of a cell of 8 x 8 pixels is the mean of channel c in it."""
+    """Save a network whose class c in a cell of 8 x 8 pixels is the mean of channel c there."""
     scale = 1.0 if layout == "YOLOv8" else 1 / 255
     cells = (H // 8) * (W // 8)
     y, x = np.indices((H // 8, W // 8)).reshape(2, 1, -1).astype(np.float32)

@@ -58,7 +58,7 @@ def kept(detector: Detector, image: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def in_image(boxes: NDArray[Any], image: NDArray[np.uint8]) -> NDArray[Any]:
-    """What can be seen of boxes, in an order of its own."""
+    """Clip the boxes to the image and sort them in a fixed order. Drop the boxes outside."""
     height, width = image.shape[:2]
     clipped = boxes.copy()
     clipped[:, :4] = np.clip(boxes[:, :4], 0, [width, height, width, height])

@@ -25,7 +25,7 @@ def examples(page: str) -> Iterator[tuple[str, str]]:
 
 
 def project_on(page: str) -> str:
-    """The project file that a page shows."""
+    """Return the project file that a page shows."""
     found = re.search(r"^```toml\n(.*?)^```$", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
     assert found is not None
     return found[1]

@@ -331,7 +331,7 @@ def labelled(*rows: tuple[str, float, float]) -> Truth:
 
 
 def named(*rows: tuple[str, float, float]) -> Objects:
-    """What a detector of COCO's classes made of a frame."""
+    """Make the objects that a detector with COCO's classes finds in a frame."""
     count = len(rows)
     numbers = np.arange(count, dtype=np.int32)
     score = np.linspace(0.9, 0.5, count, dtype=np.float32)

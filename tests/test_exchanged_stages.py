@@ -117,7 +117,7 @@ number = 3
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with somebody's module in it, where the command is run."""
+    """Run the test in a folder that contains a user's module."""
     package = tmp_path / "mine"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -389,7 +389,7 @@ def test_a_change_from_another_thread_meets_the_next_frame(here: Path, frame: Fr
 
 
 def robot_drive(folder: Path, scans: int = 3) -> Path:
-    """A drive whose robot publishes what our own stages make of it, clusters as the LiDAR alone has them."""
+    """Write a drive whose robot publishes the results of our own stages. Its clusters use the LiDAR alone."""
     drive = SyntheticSource(frames=scans, seed=3)
     config = load(settings=["detector.model=demo", "fusion.split=false"])
     session = Session(config)

@@ -151,7 +151,7 @@ def pose_of(m: bags.Messages, matrix: F64) -> Any:
 
 
 def stated_in(m: bags.Messages, array: str, frames: Sequence[str]) -> Any:
-    """The box in each of the frames; ``array``: that of the array's own header."""
+    """Make an array with the box in each of the frames; ``array`` is the frame of the array's own header."""
     size = m.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", BOX_SIZE, strict=True)))
     found = []
     for frame in frames:
@@ -163,7 +163,7 @@ def stated_in(m: bags.Messages, array: str, frames: Sequence[str]) -> Any:
 
 
 def markers_in(m: bags.Messages, frames: Sequence[str]) -> Any:
-    """The same as cubes."""
+    """Make the same boxes as cube markers."""
     found = [m.marker(frame, pose_of(m, FRAMES[frame]), BOX_SIZE, ns=frame) for frame in frames]
     return m.make("visualization_msgs/msg/MarkerArray", markers=found)
 

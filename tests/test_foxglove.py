@@ -44,7 +44,7 @@ def time(scan: int) -> Any:
 
 
 def parts(matrix: F64) -> tuple[Any, Any]:
-    """Translation and rotation."""
+    """Return the translation and the rotation."""
     place, turn = matrix[:3, 3].tolist(), geometry.quaternion(matrix).tolist()
     axes = dict(zip("xyz", place, strict=True))
     return messages.Vector3(**axes), messages.Quaternion(**dict(zip("xyzw", turn, strict=True)))
@@ -206,7 +206,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
 
 
 def _times(value: Any) -> Any:
-    """Times as Foxglove's JSON schemas have them."""
+    """Convert times to the form of Foxglove's JSON schemas."""
     if isinstance(value, dict):
         return {key: _time(item) if key == "timestamp" else _times(item) for key, item in value.items()}
     return [_times(item) for item in value] if isinstance(value, list) else value

@@ -38,7 +38,7 @@ Claimed = tuple[Clusters, tuple[Claims | None, ...], Splits]
 def looked(
     points: F32, detections: Detections, turn: F64 = CAMERA_FROM_LIDAR, name: str = "front"
 ) -> CameraResult:
-    """The points as a camera sees them."""
+    """Project the points into a camera."""
     uv, depth = project(apply(turn, points), CAMERA)
     outside = ~((uv >= -0.5) & (uv < [CAMERA.width - 0.5, CAMERA.height - 0.5])).all(axis=1)
     uv[outside] = np.nan
@@ -60,7 +60,7 @@ def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Spli
 
 
 def car(x: float, y: float, yaw: float, length: float = 3.9, width: float = 1.6) -> F32:
-    """What a LiDAR at the origin sees of a car's outline: the sides that face it."""
+    """Make the LiDAR points of a car's outline: the sides that face the origin."""
     c, s = math.cos(yaw), math.sin(yaw)
     sides = []
     for nx, ny, half, along in (

@@ -70,7 +70,7 @@ def detections_of(boxes: list[F32], scores: list[float] | None = None, names: st
 
 
 def silhouette(points: F32, across: float = 2.0, along: float = 2.0) -> F32:
-    """The box that a perfect detector would give, with a margin."""
+    """Return the box that a perfect detector would give, with a margin."""
     margin = np.array([across, along])
     uv, _ = project(apply(CAMERA_FROM_LIDAR, points), CAMERA)
     box = np.concatenate([uv.min(axis=0) - margin, uv.max(axis=0) + margin])
@@ -85,7 +85,7 @@ def run(points: F32, clusters: Clusters, detections: Detections, config: FusionC
 
 
 def check(fusion: Fusion, clusters: Clusters, detections: Detections, config: FusionConfig) -> None:
-    """What holds for every fusion."""
+    """Check the properties of every fusion."""
     pairs = {(int(d), int(k)) for d, k in zip(fusion.pairs.detection, fusion.pairs.cluster, strict=True)}
     assert len(pairs) == len(fusion.pairs.detection)
     named = np.flatnonzero(fusion.cluster_decision == Decision.MATCHED)

@@ -87,7 +87,7 @@ def test_what_may_not_be_read(capsys: Capture) -> None:
 
 
 def plain_folder(calibration: str = "") -> Path:
-    """A folder of one cloud, with a calibration."""
+    """Write a folder with one cloud, one image and a calibration."""
     folder = Path("set")
     folder.mkdir()
     datasets.scan(0).tofile(folder / "000000.bin")

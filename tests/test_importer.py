@@ -68,7 +68,7 @@ def test_a_viewer_that_is_closed_ends_it_without_a_word_of_ours(drive: Path) -> 
 
 
 def asked(*paths: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, str, str | None]]:
-    """What is imported, as application and recording, where Rerun opens a folder and all that is in it."""
+    """Return the imports, as application and recording, when Rerun opens a folder with all its files."""
     imported: list[tuple[Path, str, str | None]] = []
     monkeypatch.setattr(importer, "_import", lambda *asked: imported.append(asked))
     codes = [run([str(p), "--application-id", paths[0].stem, "--recording-id", "proposed"]) for p in paths]

@@ -41,8 +41,11 @@ TENTH = 100_000_000  # nanoseconds
 def test_raw_clouds_are_those_around_what_is_strange(
     steps: list[int], strange: set[int], asked_for: set[int], every: int, around: int, share: float
 ) -> None:
-    """Each once, and no other but each n-th; no more are held than fit into that time. What is asked for has
-    all, what begins of itself up to a share of the frames, and the first time."""
+    """Check which raw clouds are kept, each once: every n-th, and those near a strange or requested frame.
+
+    No more clouds are held than fit into that time. A requested frame gets all clouds around it. A strange
+    frame gets them the first time, and later up to a share of the frames.
+    """
     stamps = (np.cumsum(steps) * TENTH).tolist()
     config = LoggingConfig(raw_every=every, raw_around=around / 10, raw_share=share)
     kept, found, at, left_out = RawCloudSelector(), list[int](), list[int](), 0
@@ -69,7 +72,7 @@ def test_raw_clouds_are_those_around_what_is_strange(
 
 
 def pictures(count: int, height: int = 95, width: int = 121) -> list[U8]:
-    """A disc that moves over a slope of colours."""
+    """Draw a disc that moves over a slope of colours."""
     y, x = np.mgrid[:height, :width]
     slope = np.stack([x * 2, y * 2, 255 - x], axis=-1).clip(0, 255).astype(np.uint8)
     return [cv2.circle(slope.copy(), (10 + 4 * i, 40), 9, (0, 200, 255), -1) for i in range(count)]
@@ -116,7 +119,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def saved(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A recording of each kind."""
+    """Save a recording of each kind."""
     folder = tmp_path_factory.mktemp("saved")
     found = {keep: folder / f"{keep}.rrd" for keep in ("everything", "inspect", "report")}
     for keep, path in found.items():

@@ -477,7 +477,7 @@ def test_thinned_frames_are_consistent(first: int, second: int, points: int) -> 
 
 
 def merged(first: int, second: int) -> Frame:
-    """A frame of two LiDARs whose points are numbered."""
+    """Make a frame of two LiDARs whose points are numbered."""
     from bevviz.model.frame import Cloud
 
     number = np.arange(first + second, dtype=np.float32)
@@ -620,7 +620,7 @@ def test_a_recording_may_start_at_any_whole_packet(
 
 
 def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameResult:
-    """A frame with one detected pedestrian for each decision."""
+    """Make a frame with one detected pedestrian for each decision."""
     n = len(decisions)
     none = np.zeros(n, np.int32)
     found = Detections(
@@ -640,7 +640,7 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
 
 
 def triggers(*settings: str) -> Callable[[FrameResult], str | None]:
-    """What is said of each result."""
+    """Return a function that returns what the triggers report for a result."""
     config = load(settings=["live.trigger_pause=0", *settings])
     watch, detector = Triggers(config.live), AnomalyDetector()
     return lambda r: watch.check(replace(r, anomalies=detector.update(r, config.anomalies)))
@@ -707,7 +707,7 @@ def test_a_trigger_saves(run: Run) -> None:
 
 
 def save(path: Path, encoder: Encoder, packets: list[Packet], *settings: str) -> list[Path]:
-    """The parts that the packets are saved in."""
+    """Save the packets and return the files that they are saved in."""
     config = load(settings=[f"live.output_queue={len(packets)}", *settings]).live
     saver = Saver(path, config, encoder, NoIndexer(), Notes(lambda text: None))
     for packet in packets:
@@ -906,7 +906,7 @@ def a_port() -> int:
 
 
 def received(port: int, path: Path, enough: Callable[[Recording], object]) -> Recording:
-    """What a viewer that comes now is sent."""
+    """Return the recording that a viewer gets if it connects now."""
     for seconds in (2, 4, 8, 16, 32):
         late = rerun(f"rerun+http://127.0.0.1:{port}/proxy", "--save", str(path), "--port", str(a_port()))
         time.sleep(seconds)

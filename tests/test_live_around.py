@@ -88,7 +88,7 @@ class Robot:
         self.say("/diagnostics", TYPE, make(TYPE, header=header(""), status=[status]))
 
     def objects(self, data: bytes) -> None:
-        """The ground truth as what is ours, and as the robot's own, a metre further."""
+        """Publish the ground truth as our objects, and one metre further as the robot's own."""
         message: Any = typestore().deserialize_cdr(data, BOXES)
         self.say("/ours/objects", BOXES, message)
         for detection in message.detections:

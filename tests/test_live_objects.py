@@ -50,7 +50,7 @@ STATED = "source.boxes={topic: my/things, size: dimensions, yaw: heading, label:
 
 @pytest.fixture
 def packages(tmp_path: Path) -> Iterator[None]:
-    """A workspace, as sourcing it would make it known; nothing of it can be imported."""
+    """Make a workspace known as sourcing it does. None of its packages can be imported."""
     for package, texts in (
         ("autoware_perception_msgs", AUTOWARE),
         ("radar_msgs", RADAR),

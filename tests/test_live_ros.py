@@ -68,14 +68,14 @@ LIGHT = Play(frames=3, points=20_000)
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[str]:
-    """The domain of a robot that plays for several tests."""
+    """Yield the domain of a robot that plays for several tests."""
     with own_graph(), playing(LIGHT):
         yield os.environ["ROS_DOMAIN_ID"]
 
 
 @pytest.fixture(autouse=True)
 def domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The robot's graph, or an empty one, on this machine only."""
+    """Set the robot's domain, or that of an empty graph, on this machine only."""
     with ExitStack() as stack:
         shared = "robot" in request.fixturenames
         number = request.getfixturevalue("robot") if shared else stack.enter_context(own_domain())
@@ -490,7 +490,7 @@ def test_unknown_type_without_its_package() -> None:
 
 @pytest.fixture(scope="module")
 def result() -> FrameResult:
-    """A frame's result in which the detector found one car, on the first cluster."""
+    """Return the result of a frame in which the detector found one car, on the first cluster."""
     config = load()
     session = Session(config)
     made = session.run(SyntheticSource(frames=1).snapshot(0).frame)

@@ -44,7 +44,7 @@ def messages(ros1: bool, package: str, point: str = POINT) -> bags.Messages:
 
 
 def scan(made: bags.Messages, package: str, stamp: int, frame: str = "livox_frame", points: int = 50) -> Any:
-    """A floor seen from 1.5 m, the last point being a beam that met nothing."""
+    """Make a scan of a floor, seen from 1.5 m. The last point is a beam that met nothing."""
     rng = np.random.default_rng(stamp % 1000)
     xyz = rng.uniform([-5, -5, -1.5], [15, 5, -1.4], (points, 3)).astype(np.float32)
     xyz[-1:] = 0
@@ -79,7 +79,7 @@ def scan(made: bags.Messages, package: str, stamp: int, frame: str = "livox_fram
 
 
 def columns(message: Any) -> dict[str, Any]:
-    """What rosbags makes of it, point by point, but for the one at the origin."""
+    """Return the points as rosbags decodes them, without the one at the origin."""
     names = [field.name for field in dataclasses.fields(message.points[0])]
     return {n: np.array([getattr(p, n) for p in message.points[:-1]]) for n in names if n[0] != "_"}
 

@@ -161,7 +161,7 @@ def make(index: int = 0, **changes: Any) -> FrameResult:
 
 
 def nothing(index: int, *failures: Failure, **changes: Any) -> FrameResult:
-    """A frame of which no more than the cloud's stamp is known."""
+    """Make the result of a frame of which only the stamp of the cloud is known."""
     empty = make(index)
     frame = dataclasses.replace(
         empty.frame, points=np.zeros((0, 3), np.float32), clouds=(), cameras=(), **changes

@@ -33,7 +33,7 @@ POINTS = np.concatenate([PERSON, BUSH])
 
 
 def masks_of(*boxes: F32, scale: float = 0.5, corner: tuple[int, int] = (0, 10)) -> Masks:
-    """That cover these boxes, in a grid that is half as fine as the image and begins above it."""
+    """Make masks that cover these boxes. Their grid is half as fine as the image and begins above it."""
     place, cells = [], []
     for box in boxes:
         edges = np.rint((box + 0.5) * scale).astype(int) + np.array(corner * 2)
@@ -44,7 +44,7 @@ def masks_of(*boxes: F32, scale: float = 0.5, corner: tuple[int, int] = (0, 10))
 
 
 def outcome(detections: Detections, config: FusionConfig | None = None) -> tuple[Bool, Fusion]:
-    """The points that the detection takes, and the fusion."""
+    """Return which points the detection takes, and the fusion."""
     config = config or FusionConfig()
     seen = looked(POINTS, detections)
     clusters, (claims,), _ = claimed(POINTS, cluster(POINTS, CLUSTERING), seen, config=config)

@@ -48,7 +48,7 @@ CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def cloud_message(points: NDArray[Any], height: int = 1, row_padding: int = 0, **changes: Any) -> Message:
-    """A PointCloud2 of a structured array, whose dtype is the layout."""
+    """Make a PointCloud2 of a structured array, whose dtype is the layout."""
     fields = []
     layout = points.dtype.fields
     assert layout is not None
@@ -88,7 +88,7 @@ def random_points(n: int, dtype: Any = XYZI, seed: int = 0) -> NDArray[Any]:
 
 @st.composite
 def layouts(draw: st.DrawFn) -> Message:
-    """A PointCloud2 of any layout, filled with random bytes that make small or non-finite coordinates."""
+    """Draw a PointCloud2 of any layout. Its random bytes make small or non-finite coordinates."""
     big = draw(st.booleans())
     kinds = st.tuples(st.sampled_from(sorted(STRUCT)), st.integers(1, 3))
     extra = draw(
@@ -176,7 +176,7 @@ STORES["ros1"].register(TF)  # a bag brings the definition
 
 
 def through(store: Typestore, kind: str, msg: Message) -> Any:
-    """The message as rosbags gives it back after serialising."""
+    """Serialise the message with rosbags and deserialise it again."""
 
     def build(name: str, value: Any) -> Any:
         cls = store.types[name]
@@ -311,7 +311,7 @@ def test_bad_layouts_are_named() -> None:
 
 
 def image_message(pixels: NDArray[Any], encoding: str, padding: int = 0, **changes: Any) -> Message:
-    """A sensor_msgs/Image of (H, W) or (H, W, C) pixels; 1.5 rows of data a row of pixels are NV12's."""
+    """Make a sensor_msgs/Image of (H, W) or (H, W, C) pixels. NV12 has 1.5 rows of data per row of pixels."""
     rows, width = pixels.shape[:2]
     data = b"".join(row.tobytes() + b"\x7f" * padding for row in pixels)
     msg = Message(
@@ -781,7 +781,7 @@ def test_a_cloud_beyond_the_limits_is_refused_in_one_line() -> None:
 
 
 def png_of(width: int, height: int) -> bytes:
-    """A PNG of one bit a pixel, all black; small however large it is."""
+    """Make a black PNG of one bit per pixel. The file is small even for a large image."""
 
     def part(kind: bytes, content: bytes) -> bytes:
         crc = zlib.crc32(kind + content)

@@ -40,7 +40,7 @@ def a_port() -> int:
 
 
 def family(pid: int) -> list[int]:
-    """The process and what it started."""
+    """Return the process and its descendants."""
     with suppress(OSError):
         tasks = Path(f"/proc/{pid}/task").glob("*/children")
         children = [int(child) for task in tasks for child in task.read_text().split()]
@@ -68,7 +68,7 @@ def listening(pid: int) -> dict[int, str]:
 
 @contextmanager
 def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A command, ended without a word at the end."""
+    """Run a command and kill it at the end."""
     with subprocess.Popen([sys.executable, "-m", "bevviz.cli", *arguments]) as process:
         try:
             yield process

@@ -31,14 +31,14 @@ OPEN = image_input(1, 3, "height", "width")
 
 
 def yolov8() -> NDArray[np.float32]:
-    """The answer of a YOLOv8 with three classes that finds nothing."""
+    """Return the output of a YOLOv8 with three classes that finds nothing."""
     rows = np.zeros((1, 7, CELLS), np.float32)
     rows[0, :4] = 32
     return rows
 
 
 def refused(model: str, **settings: Any) -> str:
-    """The one line that a file is refused with."""
+    """Return the one line that refuses a model file."""
     with pytest.raises(UserError) as caught:
         Detector(DetectorConfig(model=model, **settings))
     line = str(caught.value)
@@ -53,7 +53,7 @@ def constant(path: Path, metadata: Mapping[str, str], shape: Input = IMAGES) -> 
 def unchecked(
     path: Path, nodes: list[Any], weights: Mapping[str, NDArray[Any]], outputs: Mapping[str, int]
 ) -> str:
-    """A network that onnx's own checks would not let pass."""
+    """Save a network that onnx's own checks reject."""
     graph = helper.make_graph(
         nodes,
         "test",
@@ -67,7 +67,7 @@ def unchecked(
 
 
 def loop(count: str, go_on: str, start: str, end: str, shape: list[int]) -> Any:
-    """A node that doubles a tensor again and again."""
+    """Make a node that doubles a tensor again and again."""
     boolean = TensorProto.BOOL
     inputs = [("i", INT64, []), ("go", boolean, []), ("x", FLOAT, shape)]
     outputs = [("go_on", boolean, []), ("y", FLOAT, shape)]
@@ -81,7 +81,7 @@ def loop(count: str, go_on: str, start: str, end: str, shape: list[int]) -> Any:
 
 
 def endless(path: Path) -> str:
-    """A loop that never ends."""
+    """Save a network with a loop that never ends."""
     nodes = [loop("count", "yes", "images", "o", [1, 3, H, W])]
     return unchecked(path, nodes, {"count": np.array(2**62), "yes": np.array(True)}, {"o": FLOAT})
 

@@ -26,7 +26,7 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def shown() -> Iterator[Drive]:
-    """A drive that was run into a viewer."""
+    """Yield a drive that was run into a viewer."""
     with pytest.MonkeyPatch.context() as patch, bevviz.simulate(frames=FRAMES, seed=3) as drive:
         patch.setattr("bevviz.notebook.in_notebook", lambda: True)
         drive.show()
@@ -35,7 +35,7 @@ def shown() -> Iterator[Drive]:
 
 @pytest.fixture
 def drive(shown: Drive) -> Iterator[Drive]:
-    """The same, at the first frame with nothing clicked."""
+    """Yield the shown drive at its first frame with no selection."""
     stamp = shown.raw(0).stamp
     tell(shown, type="selection_change", items=[])
     tell(shown, type="timeline_change", timeline="stamp", time=float(stamp))

@@ -55,7 +55,7 @@ KNOWN = ("car", "person", "cyclist", "truck", "bicycle")
 
 @cache
 def ours() -> FrameResult:
-    """A frame of the synthetic drive, as our fusion has it."""
+    """Return the result of our fusion for a frame of the synthetic drive."""
     frame = SyntheticSource(frames=12).snapshot(8).frame
     return Session(load(settings=["detector.model=demo"])).alone(frame)
 
@@ -67,7 +67,7 @@ def held(
     known: Sequence[str] = KNOWN,
     config: OpinionsConfig | None = None,
 ) -> tuple[Objects, Opinions]:
-    """A method's boxes on that frame."""
+    """Return the objects of a method's boxes on that frame, and the opinions about them."""
     scores = np.full(len(boxes), 0.9, np.float32)
     objects = make_objects(boxes, names, scores, result.obstacles, result.clusters)
     fused = result.objects

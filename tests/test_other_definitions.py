@@ -167,7 +167,7 @@ def renamed(field: str, kind: Any) -> tuple[str, Any]:
 
 
 def retyped(field: str, kind: Any) -> tuple[str, Any]:
-    """A list or a part becomes a number, a number a text, and a text a number."""
+    """Change the type of a field: list or nested message to number, number to text, text to number."""
     node, about = kind
     number = node == Nodetype.BASE and about[0].startswith(NUMBERS)
     return field, (Nodetype.BASE, ("string" if number else "int32", 0))
@@ -208,7 +208,7 @@ def write(folder: Path, changes: Mapping[str, tuple[str, str, str]], count: int 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive that can be read, without transforms that move."""
+    """Write a readable drive without moving transforms."""
     items = [item for item in bags.small_items(scans=4) if item.topic != "/tf"]
     return bags.write(tmp_path_factory.mktemp("drive") / "drive", items)
 

@@ -46,7 +46,7 @@ def metadata(profile: str, nested: bool = True) -> str:
 
 
 def millimetres(column: int, pixel: int) -> int:
-    """Some 10 m, in steps of 8 mm; every seventh column of a pixel met nothing."""
+    """Return a range of about 10 m in steps of 8 mm. Every seventh column of a pixel met nothing."""
     return 0 if (column + pixel) % 7 == 0 else 8 * (1250 + column + 3 * pixel)
 
 
@@ -72,7 +72,7 @@ def packet(profile: str, scan: int, number: int, clock: int) -> bytes:
 
 
 def where(column: int, pixel: int) -> tuple[float, float, float]:
-    """The manual's formula."""
+    """Compute the position of a pixel by the formula of the manual."""
     around = 2 * pi * (1 - column / COLUMNS)
     turn, tilt = around - radians(AZIMUTHS[pixel]), radians(ALTITUDES[pixel])
     far = millimetres(column, pixel) - ORIGIN
@@ -91,7 +91,7 @@ def bag(
     clock: int = bags.START,
     order: tuple[int, ...] = (),
 ) -> Path:
-    """Scans of 64 ms each, 100 ms apart; ``order``: of all packets, other than in that of their time."""
+    """Write scans of 64 ms each, 100 ms apart; ``order`` puts all packets out of the order of their time."""
     made = bags.Messages(form == "ros1")
     made.store.register(get_types_from_msg("uint8[] buf\n", KIND))
 

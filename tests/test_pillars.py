@@ -230,7 +230,7 @@ def test_thresholds_are_of_each_class(tmp_path: Path) -> None:
 
 
 def autoware(folder: Path, features: int = 9) -> dict[str, Any]:
-    """An encoder and a head with one object, by the names and shapes of Autoware's CenterPoint."""
+    """Save an encoder and a head with one object, by the names and shapes of Autoware's CenterPoint."""
     nodes = [node("ReduceMax", ["input_features"], ["largest"], axes=[1], keepdims=0)]
     encoder = save(
         folder / "encoder.onnx",

@@ -32,7 +32,7 @@ def gpu_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def libraries(monkeypatch: pytest.MonkeyPatch, error: str) -> None:
-    """What the dynamic linker says."""
+    """Replace the loading of libraries: it fails with this error of the dynamic linker, if there is one."""
 
     def load_library(*_: object) -> None:
         if error:

@@ -27,7 +27,7 @@ EPS = 0.437
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a bag, a detector and the recording of a run with them."""
+    """Make a folder with a bag, a detector and the recording of a run with them."""
     folder = tmp_path_factory.mktemp("made")
     bag, model, rrd = folder / "demo.mcap", folder / "net.onnx", folder / "run.rrd"
     shutil.copyfile(DEMO_MODEL, model)
@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The same, moved as a whole to where nothing else is known of."""
+    """Copy that folder as a whole to a place that contains nothing else."""
     place = tmp_path / "elsewhere"
     shutil.copytree(made, place)
     monkeypatch.chdir(tmp_path)

@@ -79,7 +79,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a report of a bag without a detector, the bag being in another folder."""
+    """Make a folder with the report of a bag without a detector. The bag is in another folder."""
     folder = tmp_path_factory.mktemp("secret_name")
     bag = bags.write(folder / "drive", bags.small_items(scans=40))
     (folder / "note.txt").write_text(NOTE)

@@ -26,7 +26,7 @@ from tests.test_cli import Capture, error_of
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of three scans. Not to be changed."""
+    """Make a report of three scans. Tests must not change it."""
     folder = tmp_path_factory.mktemp("report")
     drive = bags.write(folder / "drive", bags.small_items(scans=3))
     call = ["report", str(drive), "--at", "0.1", "--before", "0", "--after", "0.1", "--model", "demo"]
@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def report(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A copy in the working directory."""
+    """Copy the report into the working directory."""
     monkeypatch.chdir(tmp_path)
     for name in ("bug.rrd", "bug.mcap", "bug.html"):
         shutil.copy(made / name, name)
@@ -49,7 +49,7 @@ def about(made: Path) -> dict[str, Any]:
 
 
 def forge(info: str, config: str, stages: Any = None, arrays: Any = None) -> None:
-    """A recording that says so of itself, in the place of the report's."""
+    """Replace the report's recording by one with these statements about itself."""
     with rr.RecordingStream("bevviz") as recording:
         recording.save("bug.rrd")
         recording.send_property(entities.PROPERTY, rr.AnyValues(config=config))

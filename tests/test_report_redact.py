@@ -35,7 +35,7 @@ PERSON = np.array([712, 143, 811, 308])  # the pedestrian of KITTI 000000
 
 
 def unfold(bag: Path) -> dict[str, list[U8]]:
-    """The images of a bag by topic."""
+    """Return the images of a bag by topic."""
     found: dict[str, list[U8]] = {}
     with Bag([bag]) as recording:
         for m in recording.messages([PNG, RAW, JPEG]):
@@ -256,7 +256,7 @@ FRAMES = 3
 
 
 def crowded_items(messages: bags.Messages) -> list[bags.Item]:
-    """The synthetic drive, and what a robot says beside it."""
+    """Return the synthetic drive together with other messages of a robot."""
     store = messages.store = get_typestore(Stores.ROS2_JAZZY)
     types = {}
     for name, text in OLD_VISION.items():

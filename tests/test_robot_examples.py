@@ -32,7 +32,7 @@ def unit() -> configparser.ConfigParser:
 
 
 def settings_of(arguments: list[str]) -> ReloadableConfig:
-    """What bevviz makes of a command line, the configuration being that of the example."""
+    """Return the settings of a command line with the configuration file of the example."""
     options = _parser()[0].parse_args(arguments)
     assert options.config == Path("/etc/bevviz/robot.yaml")
     given = [*options.set, f"live.nice={options.nice}"]
@@ -94,7 +94,7 @@ def test_the_launch_file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def described(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
-    """What the launch file says, kind and arguments of each, where no ROS is installed."""
+    """Return the kind and the arguments of each action in the launch file, without an installed ROS."""
 
     def noted(kind: str) -> Any:
         def make(name: Any = None, value: Any = None, **more: Any) -> tuple[str, dict[str, Any]]:

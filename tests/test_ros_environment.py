@@ -13,7 +13,7 @@ from bevviz.live.environment import load_rclpy, middlewares
 
 
 def _install(folder: Path, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An rclpy that is found first, and fails."""
+    """Install an rclpy that is found first and fails."""
     (folder / "rclpy").mkdir()
     (folder / "rclpy" / "__init__.py").write_text(code)
     for name in [name for name in sys.modules if name.partition(".")[0] == "rclpy"]:

@@ -45,7 +45,7 @@ def rows() -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag, a recording and a report of it that name the function, without its module."""
+    """Make a bag, a recording and a report that name the function. Its module is not among them."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "page_tools.py").write_text(TOOLS)
     with pytest.MonkeyPatch.context() as patch:
@@ -60,7 +60,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder as somebody has received it."""
+    """Run the test in a copy of the folder, as a recipient has it."""
     place = tmp_path / "received"
     shutil.copytree(made, place)
     monkeypatch.chdir(place)

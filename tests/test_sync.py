@@ -702,7 +702,7 @@ def test_odometry_is_decoded_only_while_tf_says_nothing() -> None:
 
 
 def of_clocks(offset: float, *settings: str, frames: int = 40) -> tuple[list[Frame], Synchronizer]:
-    """A drive whose camera's clock is ``offset`` seconds behind; images come 30 ms after they are taken."""
+    """Run a drive whose camera clock is ``offset`` seconds behind. Images arrive 30 ms after the exposure."""
     feed = Feed(ONE, *settings)
     feed.calibration()
     feed.info()

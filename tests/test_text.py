@@ -29,7 +29,7 @@ ANYTHING = st.one_of(
 
 
 def words(tokens: list[Token]) -> list[str]:
-    """The text of each paragraph, cell or heading; anything but plain text in one fails."""
+    """Return the text of each paragraph, cell or heading. Fail if one contains more than plain text."""
     found = []
     for token in tokens:
         if token.type == "inline":
@@ -120,7 +120,7 @@ EVIL = "\x1b]0;owned\x07<b>*_x`|[y](z)\u202e"
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive whose topics and frames would drive a terminal and mark up a page."""
+    """Write a drive whose topics and frames contain terminal escapes and markup."""
     items = []
     for item in bags.small_items(scans=6):
         if hasattr(item.message, "header"):

@@ -26,7 +26,7 @@ def sample(parent: str, child: str, seconds: float, matrix: F64) -> StampedTrans
 
 
 def turning(t: float) -> F64:
-    """A robot on a circle of 5 m, 0.4 rad/s."""
+    """Return the pose of a robot on a circle of 5 m at 0.4 rad/s."""
     return pose(5 * np.sin(0.4 * t), 5 - 5 * np.cos(0.4 * t), yaw=0.4 * t)
 
 
@@ -37,7 +37,7 @@ def drive(buffer: TransformBuffer, seconds: float = 2.0, rate: float = 50.0) -> 
 
 @pytest.fixture
 def robot() -> TransformBuffer:
-    """map -> odom -> base_link -> rslidar, and base_link -> zed -> optical."""
+    """Build the transforms map -> odom -> base_link -> rslidar, and base_link -> zed -> optical."""
     buffer = TransformBuffer()
     buffer.add(sample("map", "odom", 0, pose(100, 50, yaw=1.0)), static=True)
     buffer.add(sample("base_link", "rslidar", 0, pose(0.3, 0, 1.2, yaw=0.1)), static=True)

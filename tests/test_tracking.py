@@ -68,7 +68,7 @@ def step(tracker: Tracker, *args: Any, config: TrackingConfig = CONFIG, **more: 
 
 
 def check(tracks: Tracks, clusters: Clusters, objects: Objects) -> None:
-    """What holds for every result."""
+    """Check the properties of every tracking result."""
     assert len(set(tracks.id.tolist())) == len(tracks)
     for array in (*(tracks.boxes.center, tracks.boxes.size, tracks.boxes.yaw), tracks.velocity, tracks.age):
         assert np.isfinite(array).all()
@@ -83,7 +83,7 @@ def check(tracks: Tracks, clusters: Clusters, objects: Objects) -> None:
 
 
 def walk(frames: int, speed: float = 1.4, pose: Any = None) -> tuple[Tracker, Tracks]:
-    """A person who walks along y, 10 m ahead."""
+    """Track a person who walks along y, 10 m ahead."""
     tracker = Tracker()
     for i in range(frames):
         place = pose(i) if pose is not None else None

@@ -47,7 +47,7 @@ PROJECT = '[ground]\nmethod = "drive_tools:segment"\n'
 
 @pytest.fixture(autouse=True)
 def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder that was downloaded, with the user in it: a bag, a project and its module."""
+    """Run the test in a downloaded folder with a bag, a project and its module."""
     folder = tmp_path / "received"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -74,7 +74,7 @@ def has_run(folder: Path) -> bool:
 
 
 def error_of(capsys: Capture, *arguments: str) -> str:
-    """The one line of a command that is refused."""
+    """Return the one line of a command that is refused."""
     assert main(list(arguments)) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
     return line
@@ -486,7 +486,7 @@ def test_functions_that_say_what_they_are_for_are_stages(received: Path, functio
 
 
 def calls(name: str) -> Iterator[tuple[str, ast.Call]]:
-    """Calls of a function in the package, with the file of each."""
+    """Yield the calls of a function in the package, with the file of each."""
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] == name:

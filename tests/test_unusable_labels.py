@@ -26,7 +26,7 @@ Capture = pytest.CaptureFixture[str]
 
 
 def label(**changed: str) -> str:
-    """A line of KITTI's with other values."""
+    """Return a KITTI label line with other values."""
     names = "type truncation occlusion alpha left top right bottom height width length x y z rotation_y"
     values = dict(zip(names.split(), GOOD.split(), strict=True))
     return " ".join((values | changed).values())
@@ -139,7 +139,7 @@ def test_a_label_of_the_tracking_benchmark_is_counted(tmp_path: Path) -> None:
 
 
 def array(size: tuple[float, float, float], x: float = 5.0) -> Any:
-    """A Detection3DArray of a good box and of one with this size and place."""
+    """Make a Detection3DArray of a good box and of one with this size and position."""
     boxes = Boxes3D(np.full((2, 3), 5.0), np.array([[4, 2, 1.5], size], np.float32), np.zeros(2, np.float32))
     results = [[("car", 1.0)], [("van", 1.0)]]
     message = encode_boxes_3d(bags.START, bags.LIDAR_FRAME, boxes, results, ids=["a", "b"])

@@ -61,7 +61,7 @@ def scan() -> Cloud:
 def built(
     cloud: Cloud, mounting: F64, tell: Callable[[Synchronizer, F64], None], frame: str = LIDAR
 ) -> tuple[Frame, Synchronizer]:
-    """The frame that becomes of the scan, as a LiDAR mounted so would have made it."""
+    """Return the frame of the scan, as a LiDAR with this mounting records it."""
     points = geometry.apply(geometry.inverse(mounting), cloud.xyz)
     sync = Synchronizer(ROLES, CONFIG)
     tell(sync, mounting)

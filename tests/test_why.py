@@ -48,7 +48,7 @@ def of_truth(answers: list[Answer], row: int) -> Answer:
 
 
 def about(name: str, preset: str, row: int) -> Answer:
-    """The answer about one object, with hints: asked for by its place in the image."""
+    """Return the answer about one object, with hints. The question is the object's box in the image."""
     result = run(name, preset)
     place = FrameIndex(result).truth[row].box
     box = projected_box(place, result.frame.cameras[0]) if place is not None else None
@@ -438,7 +438,7 @@ def test_a_failed_stage_is_the_reason() -> None:
 
 
 def kitti_truth(shared: Path, result: FrameResult, name: str) -> FrameResult:
-    """The result with the label file as ground truth."""
+    """Return the result with the label file as ground truth."""
     kitti = bags.kitti(shared, name)
     lidar_from_camera = geometry.inverse(kitti.camera_from_lidar)
     p2 = kitti.pixels_from_lidar @ lidar_from_camera

@@ -37,7 +37,7 @@ def near(preset: str) -> tuple[Answer, ...]:
 
 
 def again(preset: str, answer: Answer) -> Answer:
-    """The same question with the settings of its hint, everything run anew."""
+    """Ask the same question after running everything again with the settings of the hint."""
     model = "detector.model=demo"
     config = load(
         None, [model, *answer.hints[0].settings], "reference" if preset == "reference" else "default"

@@ -133,7 +133,7 @@ def test_a_detector_of_objects_is_not_asked_for_its_clusters(here: Path) -> None
 
 
 def published(drop_cluster: int = -1, drop_detection: int = -1, drop_object: int = -1) -> Frame:
-    """The frame with what a robot published that does as we do, but for what it lost."""
+    """Return the frame with the outputs of a robot that runs our stages, except for the dropped ones."""
     result = ours()
     clusters, objects, detections = result.clusters, result.objects, result.cameras[0].detections
     assert clusters is not None and objects is not None and detections is not None

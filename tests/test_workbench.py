@@ -115,7 +115,7 @@ def browser() -> Iterator[Browser]:
 
 @contextmanager
 def opened(browser: Browser, address: str, width: int = 1400, height: int = 900) -> Iterator[Page]:
-    """The page, once the viewer shows a frame."""
+    """Yield the page as soon as the viewer shows a frame."""
     page = browser.new_page(viewport={"width": width, "height": height})
     page.add_init_script(
         "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
@@ -154,7 +154,7 @@ def click(page: Page, x: float, y: float) -> dict[str, Any]:
 
 
 def events(page: Page, kind: str) -> list[dict[str, Any]]:
-    """What the viewer has told of a kind."""
+    """Return the viewer's events of one kind."""
     found: list[dict[str, Any]] = page.evaluate("window.seen")
     return [event for event in found if event["type"] == kind]
 
@@ -163,20 +163,20 @@ until = partial(waiting.until, every=POLL)
 
 
 def verdict(page: Page) -> str:
-    """The newest answer's sentence; empty while it is on its way."""
+    """Return the sentence of the newest answer; empty while the answer is pending."""
     answer = page.locator("#answer")
     busy = "busy" in (answer.get_attribute("class") or "")
     return "" if busy else page.inner_text("#verdict")
 
 
 def new_verdict(page: Page, before: str) -> str:
-    """The next one, once it is there."""
+    """Wait for the next verdict and return it."""
     until(lambda: verdict(page) not in ("", before))
     return verdict(page)
 
 
 def state(page: Page) -> dict[str, list[str]]:
-    """What the address holds."""
+    """Return the state that the page's address holds."""
     return parse_qs(urlsplit(page.url).fragment)
 
 
@@ -341,12 +341,12 @@ class Talk:
         self._channel.send(json.dumps({"id": self._number, **message}))
 
     def asked(self, kind: str, **message: Any) -> dict[str, Any]:
-        """The answer of a kind to a message, or its error."""
+        """Send a message and return its answer of this kind, or its error."""
         self.say(**message)
         return self.until(kind, lambda answer: answer.get("id") == self._number)
 
     def until(self, kind: str, wanted: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
-        """The next message of a kind that is so, or the next error."""
+        """Return the next message of a kind that meets the condition, or the next error."""
         while True:
             message: dict[str, Any] = json.loads(self._channel.recv(timeout=PATIENCE))
             if message["type"] == "entries":

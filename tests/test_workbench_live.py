@@ -39,7 +39,7 @@ HELD = 4
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
-    """A robot that plays, and ``bevviz live --workbench`` beside it: its address and its folder."""
+    """Run a robot and ``bevviz live --workbench`` beside it. Yield the workbench's address and its folder."""
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
     folder, root = tmp_path_factory.mktemp("live"), Path(__file__).parents[1]
     with own_graph() as patch:
@@ -59,7 +59,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]
 
 
 def _address(said: Path, live: subprocess.Popen[bytes]) -> str:
-    """What it prints, once it can be reached."""
+    """Return the address that the live run prints, as soon as it can be reached."""
     from bevviz.recording.ports import is_listening
 
     end = time.monotonic() + PATIENCE
@@ -97,7 +97,7 @@ class Channel:
         return data
 
     def until(self, kind: str, number: int | None = None) -> dict[str, Any]:
-        """The next message of a kind, or an error."""
+        """Return the next message of a kind, or an error."""
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             message: dict[str, Any] = json.loads(self._socket.recv(timeout=PATIENCE))
@@ -138,7 +138,7 @@ class Shown:
 
 
 def nearest_missed(talk: Channel, frame: int) -> str:
-    """The pick of the nearest missed object of what is listed next, all of which is of one frame."""
+    """Return the pick of the nearest missed object in the next list, which is of one frame only."""
     entries: list[dict[str, Any]] = []
     while not entries:  # those of the frame that was held before may go first
         entries = talk.until("entries")["entries"]
@@ -265,7 +265,7 @@ def detect(points, params):
 def bench_with_network(
     results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[LiveSession]:
-    """A run whose user has named a function, and then ours again: a page may go to and fro."""
+    """Yield a run whose user has named a function and then our own method. A page may switch between them."""
     (tmp_path / "network.py").write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
     named = ("objects.method=network:detect", "objects.method=frustum")

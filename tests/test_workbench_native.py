@@ -28,7 +28,7 @@ NO_VULKAN = "needs Vulkan, if only in software: apt-get install mesa-vulkan-driv
 
 @pytest.fixture
 def native() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """A viewer without a window: its URL and its process."""
+    """Run a viewer without a window. Yield its URL and its process."""
     port = free_port(9950)
     arguments = ["--headless", "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
     process = subprocess.Popen(
@@ -52,7 +52,7 @@ def native() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 
 def shown(client: ViewerClient) -> tuple[str | None, int | None]:
-    """The viewer's timeline and time."""
+    """Return the viewer's timeline and time."""
     with suppress(TimeoutError):
         for recording in client.get_state().recordings:
             return recording.current_timeline, recording.current_time

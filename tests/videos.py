@@ -47,7 +47,7 @@ def number_of(bgr: U8) -> int:
 
 
 def encode(pictures: Sequence[U8], codec: str = "h264", *, group: int = 10, b_frames: int = 0) -> list[bytes]:
-    """A packet a picture, in the order of decoding."""
+    """Encode each picture as a packet, in the order of decoding."""
     context = cast(Any, av.CodecContext.create(ENCODERS[codec], "w"))
     context.height, context.width = pictures[0].shape[:2]
     context.pix_fmt, context.time_base, context.framerate = "yuv420p", Fraction(1, 10), 10

@@ -14,7 +14,7 @@ PATIENCE = 180.0  # seconds for what takes one or two on an idle machine
 
 
 def until(done: Callable[[], T | None], what: str = "what was waited for", every: float = 0.05) -> T:
-    """What it gives, once that is something. How long it takes says nothing but how busy the machine is."""
+    """Wait until ``done`` returns a true value, and return it. The time limit allows for a busy machine."""
     end = time.monotonic() + PATIENCE
     while not (found := done()):
         assert time.monotonic() < end, f"never: {what}"

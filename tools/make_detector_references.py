@@ -54,7 +54,7 @@ class Reference:
 
 
 def picture() -> NDArray[np.uint8]:
-    """A BGR image of coloured blocks, each with a slope: it can be packed, and no two places are the same."""
+    """Make a BGR image of coloured blocks, each with a slope. It packs well, and no two places are equal."""
     height, width = IMAGE
     blocks = np.random.default_rng(0).integers(0, 225, (-(-height // 16), -(-width // 16), 3))
     slope = np.add.outer(np.arange(height) % 16, np.arange(width) % 16)[..., None]
@@ -62,7 +62,7 @@ def picture() -> NDArray[np.uint8]:
 
 
 def input_of(size: Sequence[int] = SIZE) -> Tensor:
-    """The picture as most families want it, to scale the last layers by."""
+    """Return the picture as most families want it. The last layers are scaled by it."""
     canvas = np.full((1, *size, 3), 114, np.uint8)
     height = int(IMAGE[0] * size[1] / IMAGE[1])
     top = (size[0] - height) // 2
@@ -234,7 +234,7 @@ def ultralytics(
 
 
 def _scaled(folder: Path, plan: str) -> Path:
-    """The plan that a name with a size, such as yolov8n-seg, is scaled from."""
+    """Return the plan that a name with a size, such as yolov8n-seg, is scaled from."""
     family, _, task = plan.partition("-")
     return next(folder.rglob(f"{family[:-1]}{'-' if task else ''}{task}.yaml"))
 

@@ -159,7 +159,7 @@ def _put(module: str, **functions: Any) -> None:
 
 
 def maps(seed: int, channels: Sequence[tuple[str, int, float, float]]) -> dict[str, Tensor]:
-    """Maps (1, C, y, x) by name; each with its number of channels, mean and spread."""
+    """Make maps (1, C, y, x) by name, each with its number of channels, mean and spread."""
     draw = np.random.default_rng(seed)
     shape = GRID[1] // STRIDE, GRID[0] // STRIDE
     return {

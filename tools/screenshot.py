@@ -66,7 +66,7 @@ def main() -> int:
 
 @contextmanager
 def served(recording: Path) -> Iterator[str]:
-    """The web viewer with the recording open, as a URL."""
+    """Serve the recording in the web viewer and yield the URL."""
     web, data = free_port(), free_port()
     command = [sys.executable, "-m", "rerun", str(recording), "--serve-web"]
     command += ["--web-viewer-port", str(web), "--port", str(data)]
@@ -76,7 +76,7 @@ def served(recording: Path) -> Iterator[str]:
 
 @contextmanager
 def browser(binary: str, url: str, size: str) -> Iterator[DevTools]:
-    """A window of that size with the page open."""
+    """Open the page in a browser window of that size."""
     port = free_port()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [binary, *FLAGS, f"--window-size={size.replace('x', ',')}", f"--user-data-dir={profile}"]
@@ -88,7 +88,7 @@ def browser(binary: str, url: str, size: str) -> Iterator[DevTools]:
 
 @contextmanager
 def running(command: list[str], port: int) -> Iterator[None]:
-    """The command, from when it listens on the port until the block is left."""
+    """Run a command until the block is left. The block starts when the command listens on the port."""
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
     try:

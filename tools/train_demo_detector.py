@@ -109,7 +109,7 @@ def dataset(folder: Path, name: str, first_seed: int, seeds: int, workers: int) 
 
 
 def crop(rng: np.random.Generator, image: U8, labels: Labels, size: tuple[int, int]) -> tuple[U8, Labels]:
-    """A scaled, flipped, recoloured window of ``size`` (width, height), every other one around an object."""
+    """Cut a scaled, flipped, recoloured window of ``size`` (width, height). Every other one has an object."""
     width, height = size
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.6)))
     middle = rng.uniform((0, 0), image.shape[1::-1])

@@ -22,12 +22,12 @@ Damage = Callable[[bytearray, random.Random], object]
 
 
 def cut(data: bytearray, rng: random.Random) -> None:
-    """The end is missing: a full disk, a pulled plug."""
+    """Cut off the end, as a full disk or a pulled plug does."""
     del data[rng.randrange(len(data)) :]
 
 
 def cut_late(data: bytearray, rng: random.Random) -> None:
-    """The end is missing, somewhere in the index."""
+    """Cut off the end somewhere in the index."""
     del data[len(data) - rng.randrange(1, max(2, len(data) // 20)) :]
 
 
@@ -38,7 +38,7 @@ def hole(data: bytearray, rng: random.Random) -> None:
 
 
 def zeros(data: bytearray, rng: random.Random) -> None:
-    """A sector was never written."""
+    """Fill a sector with zeros, as if it was never written."""
     at = rng.randrange(len(data)) // 512 * 512
     size = min(rng.choice([512, 4096]), len(data) - at)
     data[at : at + size] = bytes(size)
@@ -51,7 +51,7 @@ def flips(data: bytearray, rng: random.Random) -> None:
 
 
 def noise(data: bytearray, rng: random.Random) -> None:
-    """A stretch is something else."""
+    """Overwrite a stretch with random bytes."""
     at = rng.randrange(len(data))
     size = min(rng.randrange(1, 200), len(data) - at)
     data[at : at + size] = rng.randbytes(size)
@@ -64,12 +64,12 @@ def inserted(data: bytearray, rng: random.Random) -> None:
 
 
 def opcode(data: bytearray, rng: random.Random) -> None:
-    """The kind of a record is another one."""
+    """Change the kind of a record."""
     data[rng.choice(_heads(data))] = rng.randrange(256)
 
 
 def length(data: bytearray, rng: random.Random) -> None:
-    """The length of a record is another one: a little, or all memory."""
+    """Change the length of a record: a little, or to more than all memory."""
     at = rng.choice(_heads(data)) + 1
     if data[:6] == b"\x89MCAP0":
         size = struct.unpack_from("<Q", data, at)[0] if at + 8 <= len(data) else 0
@@ -82,7 +82,7 @@ def length(data: bytearray, rng: random.Random) -> None:
 
 
 def numbers(data: bytearray, rng: random.Random) -> None:
-    """A number among the first of a record is beyond all measure: a time, a size, an offset."""
+    """Set one of the first numbers of a record (a time, a size, an offset) to an extreme value."""
     at = rng.choice(_heads(data)) + rng.randrange(1, 60)
     data[at : at + 8] = struct.pack("<Q", rng.choice([2**63, 2**64 - 1, 2**62, 2**31, 2**32 - 1, 0]))
 
@@ -164,7 +164,7 @@ class Tally:
 
 
 def damaged(name: str, sound: Path, number: int, seed: int, folder: Path) -> tuple[str, Path]:
-    """The bag that belongs to a number: what was done to it, and where it is."""
+    """Write the damaged bag of this number. Return what was done to it and its path."""
     rng = random.Random(f"{seed} {name} {number}")
     what = list(DAMAGES)[number % len(DAMAGES)]
     path = folder / sound.name

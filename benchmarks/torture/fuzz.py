@@ -61,7 +61,7 @@ class Fuzzed:
 
 
 def sound(scans: int = 4) -> list[Row]:
-    """A short drive with every kind of message that is decoded, in order of log time."""
+    """Return a short drive with every kind of message that is decoded, in order of log time."""
     messages = bags.Messages()
     store = messages.store
     found = [
@@ -85,7 +85,7 @@ def sound(scans: int = 4) -> list[Row]:
 
 
 def _filled(store: Any, kind: str, stamp: int) -> Any:
-    """A message with two of everything, and numbers that make sense in most places."""
+    """Make a message with two items in every list, and with plausible numbers in most fields."""
     values = {}
     for name, (node, detail) in store.fielddefs[kind][1]:
         values[name] = _value(store, node.name, detail, stamp)
@@ -115,7 +115,7 @@ def flipped(data: bytearray, rng: random.Random) -> None:
 
 
 def numbered(data: bytearray, rng: random.Random) -> None:
-    """A number among the first is beyond all measure."""
+    """Set one of the first numbers to an extreme value."""
     at = rng.randrange(0, max(1, min(len(data) - 8, 400)), 4)
     numbers = (2**31 - 1, 2**31, 2**32 - 1, 10**6, 0, 0x7FC00000, 0x7F7FFFFF)
     data[at : at + 4] = struct.pack("<I", rng.choice(numbers))
@@ -146,7 +146,7 @@ CHANGES: Sequence[Callable[[bytearray, random.Random], None]] = (
 
 
 def renamed(text: str, rng: random.Random) -> str:
-    """A definition with other names, or of other types."""
+    """Change a name or a type in a message definition."""
     words = ["data", "height", "width", "fields", "header", "stamp", "transforms", "point_step", "encoding"]
     words += ["uint32", "uint8", "float64", "string", "detections", "k", "pose", "results", "frame_id"]
     word = rng.choice([w for w in words if w in text] or words)
@@ -154,7 +154,7 @@ def renamed(text: str, rng: random.Random) -> str:
 
 
 def png(side: int) -> bytes:
-    """A square PNG of one bit a pixel: a small file of a large image. The largest lack their pixels."""
+    """Make a square PNG of one bit per pixel: a small file of a large image. The largest have no pixels."""
     rows = (b"\0" + bytes(side // 8)) * (side if side <= 32_000 else 1)
 
     def part(kind: bytes, content: bytes) -> bytes:
@@ -210,7 +210,7 @@ def fuzzed(rows: Sequence[Row], rng: random.Random) -> Row:
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """A bag; a definition that is another one has a channel of its own."""
+    """Write the rows as a bag. A changed definition has its own channel."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start("ros2")
@@ -260,7 +260,7 @@ def read_messages(path: Path) -> Outcome:
 
 
 def run_over(path: Path) -> Outcome:
-    """A whole run over a bag. ``said`` has its exit status."""
+    """Run bevviz over a bag. ``said`` of the outcome has the exit status."""
     from bevviz.cli import main
 
     outcome = Outcome()

@@ -33,7 +33,7 @@ STEP = 32  # compressed bytes that a decompressor gets at once; what it made of 
 
 
 def taken(judge: Judge, path: Path) -> list[Found]:
-    """What a reader gives before it gives up. Whatever it raises is its own affair."""
+    """Return the messages that a reader yields before it fails. Ignore the exception that it raises."""
     found: list[Found] = []
     try:
         for item in judge(path):
@@ -47,7 +47,7 @@ def taken(judge: Judge, path: Path) -> list[Found]:
 
 
 def mcap_stream(path: Path) -> Iterator[Found]:
-    """The mcap package, from front to back. Of a chunk that is damaged the part before the damage counts."""
+    """Read with the mcap package from front to back. Of a damaged chunk, yield the part before the damage."""
     channels: dict[int, Channel] = {}
     with path.open("rb") as file:
         for record in StreamReader(file, emit_chunks=True, record_size_limit=1 << 28).records:
@@ -99,16 +99,16 @@ def _streamed(stream: Any, packed: bytes) -> bytes:
 
 
 def mcap_index(path: Path) -> Iterator[Found]:
-    """The mcap package, by the index."""
+    """Read with the mcap package by the index."""
     with path.open("rb") as file:
         for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False):
             yield channel.topic, message.log_time, message.data
 
 
 def mcap_resync(path: Path) -> Iterator[Found]:
-    """A scan that tries every place which looks like the head of a record, with the mcap package's parser.
+    """Try every offset that looks like the head of a record, with the parser of the mcap package.
 
-    A chunk that is cut by the end of the file is read as far as it goes.
+    A chunk that the end of the file cuts off is read as far as it goes.
     """
     data = path.read_bytes()
     channels: dict[int, Channel] = {}
@@ -181,7 +181,7 @@ def _queried(path: Path, query: str) -> Iterator[Found]:
 
 
 def sqlite_recover(path: Path) -> Iterator[Found]:
-    """The command line's ``.recover``, where there is one that has it (Debian's has not)."""
+    """Recover with ``.recover`` of the sqlite3 command line, if that has it (Debian's has not)."""
     program = shutil.which("sqlite3")
     if program is None:
         return
@@ -229,7 +229,7 @@ def rosbag_original(path: Path) -> Iterator[Found]:
 
 
 def ros1_resync(path: Path) -> Iterator[Found]:
-    """A scan that tries every place which looks like the head of a record."""
+    """Try every offset that looks like the head of a record."""
     yield from _ros1_records(path.read_bytes(), 13, {})
 
 
@@ -288,7 +288,7 @@ def _ros1_content(compression: bytes, packed: bytes) -> bytes:
 
 
 def unpacked(judge: Judge) -> Judge:
-    """The judge on as much of a zstd file as the zstandard package unpacks."""
+    """Make a judge of zstd files: it reads as much of the file as the zstandard package unpacks."""
 
     def read(path: Path) -> Iterator[Found]:
         target = path.with_name("unpacked") / path.stem
@@ -309,7 +309,7 @@ def unpacked(judge: Judge) -> Judge:
 
 
 def messages_unpacked(judge: Judge) -> Judge:
-    """The judge, and each message unpacked with the zstandard package; those that cannot be are left out."""
+    """Make a judge that unpacks each message with the zstandard package and skips it if that fails."""
 
     def read(path: Path) -> Iterator[Found]:
         for topic, time, data in taken(judge, path):

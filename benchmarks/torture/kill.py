@@ -213,7 +213,7 @@ def _one(
 
 
 def _falsehood(folder: Path, command: Command, status: int, out: str) -> str:
-    """What is not true of a status and what it vouches for; empty where all is."""
+    """Return what is wrong with an exit status and the output that it vouches for, or an empty text."""
     if status not in (0, 130, *(-number for number in SIGNALS)) and not (command.endless and status == 1):
         return "no status of an interrupt or of an end"
     if status != 0:
@@ -234,7 +234,7 @@ def _goes_on(folder: Path, command: Command) -> str:
 
 
 def _left(folder: Path, session: int, before: set[str], made: Sequence[str], killed: bool) -> str:
-    """Processes that outlive the command; files that are neither its outputs nor unfinished ones."""
+    """Return the processes or the unexpected files that the command left behind; empty if there are none."""
     deadline = time.monotonic() + PATIENCE
     while (running := _session(session)) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -320,14 +320,14 @@ def _start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def _undeafened() -> None:
-    """A shell starts what is in the background deaf to Ctrl-C, which is inherited."""
+    """Restore the handling of Ctrl-C. A shell starts background processes with SIGINT ignored."""
     for number in SIGNALS[:3]:
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _finish(folder: Path, *arguments: str) -> str:
-    """What an undisturbed command prints. Raises RuntimeError where it does not end well."""
+    """Return the output of an undisturbed command. Raise RuntimeError if the command fails."""
     process = _start(folder, *arguments)
     try:
         out, said = process.communicate(timeout=LIMIT)

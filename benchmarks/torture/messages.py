@@ -105,7 +105,7 @@ class Tally:
 
 @cache
 def _messages() -> bags.Messages:
-    """A maker of messages that knows all types."""
+    """Return a message factory that knows all types."""
     from tests import test_objects
 
     made = bags.Messages()
@@ -141,7 +141,7 @@ def _base() -> tuple[bags.Item, ...]:
 
 
 def _drive(kind: str, make: Callable[[int], Any], *, without: str = "", topic: str = TOPIC) -> list[Row]:
-    """A drive with one message of a kind for each scan, which takes the place of the topic ``without``."""
+    """Return a drive with one message of a kind per scan. These messages replace the topic ``without``."""
     stamps = [bags.START + scan * bags.PERIOD for scan in range(SCANS)]
     items = [item for item in _base() if item.topic != without]
     return _rows([*items, *(bags.Item(topic, kind, stamp, make(stamp)) for stamp in stamps)])
@@ -268,7 +268,7 @@ def _markers() -> list[Row]:
 
 
 def _filled(kind: str, topic: str = TOPIC, **values: Any) -> list[Row]:
-    """A drive with messages that have two of everything, but for the given fields."""
+    """Return a drive with messages that have two items in every list, except for the given fields."""
 
     def make(stamp: int) -> Any:
         message = fuzz._filled(_messages().store, kind, stamp)
@@ -319,7 +319,7 @@ link="wheel"/></joint></robot>"""
 
 
 def _foxglove(image: str, encoding: str) -> list[Row]:
-    """The drive of Foxglove's own SDK, prolonged, in protobuf or JSON."""
+    """Return the drive of Foxglove's own SDK, prolonged, in protobuf or JSON."""
     from google.protobuf.json_format import MessageToDict, ParseDict
 
     from bevviz.messages.foxglove import parse
@@ -354,7 +354,7 @@ def _foxglove(image: str, encoding: str) -> list[Row]:
 
 
 def _at(value: Any, moment: int) -> Any:
-    """The fields of a message, with every time in them replaced."""
+    """Return the fields of a message with every time in them replaced."""
     if isinstance(value, dict):
         told = f"{np.datetime64(moment, 'ns')}Z"
         return {key: told if key == "timestamp" else _at(item, moment) for key, item in value.items()}
@@ -440,21 +440,21 @@ def _flipped(data: bytearray, rng: random.Random) -> None:
 
 
 def _numbered(data: bytearray, rng: random.Random) -> None:
-    """A number anywhere is beyond all measure."""
+    """Set a number anywhere in the message to an extreme value."""
     at = rng.randrange(0, max(1, len(data) - 8), 4)
     numbers = (2**31 - 1, 2**31, 2**32 - 1, 10**6, 65535, 0, 0x7FC00000, 0xFF800000)
     data[at : at + 4] = struct.pack("<I", rng.choice(numbers))
 
 
 def _doubled(data: bytearray, rng: random.Random) -> None:
-    """A number of eight bytes is none, or beyond all measure."""
+    """Set a number of eight bytes to NaN or to an extreme value."""
     at = rng.randrange(0, max(1, len(data) - 8), 4)
     numbers = (float("nan"), float("inf"), -float("inf"), 1e308, -1e300, 5e-324, 0.0)
     data[at : at + 8] = struct.pack("<d", rng.choice(numbers))
 
 
 def _spliced(data: bytearray, rng: random.Random) -> None:
-    """A stretch stands in the place of another one."""
+    """Copy a stretch of the message over another stretch."""
     size = rng.randrange(1, max(2, len(data) // 2))
     source, target = (rng.randrange(max(1, len(data) - size)) for _ in range(2))
     data[target : target + size] = data[source : source + size]
@@ -473,7 +473,7 @@ ODD: Sequence[Any] = (
 
 
 def _reworded(text: bytes, rng: random.Random) -> bytes:
-    """A JSON message with odd values in one to three places, or without them."""
+    """Change or remove one to three values of a JSON message."""
     tree = json.loads(text)
     for _ in range(rng.randrange(1, 4)):
         places = list(_places(tree))
@@ -499,7 +499,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def changed(row: Row, rng: random.Random) -> Row:
-    """The row with a message, or a definition, that is not as it should be."""
+    """Return the row with a damaged message or a damaged definition."""
     if row.form != "jsonschema" and rng.random() < CHANGED_DEFINITIONS:
         if row.form == "ros2msg":
             return replace(row, definition=fuzz.renamed(row.definition.decode(), rng).encode())
@@ -514,7 +514,7 @@ def changed(row: Row, rng: random.Random) -> Row:
 
 
 def case(name: str, rows: Sequence[Row], number: int, seed: int) -> tuple[int, Row]:
-    """The place of a case in its drive, and the changed row."""
+    """Return the index of a case in its drive, and the changed row."""
     victims = [place for place, row in enumerate(rows) if row.topic == KINDS[name].topic]
     victims = victims[2:] or victims
     place = victims[number % min(len(victims), BATCH)]
@@ -588,7 +588,7 @@ def read_frames(argument: tuple[Path, Sequence[str]]) -> Outcome:
 
 
 def fault(outcome: Outcome) -> str:
-    """What is wrong with the reading of a drive; empty: nothing."""
+    """Return what is wrong with the reading of a drive; empty if nothing is."""
     if outcome.hung:
         return "hangs"
     if outcome.traceback:
@@ -640,7 +640,7 @@ class Trial:
             tally.examples.append("; ".join([f"{self._name}, case {which}: {kind}", told, *last, *where]))
 
     def _guilty(self, cases: Mapping[int, Row], kind: str) -> list[int]:
-        """The place of one case that does the same alone; all of them where none does."""
+        """Return the index of one case that has the fault alone, or of several that have it together."""
         places = list(cases)
         while len(places) > 1:
             halves = places[: len(places) // 2], places[len(places) // 2 :]

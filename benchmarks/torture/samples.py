@@ -24,7 +24,7 @@ Item = tuple[str, str, int, bytes]
 
 
 def items(ros1: bool) -> list[Item]:
-    """A drive of four seconds in order of log time."""
+    """Return a drive of four seconds in order of log time."""
     messages = bags.Messages(ros1)
     serialize = messages.store.serialize_ros1 if ros1 else messages.store.serialize_cdr
     found = sorted(bags.small_items(messages, SCANS, POINTS), key=lambda item: item.received)
@@ -32,7 +32,7 @@ def items(ros1: bool) -> list[Item]:
 
 
 def rosbag2(plugin: StoragePlugin, mode: CompressionMode | None = None) -> Callable[[Path], Path]:
-    """A bag as rosbags writes it, the one file of it."""
+    """Return a function that writes a bag with rosbags and returns its one file."""
 
     def write(folder: Path) -> Path:
         store = bags.Messages().store
@@ -53,7 +53,7 @@ def rosbag2(plugin: StoragePlugin, mode: CompressionMode | None = None) -> Calla
 def mcap(
     compression: CompressionType, *, chunked: bool = True, crc: bool = True, chunk_size: int = CHUNK_SIZE
 ) -> Callable[[Path], Path]:
-    """A file as the mcap package writes it, of several chunks."""
+    """Return a function that writes a file of several chunks with the mcap package."""
 
     def write(folder: Path) -> Path:
         store = bags.Messages().store
@@ -81,7 +81,10 @@ def mcap(
 
 
 def packed(write: Callable[[Path], Path]) -> Callable[[Path], Path]:
-    """The same as one zstd file of several frames, as a recorder that packs as it goes leaves it."""
+    """Return a function that packs the written file as one zstd file of several frames.
+
+    A recorder that packs while it records leaves such a file.
+    """
 
     def pack(folder: Path) -> Path:
         path = write(folder)
@@ -114,7 +117,7 @@ def ros1(compression: str = "", chunk_size: int = CHUNK_SIZE) -> Callable[[Path]
 
 
 def unclosed(folder: Path) -> Path:
-    """A sqlite3 bag whose recorder was killed: two fifths of the messages lie in the log beside it."""
+    """Write a sqlite3 bag whose recorder was killed: two fifths of the messages are in the log beside it."""
     whole = rosbag2(StoragePlugin.SQLITE3)(folder)
     path = folder / "bag.db3"
     with sqlite3.connect(whole) as source, sqlite3.connect(path) as target:
