@@ -267,7 +267,7 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
 
 def both_are_large(recording: Path, bag: Path) -> bool:
     waiting = sum(path.stat().st_size for path in unfinished_files(bag))
-    return waiting > 9_000_000 and recording.stat().st_size > 1_000_000
+    return waiting > 9_000_000 and recording.stat().st_size > 2_500_000
 
 
 def test_killed_twice_and_started_again_each_bag_is_whole(tmp_path: Path) -> None:

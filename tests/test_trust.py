@@ -526,7 +526,7 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         "recording/source_lookup.py",
         "report/check.py",
     }
-    finding = {file for file, call in calls("find") if ast.unparse(call.func) == "plugins.find"}
+    finding = {file for file, call in calls("load_plugin") if ast.unparse(call.func) == "plugins.load_plugin"}
     assert finding == {"config/user_stages.py"}
 
 
