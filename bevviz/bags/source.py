@@ -48,19 +48,15 @@ class FrameSelection:
 
 @dataclass(slots=True)
 class ReadingState:
-    """Position in a recording between two messages, and the state that earlier messages built up.
+    """State that the messages of a recording built up so far.
 
     Attributes:
         sync: synchroniser with its queues.
-        stop: log time in nanoseconds at which reading ends; 0: not known yet.
-        number: number of the last scan read, counted from the first scan read; -1: none.
         numbers: numbers of the scans not delivered yet, by time of receipt.
         damage: unusable messages.
     """
 
     sync: Synchronizer
-    stop: int = 0
-    number: int = -1
     numbers: dict[int, list[int]] = field(default_factory=dict)
     damage: UnusableMessages = field(default_factory=UnusableMessages)
 
@@ -204,39 +200,36 @@ class BagSource(Closable):
 
     def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
         """Yield the chosen frames of the scans with low <= log time < high, numbered from ``first``."""
-        return self._deliver(self._begin(low), low, high, first, chosen)
-
-    def _begin(self, low: int) -> ReadingState:
         sync = Synchronizer(self.roles, self.config)
         state = self._state = ReadingState(sync)
-        self._feed_latched(state, self._handlers(sync), low)
-        return state
-
-    def _handlers(self, sync: Synchronizer) -> dict[str, Handler[RawMessage]]:
-        return make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
+        handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
+        self._feed_latched(state, handlers, low)
+        return self._deliver(state, handlers, low, high, first, chosen)
 
     def _deliver(
-        self, state: ReadingState, low: int, high: int, first: int, chosen: range
+        self,
+        state: ReadingState,
+        handlers: Mapping[str, Handler[RawMessage]],
+        low: int,
+        high: int,
+        first: int,
+        chosen: range,
     ) -> Iterator[Frame]:
         """Yield the frames and update ``state``."""
-        sync = state.sync
-        handlers = self._handlers(sync)
-        state.stop = high + MARGIN
+        sync, number, stop = state.sync, -1, high + MARGIN
         for message in self.recording.scans(handlers.keys(), low - MARGIN, high + MARGIN):
-            if message.received > state.stop:
+            if message.received > stop:
                 break
             if message.topic == self._driver:
                 if not low <= message.received < high:
                     continue
-                state.number += 1
-                if state.number not in chosen:
+                number += 1
+                if number not in chosen:
                     continue
-                if state.number == chosen[-1]:
-                    state.stop = message.received + MARGIN
-                state.numbers.setdefault(message.received, []).append(first + state.number)
-            elif message.topic in self.roles.lidars and not (
-                state.number in chosen or state.number + 1 in chosen
-            ):
+                if number == chosen[-1]:
+                    stop = message.received + MARGIN
+                state.numbers.setdefault(message.received, []).append(first + number)
+            elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
             self._handle(handlers[message.topic], message, state)
             yield from self._numbered(sync.ready(message.received), state)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 from uuid import uuid4
 
 from bevviz.bags.source import BagSource
@@ -83,7 +83,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
                 session = Session(config)
                 with output.opened(source) as sinks:
                     recorder = Recorder(sinks.recording, job.config, session.stages.provider)
-                    observers = output.observers(source, sinks, recorder, on_frame, pictures)
+                    observers = output.observers(source, sinks, recorder, on_frame)
                     if run_frames(source, session, observers).interrupted:
                         raise KeyboardInterrupt
                 return output.complete(source)
@@ -127,7 +127,6 @@ class JobOutput(Closable):
         sinks: OpenRecording,
         recorder: Recorder,
         on_frame: Callable[[], None],
-        pictures: PictureMaker,
     ) -> list[Observer[FrameResult]]:
         """Return the observers of the run.
 
@@ -136,14 +135,13 @@ class JobOutput(Closable):
             sinks: outputs of the recording.
             recorder: writes to the recording.
             on_frame: called after each frame.
-            pictures: makes the pictures of a frame.
         """
         observers: list[Observer[FrameResult]] = [recorder]
         if self._job.truth is not None:
             self._evaluation = Evaluation(truth_in(source, self._job.truth or None))
             observers += [self._evaluation, EvaluationRecorder(sinks.recording, self._evaluation)]
         assert sinks.file is not None
-        self._rows = _RowCollector(self._job, sinks.file, on_frame, self._evaluation, pictures)
+        self._rows = _RowCollector(self._job, sinks.file, on_frame, self._evaluation)
         return [*observers, self._rows, DiskWatch(sinks)]
 
     @property
@@ -188,8 +186,6 @@ class JobOutput(Closable):
         return JobResult(job.name, info.frames, info.seconds)
 
 
-PictureMaker: TypeAlias = Callable[[FrameResult], Mapping[str, bytes]]
-
 WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's-eye view's
 
 
@@ -209,22 +205,21 @@ class _WorstPictures:
 
     COUNT = 12
 
-    def __init__(self, pictures: PictureMaker) -> None:
-        self._pictures = pictures
+    def __init__(self) -> None:
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def see(self, badness: float, row: int, result: FrameResult) -> None:
         rank = (badness, -row)
         if len(self._worst) == self.COUNT and rank <= self._worst[0][:2]:
             return
-        candidate = (*rank, self._pictures(result))
+        candidate = (*rank, pictures(result))
         if len(self._worst) == self.COUNT:
             heapq.heapreplace(self._worst, candidate)
         else:
             heapq.heappush(self._worst, candidate)
 
     def __iter__(self) -> Iterator[tuple[int, Mapping[str, bytes]]]:
-        return ((-row, pictures) for _, row, pictures in self._worst)
+        return ((-row, jpegs) for _, row, jpegs in self._worst)
 
 
 class _RowCollector(Observer[FrameResult]):
@@ -236,12 +231,11 @@ class _RowCollector(Observer[FrameResult]):
         recording: Path,
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
-        pictures: PictureMaker,
     ) -> None:
         self.rows: list[dict[str, Any]] = []
         self._job, self._recording, self._on_frame = job, recording, on_frame
         self._evaluation = evaluation
-        self._worst = _WorstPictures(pictures)
+        self._worst = _WorstPictures()
 
     def see(self, result: FrameResult) -> None:
         values = row(result, result.config)
@@ -255,5 +249,5 @@ class _RowCollector(Observer[FrameResult]):
             raise WithdrawnError
 
     def end(self) -> None:
-        for row_number, pictures in self._worst:
-            self.rows[row_number] |= pictures
+        for row_number, jpegs in self._worst:
+            self.rows[row_number] |= jpegs

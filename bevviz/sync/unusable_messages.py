@@ -28,11 +28,6 @@ class UnusableMessages:
         self._first.setdefault(topic, reason)
         return self._counts[topic]
 
-    def extend(self, other: UnusableMessages) -> None:
-        """Add the counts of another one."""
-        self._counts += other._counts
-        self._first = {**other._first, **self._first}
-
     @property
     def sentences(self) -> list[str]:
         """A sentence for each topic."""
