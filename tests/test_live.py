@@ -1101,7 +1101,7 @@ def is_large(path: Path) -> bool:
 
 
 def test_killed_twice_and_started_again_nothing_is_lost(tmp_path: Path) -> None:
-    """As systemd does it with Restart=always: the same command each time."""
+    """Start the same command again after each kill, as systemd does with Restart=always."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     environment |= alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "4", "--save", "drive.rrd"]

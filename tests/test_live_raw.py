@@ -271,7 +271,7 @@ def both_are_large(recording: Path, bag: Path) -> bool:
 
 
 def test_killed_twice_and_started_again_each_bag_is_whole(tmp_path: Path) -> None:
-    """As systemd does it with Restart=always: the same command each time."""
+    """Start the same command again after each kill, as systemd does with Restart=always."""
     command = [sys.executable, "-m", "bevviz.cli", "live", "--save", "drive.rrd", "--save", "drive.mcap"]
     stems = ["drive", "drive-2", "drive-3"]
     before: dict[Path, bytes] = {}

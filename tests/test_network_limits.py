@@ -246,7 +246,7 @@ def test_memory_for_tensors_is_limited(tmp_path: Path) -> None:
 
 
 def test_memory_beyond_the_tensors_is_watched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of a file whose functions call one another, which grow while they are loaded."""
+    """Simulate a file whose nested functions grow while it is loaded."""
     resident = iter([0, *[10**12] * 1000])
     monkeypatch.setattr(session, "_resident", lambda: next(resident))
     ended: list[bool] = []

@@ -305,7 +305,7 @@ def test_modules_of_a_trusted_file_lie_beside_it(received: Path, monkeypatch: py
 
 
 def test_modules_beside_a_trusted_file_come_first(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was trusted is what runs, whatever is installed; two of one name are not mixed up."""
+    """Run the trusted module, also if another one of the same name is installed."""
     installed = received.parent / "installed"
     installed.mkdir()
     (installed / "drive_tools.py").write_text(TOOLS)
@@ -499,7 +499,7 @@ def names_in(path: Path) -> set[str]:
 
 
 def test_only_few_places_speak_for_the_user() -> None:
-    """Whoever adds one is to think of what is received; a layer without a word is not trusted."""
+    """Few modules grant trust, and a layer without a stated origin is not trusted."""
     assert Layer("somewhere", {}).trust is RECEIVED and not RECEIVED.granted
     users = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if "USER" in names_in(path)}
     assert users == {"config/loading.py", "config/project.py", "config/trust.py", "drive.py"}

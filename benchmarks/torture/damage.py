@@ -132,7 +132,7 @@ DAMAGES: Mapping[str, Damage] = {
 
 @dataclass
 class Tally:
-    """What came of the bags of one format, or of all."""
+    """Result of the bags of one format, or of all."""
 
     bags: int = 0
     messages: int = 0  # that were in them when they were sound

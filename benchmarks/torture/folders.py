@@ -396,7 +396,7 @@ def project(root: Path, rng: random.Random) -> str:
 
 @dataclass
 class Tally:
-    """What came of the folders of one kind."""
+    """Result of the folders of one kind."""
 
     cases: int = 0
     read: int = 0  # commands that ended with status 0, or with 1 and the line that there are no frames

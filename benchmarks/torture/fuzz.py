@@ -44,7 +44,7 @@ Row = tuple[str, int, bytes, str]
 
 @dataclass
 class Fuzzed:
-    """What came of fuzzed messages."""
+    """Result of the fuzzed messages."""
 
     messages: int = 0
     refused: int = 0  # with one clear line

@@ -94,7 +94,7 @@ COMMANDS: dict[str, Command] = {
 
 @dataclass
 class Killed:
-    """What came of the signals that a command was sent."""
+    """Result of the signals that a command was sent."""
 
     signals: int = 0
     ended: int = 0  # before the signal came

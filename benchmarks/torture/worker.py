@@ -16,7 +16,7 @@ LIMIT = 60.0  # seconds for a bag or a message
 
 @dataclass
 class Outcome:
-    """What came of one bag or one message."""
+    """Result of reading one bag or one message."""
 
     found: list[tuple[str, int, bytes]] = field(default_factory=list)
     said: list[str] = field(default_factory=list)  # warnings, or the one line of an error

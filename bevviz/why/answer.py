@@ -54,7 +54,7 @@ class Answer:
 
     @property
     def weak(self) -> bool:
-        """Whether it is a detection below a threshold that belongs to no object of the ground truth."""
+        """Whether the subject is a weak detection without an object of the ground truth."""
         reason, best = self.verdict.reason, self.evidence.best
         low = reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
         low |= reason is Reason.NOT_AMONG and best is not None and not best.kept

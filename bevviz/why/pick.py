@@ -38,7 +38,7 @@ class Pick:
 
     @property
     def is_place(self) -> bool:
-        """Whether it is a place. A place may hold any number of objects."""
+        """Whether the pick is a place, which may hold any number of objects."""
         return self.kind in ("pixel", "point", "cell")
 
     def __str__(self) -> str:

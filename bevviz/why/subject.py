@@ -41,7 +41,7 @@ class Selection:
 
     @property
     def one(self) -> bool:
-        """Whether it selects one subject or place. Else it selects a whole class or frame."""
+        """Whether the selection is one subject or place, and not a whole class or frame."""
         rows = self.truth, self.object, self.detection, self.cluster, self.track
         return bool(self.box or self.point or self.cell) or any(row is not None for row in rows)
 
