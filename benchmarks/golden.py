@@ -113,7 +113,7 @@ def _steps(folder: Path) -> dict[str, Callable[[], Hashes]]:
 
 def _drives(folder: Path) -> dict[str, list[str]]:
     """Return the arguments that name each drive; make the drives that FOLDER lacks."""
-    from tests import datasets
+    from tests.support import datasets
 
     demo = folder / "demo.mcap"
     if not demo.exists():

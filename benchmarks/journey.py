@@ -104,7 +104,7 @@ def demo(folder: Path, frames: int) -> list[str]:
 
 def _kitti(folder: Path) -> list[str]:
     """Its labelled frames as a bag, and the labels."""
-    from tests import bags
+    from tests.support import bags
 
     names = [f"{number:06}" for number in range(12)]
     bag = bags.write(folder / "kitti", bags.kitti_items(DATA.parent / "data", names=names))

@@ -24,7 +24,7 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.sync.surroundings import MANY, SAMPLES, SurroundingsBuffer
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
-from tests.recordings import Recording
+from tests.support.recordings import Recording
 
 
 def make(kind: str, **values: Any) -> Any:

@@ -20,7 +20,7 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
-from tests import bags
+from tests.support import bags
 
 FORMATS = [
     ("mcap", ""),

@@ -34,10 +34,10 @@ from bevviz.fleet.table import SEVERITIES, row, severity
 from bevviz.fleet.work import run
 from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
-from tests import bags
-from tests.pages import Page
-from tests.recordings import Recording, verify
-from tests.waiting import meanwhile
+from tests.support import bags
+from tests.support.html_pages import Page
+from tests.support.recordings import Recording, verify
+from tests.support.waiting import meanwhile
 
 GOOD = ("kitti", "one-drive", "two_b_-drive")
 SCANS = 8

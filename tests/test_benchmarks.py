@@ -22,7 +22,7 @@ from bevviz.cli import main
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why.verdict import HOPELESS, Reason
-from tests import bags
+from tests.support import bags
 from tests.test_faults import at, drive, planted
 from tests.test_faults import run as run_fault
 

@@ -24,8 +24,8 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
-from tests import bags, forms
-from tests.recordings import Recording, verify
+from tests.support import bags, documented_json
+from tests.support.recordings import Recording, verify
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -396,7 +396,7 @@ def test_command(turned: Path, capsys: Capture) -> None:
 
     assert main(["calib", str(turned), "--config", "fixed.yaml", "--json", "--frames", ":8"]) == 0
     tree = json.loads(capsys.readouterr().out)
-    forms.check(tree, "bevviz.calib/1")
+    documented_json.check(tree, "bevviz.calib/1")
     (again,) = tree["cameras"]
     assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 

@@ -23,9 +23,9 @@ from bevviz.cli.options import join_negative_numbers
 from bevviz.model.results import FrameResult
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.support.files import unfinished_files
-from tests import bags
-from tests.recordings import Recording
-from tests.waiting import PATIENCE
+from tests.support import bags
+from tests.support.recordings import Recording
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 

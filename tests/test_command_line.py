@@ -15,8 +15,8 @@ import pytest
 from bevviz.cli import main
 from bevviz.cli.machine import join_json_option
 from bevviz.cli.outputs import program, set_up_notes
-from tests import bags, forms
-from tests.waiting import PATIENCE
+from tests.support import bags, documented_json
+from tests.support.waiting import PATIENCE
 
 Capture = pytest.CaptureFixture[str]
 
@@ -154,7 +154,7 @@ def test_json_on_stdout_or_in_a_file(tmp_path: Path, capsys: Capture) -> None:
     bags.write(tmp_path / "drive", bags.small_items(scans=6))
     assert main(["info", "--json", "drive"]) == 0
     info = json.loads(capsys.readouterr().out)
-    forms.check(info, "bevviz.info/1")
+    documented_json.check(info, "bevviz.info/1")
     assert [camera["K"][0][0] for camera in info["cameras"]] == [60.0]
     assert info["transforms"]["velodyne"] == "base_link"
 
@@ -162,13 +162,13 @@ def test_json_on_stdout_or_in_a_file(tmp_path: Path, capsys: Capture) -> None:
     assert main(["sweep", "drive", *swept, "--json", "sweep.json"]) == 0
     assert "clustering.eps" in capsys.readouterr().out
     sweep = json.loads(Path("sweep.json").read_text())
-    forms.check(sweep, "bevviz.sweep/1")
+    documented_json.check(sweep, "bevviz.sweep/1")
     assert [run["values"] for run in sweep["runs"]] == [["0.5"], ["0.6"]]
 
     assert main(["compare", "drive", "--frames", ":1", "--json", "--save", "c.rrd"]) == 0
-    forms.check(json.loads(capsys.readouterr().out), "bevviz.compare/1")
+    documented_json.check(json.loads(capsys.readouterr().out), "bevviz.compare/1")
     assert main(["why", "drive", "--at-frame", "0", "--point", "5,0,0", "--json"]) == 0
-    forms.check(json.loads(capsys.readouterr().out), "bevviz.why/1")
+    documented_json.check(json.loads(capsys.readouterr().out), "bevviz.why/1")
 
 
 def test_json_never_takes_the_bag_for_its_file() -> None:

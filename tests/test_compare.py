@@ -38,8 +38,8 @@ from bevviz.pipeline.variants import Variants, check_same_frames, without_motion
 from bevviz.recording import entities
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource, write_bag
-from tests import bags, forms
-from tests.recordings import Recording, verify
+from tests.support import bags, documented_json
+from tests.support.recordings import Recording, verify
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -293,7 +293,7 @@ def test_two_configurations_on_kitti(kitti: tuple[str, str], capsys: Capture) ->
     said = capsys.readouterr().out
     assert "clustering.min_cluster_points  10 -> 2000" in said
     tree = json.loads(Path("c.json").read_text())
-    forms.check(tree, "bevviz.compare/1")
+    documented_json.check(tree, "bevviz.compare/1")
     first = tree["frames"][0]["objects"]
     assert {(o["change"], o["class_a"]) for o in first} >= {("only A", "person")}
     assert tree["objects"]["person"]["only A"] >= 1

@@ -25,7 +25,7 @@ from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import register_definitions
 from bevviz.messages.decoding import MessageError
 from bevviz.model.frame import F32
-from tests import bags
+from tests.support import bags
 
 # Twelve points, (4 + i, i % 4 - 1.5, -1.5 + i / 16), intensity 10 i, ring i % 3, rgb 0x102030 + i, encoded by
 # Google's draco 1.5.5 with the calls of draco_point_cloud_transport, an attribute a field: as they are, and

@@ -17,7 +17,7 @@ from bevviz.evaluate import truth_in
 from bevviz.fleet.jobs import find_bags
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Boxes3D, Frame
-from tests import datasets
+from tests.support import datasets
 
 Capture = pytest.CaptureFixture[str]
 STILL = {"sync.motion_compensation": False}

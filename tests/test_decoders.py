@@ -21,7 +21,8 @@ from bevviz.live.ouster_sensors import Ousters
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import BUILT_IN, declared_decoder, decoders, find_decoder
 from bevviz.messages.topics import Topic
-from tests import bags, test_compressed_clouds, test_livox, test_ouster, test_packets, videos
+from tests import test_compressed_clouds, test_livox, test_ouster, test_packets
+from tests.support import bags, videos
 
 ROOT = Path(__file__).parents[1]
 MINE = """

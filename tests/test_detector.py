@@ -18,8 +18,8 @@ from bevviz.model.geometry import iou
 from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector import COCO, Detector, nms
 from bevviz.stages.detector.names import COCO_CATEGORIES
-from tests import networks
-from tests.networks import FLOAT, FLOAT16, INT64, UINT8, Input, image_input, node
+from tests.support import onnx_networks
+from tests.support.onnx_networks import FLOAT, FLOAT16, INT64, UINT8, Input, image_input, node
 
 H, W = 64, 96  # of the small networks' input
 STRIDES = (8, 16, 32)
@@ -39,7 +39,7 @@ def constant(
     metadata: dict[str, str] | None = None,
 ) -> str:
     """Save a network that gives these outputs for every image."""
-    return networks.answer(path, {f"output{i}": o for i, o in enumerate(outputs)}, inputs, metadata)
+    return onnx_networks.answer(path, {f"output{i}": o for i, o in enumerate(outputs)}, inputs, metadata)
 
 
 def head(
@@ -129,14 +129,14 @@ def color_network(path: Path, layout: str) -> str:
     if layout == "YOLOv8":
         weights["boxes"] = np.stack([x * 8 + 4, y * 8 + 4, x * 0 + 8, x * 0 + 8], axis=1)
         nodes.append(node("Concat", ["boxes", "scores"], ["output0"], axis=1))
-        return networks.save(path, nodes, weights, {"output0": ([1, 7, cells], FLOAT)}, inputs, NAMES)
+        return onnx_networks.save(path, nodes, weights, {"output0": ([1, 7, cells], FLOAT)}, inputs, NAMES)
     half, zero = np.full_like(x, 0.5), np.zeros_like(x)
     weights["boxes"] = np.stack([half, half, zero, zero, zero + 1], axis=1)
     weights["coarse"] = np.zeros((1, 8, CELLS - cells), np.float32)  # nothing at strides 16 and 32
     nodes.append(node("Concat", ["boxes", "scores"], ["fine"], axis=1))
     nodes.append(node("Concat", ["fine", "coarse"], ["rows"], axis=2))
     nodes.append(node("Transpose", ["rows"], ["output0"], perm=[0, 2, 1]))
-    return networks.save(path, nodes, weights, {"output0": ([1, CELLS, 8], FLOAT)}, inputs)
+    return onnx_networks.save(path, nodes, weights, {"output0": ([1, CELLS, 8], FLOAT)}, inputs)
 
 
 @pytest.mark.parametrize(("layout", "channel"), [("YOLOv8", 0), ("YOLOX", 2)])
@@ -472,7 +472,7 @@ def test_rtdetr_and_dfine_of_their_repositories(tmp_path: Path) -> None:
         "scores": ((1, 3), FLOAT),
     }
     inputs = (image_input("N", 3, H, W), size)
-    model = networks.save(tmp_path / "m.onnx", nodes, weights, outputs, inputs)
+    model = onnx_networks.save(tmp_path / "m.onnx", nodes, weights, outputs, inputs)
     found = detector(model)
     assert (str(found.layout), found.names) == ("RT-DETR or D-FINE", ())
     assert "unnamed classes" in found.description
@@ -488,7 +488,7 @@ def test_rtdetr_of_its_repository_is_resampled_as_by_torchvision(tmp_path: Path)
     stripes[:, ::2] = 200
     lists = {"labels": CLASSES[None], "boxes": single(BOXES[None]), "scores": single(SCORES[None])}
     inputs = (image_input("N", 3, H, W), ("orig_target_sizes", ("N", 2), INT64))
-    blob, _ = detector(networks.answer(tmp_path / "m.onnx", lists, inputs)).prepare(stripes)
+    blob, _ = detector(onnx_networks.answer(tmp_path / "m.onnx", lists, inputs)).prepare(stripes)
     np.testing.assert_allclose(blob[..., 1:-1], 100 / 255, atol=12 / 255)
 
 
@@ -502,7 +502,7 @@ def test_yolonas_with_its_pre_and_postprocessing(flat: bool, tmp_path: Path) -> 
     inputs = (image_input(1, 3, H, W, kind=UINT8),)
     if flat:
         rows = np.column_stack([np.zeros(3), boxes, SCORES, CLASSES]).astype(np.float32)
-        model = networks.answer(tmp_path / "m.onnx", {"graph2_flat_predictions": rows}, inputs)
+        model = onnx_networks.answer(tmp_path / "m.onnx", {"graph2_flat_predictions": rows}, inputs)
     else:
         empty = np.full((5, 4), -1)
         lists = {
@@ -511,7 +511,7 @@ def test_yolonas_with_its_pre_and_postprocessing(flat: bool, tmp_path: Path) -> 
             "graph2_pred_scores": filled(SCORES, -1)[None].astype(np.float32),
             "graph2_pred_classes": filled(CLASSES, -1)[None].astype(np.int64),
         }
-        model = networks.answer(tmp_path / "m.onnx", lists, inputs)
+        model = onnx_networks.answer(tmp_path / "m.onnx", lists, inputs)
     found = detector(model)
     assert str(found.layout) == "YOLO-NAS"
     expect(found(np.zeros((120, 200, 3), np.uint8)))
@@ -539,7 +539,7 @@ def test_pixels_that_nothing_tells_the_meaning_of_are_refused(tmp_path: Path) ->
     whole, real = image_input(1, 3, H, W, kind=UINT8), image_input(1, 3, H, W)
     rows = {"flat_predictions": np.zeros((0, 7), np.float32)}
     with pytest.raises(UserError, match="YOLO-NAS wants its pixels: export it with preprocessing=True"):
-        detector(networks.answer(tmp_path / "nas.onnx", rows, (real,)))
+        detector(onnx_networks.answer(tmp_path / "nas.onnx", rows, (real,)))
     output = head("YOLOv8", BOXES / 3, SCORES, CLASSES)
     with pytest.raises(
         UserError, match=r"read as YOLOv8, it takes pixels as bytes, .*: export it for floats"
@@ -681,7 +681,7 @@ def test_strangers_are_called_by_name(
 ) -> None:
     outputs = {name: np.zeros(shape, np.float32) for name, shape in zip(names, shapes, strict=True)}
     with pytest.raises(UserError, match=f"detector.model .*{said}"):
-        detector(networks.answer(tmp_path / "m.onnx", outputs, (image_input(1, 3, H, W),)))
+        detector(onnx_networks.answer(tmp_path / "m.onnx", outputs, (image_input(1, 3, H, W),)))
 
 
 @pytest.mark.parametrize(
@@ -709,7 +709,7 @@ def test_a_list_that_was_empty_when_the_model_was_read_is_looked_at_later(
         "rows": np.array([[row]], np.float32),
     }
     outputs = {"output0": ((1, 1, 6), FLOAT)}
-    model = networks.save(tmp_path / "m.onnx", nodes, weights, outputs, [image_input(1, 3, H, W)], NAMES)
+    model = onnx_networks.save(tmp_path / "m.onnx", nodes, weights, outputs, [image_input(1, 3, H, W)], NAMES)
     found = detector(model)
     assert len(found(IMAGE)) == 0
     with pytest.raises(UserError, match=f"detector.model .*: read as end-to-end, it has {said}"):
@@ -788,7 +788,7 @@ def test_outputs_that_are_no_detections(shape: tuple[int, ...], tmp_path: Path) 
 
 
 def test_types_that_no_detector_has(tmp_path: Path) -> None:
-    inputs = (image_input(1, 3, H, W, kind=networks.DOUBLE),)
+    inputs = (image_input(1, 3, H, W, kind=onnx_networks.DOUBLE),)
     with pytest.raises(UserError, match="supported: tensor"):
         detector(constant(tmp_path / "double.onnx", np.zeros((1, 7, CELLS), np.float32), inputs=inputs))
 

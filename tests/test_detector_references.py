@@ -17,13 +17,13 @@ from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
 from bevviz.model.results import DetectionState
 from bevviz.stages.detector import Detector
-from tests import networks
+from tests.support import onnx_networks
 
 FOLDER = Path(__file__).parent / "references"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.npz"))
 ORIENTED = [name for name in NAMES if "-obb" in name]
 UPRIGHT = [name for name in NAMES if "-obb" not in name]
-TYPES = {"tensor(float)": networks.FLOAT, "tensor(float16)": networks.FLOAT16}
+TYPES = {"tensor(float)": onnx_networks.FLOAT, "tensor(float16)": onnx_networks.FLOAT16}
 # Fractions of the image are known as such, but not which way to lay the image in; further columns may be
 # key points or an angle.
 NOT_WITHOUT_METADATA = {"rtdetr", "yolo11n-pose", "yolo11n-pose_nms", "yolo26n-pose_e2e"}
@@ -41,7 +41,7 @@ class Reference:
         """Of a network that has the inputs and metadata of the exported one, and its answer."""
         inputs = [(name, shape, TYPES[kind]) for name, shape, kind in self.about["inputs"]]
         about = self.about["metadata"] if metadata else {}
-        model = networks.answer(folder / "model.onnx", self.outputs, inputs, about)
+        model = onnx_networks.answer(folder / "model.onnx", self.outputs, inputs, about)
         score, iou = self.about["thresholds"]
         return Detector(
             DetectorConfig(

@@ -16,7 +16,7 @@ from bevviz.cli import main
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Selection
-from tests.recordings import Recording, verify
+from tests.support.recordings import Recording, verify
 
 
 @pytest.fixture(scope="module")

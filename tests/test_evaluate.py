@@ -27,8 +27,8 @@ from bevviz.model.frame import Boxes3D, ImageLabels
 from bevviz.model.results import Objects
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.synthetic import SyntheticSource, write_bag
-from tests import bags, forms
-from tests.recordings import Recording, verify
+from tests.support import bags, documented_json
+from tests.support.recordings import Recording, verify
 
 REFERENCES = Path(__file__).parent / "references" / "metrics"
 
@@ -203,7 +203,7 @@ def test_a_gate_that_is_kept_and_one_that_is_not(drive: Path, tmp_path: Path, ca
     suite = ElementTree.parse(tmp_path / "e.xml").getroot()[0]
     assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("drive", "2", "0")
     tree = json.loads((tmp_path / "e.json").read_text())
-    forms.check(tree, "bevviz.evaluate/1")
+    documented_json.check(tree, "bevviz.evaluate/1")
     assert tree["frames"] == 4
     counts = [len(frame["missed"]) + len(frame["false"]) for frame in tree["worst"]]
     assert counts == sorted(counts, reverse=True)

@@ -39,8 +39,8 @@ from bevviz.pipeline.session import Session
 from bevviz.stages import user_stages
 from bevviz.stages.robot_results import detect
 from bevviz.synthetic import SyntheticSource
-from tests import bags
-from tests.waiting import PATIENCE
+from tests.support import bags
+from tests.support.waiting import PATIENCE
 
 MODULE = '''
 """Somebody's stages: nothing of bevviz is imported."""

@@ -21,7 +21,7 @@ from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, Intrinsics
 from bevviz.model.results import FrameResult, Objects
-from tests import bags
+from tests.support import bags
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))
 

@@ -26,10 +26,10 @@ from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.support.files import ScratchFolder, atomic_write, claim_target, save_text, unfinished_files
 from bevviz.workbench.recording_buffer import RecordingBuffer
-from tests import bags
-from tests.recordings import Recording, verify
+from tests.support import bags
+from tests.support.recordings import Recording, verify
+from tests.support.waiting import PATIENCE
 from tests.test_cli import Capture, environment, error_of
-from tests.waiting import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 

@@ -22,7 +22,7 @@ from bevviz.messages.foreign_boxes import decode_objects
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Intrinsics
 from bevviz.stages.robot_results import in_points_frame
-from tests import bags
+from tests.support import bags
 
 LINE = "=" * 80 + "\n"
 IDL = {  # as rosidl generates it from .msg files, and rosbag2 stores it

@@ -17,7 +17,7 @@ from bevviz.messages.detections import decode_detections_3d
 from bevviz.messages.encode import encode_labels
 from bevviz.model.frame import Boxes3D
 from bevviz.model.geometry import inverse, transform, transform_boxes
-from tests.datasets import TR, kitti_odometry, kitti_raw, nuscenes
+from tests.support.datasets import TR, kitti_odometry, kitti_raw, nuscenes
 
 OLD = """# .PCD v.5 - Point Cloud Data file format
 VERSION .5

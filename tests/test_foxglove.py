@@ -22,7 +22,7 @@ from bevviz.model import geometry  # noqa: E402
 from bevviz.model.frame import F32, F64  # noqa: E402
 from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window  # noqa: E402
 from bevviz.stages.robot_results import in_points_frame  # noqa: E402
-from tests import bags, videos  # noqa: E402
+from tests.support import bags, videos  # noqa: E402
 
 SCANS = 6
 K = [60.0, 0, 32, 0, 60, 24, 0, 0, 1]

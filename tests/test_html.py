@@ -14,7 +14,7 @@ from bevviz.fleet.table import RunInfo
 from bevviz.model.frame import Scene
 from bevviz.report.plots import plot
 from bevviz.support.html import render, template_environment
-from tests.pages import Page
+from tests.support.html_pages import Page
 
 EVIL = "</style></script><script>alert('x')</script>\"'><img src=x onerror=alert(1)> &amp; {{ 7 * 7 }}"
 

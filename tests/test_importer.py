@@ -13,9 +13,9 @@ import pytest
 
 from bevviz.cli import importer
 from bevviz.cli.importer import NOT_OURS, run
-from tests import bags
-from tests.recordings import Recording, verify
-from tests.waiting import PATIENCE
+from tests.support import bags
+from tests.support.recordings import Recording, verify
+from tests.support.waiting import PATIENCE
 
 COMMAND = [sys.executable, "-c", "from bevviz.cli.importer import main; main()"]
 

@@ -15,7 +15,7 @@ from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import WIDTH, describe_bag, render_bag_info
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import DEMO_MODEL
-from tests import bags
+from tests.support import bags
 
 
 def write(path: Path, *without: str, form: str = "mcap") -> Path:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from bevviz.support import cleanup
+from tests.support.waiting import PATIENCE
 from tests.test_cli import environment
-from tests.waiting import PATIENCE
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

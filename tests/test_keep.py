@@ -19,8 +19,8 @@ from bevviz.recording import entities
 from bevviz.recording.retention import RawCloudFrame, RawCloudSelector
 from bevviz.recording.saved_viewer import too_large_for_web
 from bevviz.recording.video import GOP, VideoEncoder, decode
-from tests import bags
-from tests.recordings import Recording, verify, without_nan
+from tests.support import bags
+from tests.support.recordings import Recording, verify, without_nan
 
 SETTINGS = ("clustering.eps=2 m", "clustering.min_points=2", "tracking.min_hits=1", "logging.raw_every=21")
 SCANS, DARK = 24, 12  # scans, and the one without an image

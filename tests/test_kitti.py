@@ -13,8 +13,8 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64
 from bevviz.model.results import Decision, DetectionState, FrameResult
 from bevviz.pipeline.session import Session
-from tests import bags
-from tests.recordings import Recording
+from tests.support import bags
+from tests.support.recordings import Recording
 
 CLASSES = {
     "Pedestrian": {"person"},

@@ -49,9 +49,9 @@ from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
-from tests.graphs import alone
-from tests.recordings import Recording, verify
-from tests.waiting import until
+from tests.support.recordings import Recording, verify
+from tests.support.ros_graphs import alone
+from tests.support.waiting import until
 
 Run = Callable[..., "Outcome"]
 

@@ -19,10 +19,10 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.drive import TRUTH_TOPIC
-from tests.graphs import own_graph, playing
-from tests.recordings import Recording
-from tests.ros_player import Play
-from tests.waiting import PATIENCE, until
+from tests.support.recordings import Recording
+from tests.support.ros_graphs import own_graph, playing
+from tests.support.ros_player import Play
+from tests.support.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

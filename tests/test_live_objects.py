@@ -21,8 +21,9 @@ from bevviz.messages import definitions
 from bevviz.messages.definitions import store_of
 from bevviz.messages.encode import encode_cloud, typestore
 from bevviz.synthetic import SyntheticSource
-from tests import bags
-from tests.graphs import own_graph
+from tests.support import bags
+from tests.support.ros_graphs import own_graph
+from tests.support.waiting import until
 from tests.test_objects import (
     AUTOWARE,
     BOX,
@@ -36,7 +37,6 @@ from tests.test_objects import (
     radar,
     vector,
 )
-from tests.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

@@ -38,10 +38,10 @@ from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
-from tests.graphs import alone, own_domain, own_graph, playing
-from tests.recordings import Recording, verify
-from tests.ros_player import Play
-from tests.waiting import PATIENCE, until
+from tests.support.recordings import Recording, verify
+from tests.support.ros_graphs import alone, own_domain, own_graph, playing
+from tests.support.ros_player import Play
+from tests.support.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

@@ -21,8 +21,8 @@ from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.live_buffer import AHEAD, WHOLE
 from bevviz.workbench.live_session import LiveSession
 from bevviz.workbench.routes import PageState
-from tests.live_bench import live_bench
-from tests.recordings import Recording
+from tests.support.live_sessions import live_bench
+from tests.support.recordings import Recording
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 LIMIT = 500  # points

@@ -16,7 +16,7 @@ from bevviz.config import Config
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoding import MessageError
-from tests import bags
+from tests.support import bags
 
 POINT = """uint32 offset_time      # offset time relative to the base time
 float32 x               # X axis, unit:m

@@ -64,8 +64,8 @@ from bevviz.stages.bev import bev
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 from bevviz.support.files import unfinished_files
-from tests.recordings import Recording, verify
-from tests.waiting import PATIENCE
+from tests.support.recordings import Recording, verify
+from tests.support.waiting import PATIENCE
 
 SCENE = Scene("drive", "lidar", ("lidar",), ("zed",), robot=True, truth=True)
 START = 1_700_000_000_123_456_789

@@ -23,7 +23,7 @@ from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
 from bevviz.stages.mask_lookup import is_covered
 from bevviz.synthetic import SyntheticSource
-from tests.recordings import Recording
+from tests.support.recordings import Recording
 from tests.test_frustum import CLUSTERING, claimed, looked
 from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
 

@@ -16,8 +16,8 @@ import pytest
 from bevviz.errors import UserError
 from bevviz.recording import rerun_cli
 from bevviz.recording.ports import allowed_origins, host_for, is_listening, own_address
-from tests import bags
-from tests.waiting import PATIENCE, until
+from tests.support import bags
+from tests.support.waiting import PATIENCE, until
 
 LOOPBACK = "0100007F"  # as /proc/net/tcp has it
 OTHER = "127.0.0.2"  # of this machine, too, and another address: whoever listens on one does not hear it

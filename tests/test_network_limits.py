@@ -19,8 +19,8 @@ from bevviz.config import DetectorConfig, load
 from bevviz.errors import UserError
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import Detector, session
-from tests import networks
-from tests.networks import FLOAT, INT64, Input, image_input, node
+from tests.support import onnx_networks
+from tests.support.onnx_networks import FLOAT, INT64, Input, image_input, node
 from tests.test_pillars import autoware, stated
 
 H, W = 64, 96
@@ -47,7 +47,7 @@ def refused(model: str, **settings: Any) -> str:
 
 
 def constant(path: Path, metadata: Mapping[str, str], shape: Input = IMAGES) -> str:
-    return networks.answer(path, {"output0": yolov8()}, (shape,), metadata)
+    return onnx_networks.answer(path, {"output0": yolov8()}, (shape,), metadata)
 
 
 def unchecked(
@@ -173,11 +173,11 @@ def test_outputs_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
 
 def test_a_file_with_very_many_outputs_has_a_short_error(tmp_path: Path) -> None:
     many = {f"{'o' * 500}{i}": np.zeros((1, 2), np.float32) for i in range(90)}
-    line = refused(networks.answer(tmp_path / "m.onnx", many, (IMAGES,)))
+    line = refused(onnx_networks.answer(tmp_path / "m.onnx", many, (IMAGES,)))
     assert "no detector that is known here" in line and "and 82 more" in line
     many |= {f"more{i}": np.zeros((1, 2), np.float32) for i in range(20)}
     assert "has 110 outputs, and no more than 100 are read" in refused(
-        networks.answer(tmp_path / "n.onnx", many, (IMAGES,))
+        onnx_networks.answer(tmp_path / "n.onnx", many, (IMAGES,))
     )
 
 
@@ -188,19 +188,19 @@ def test_a_file_with_very_many_outputs_has_a_short_error(tmp_path: Path) -> None
 def test_scores_that_are_not_finite_are_refused(value: float, said: str, tmp_path: Path) -> None:
     answer = yolov8()
     answer[0, 5, 3] = value
-    assert said in refused(networks.answer(tmp_path / "m.onnx", {"output0": answer}, (IMAGES,)))
+    assert said in refused(onnx_networks.answer(tmp_path / "m.onnx", {"output0": answer}, (IMAGES,)))
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (1, 0, 0), (1, 7, 0), (0, 7, CELLS), (1, 0, 85), (1,) * 6])
 def test_empty_outputs_and_odd_ranks_are_one_clear_line(shape: tuple[int, ...], tmp_path: Path) -> None:
-    refused(networks.answer(tmp_path / "m.onnx", {"output0": np.zeros(shape, np.float32)}, (IMAGES,)))
+    refused(onnx_networks.answer(tmp_path / "m.onnx", {"output0": np.zeros(shape, np.float32)}, (IMAGES,)))
 
 
 def test_long_texts_of_a_file_are_cut_in_errors(tmp_path: Path) -> None:
     task = {"author": "Ultralytics", "task": "x" * 5000}
     assert f"for the task '{'x' * 200}...'" in refused(constant(tmp_path / "m.onnx", task))
     outputs = {"y" * 5000: yolov8()}
-    line = refused(networks.answer(tmp_path / "n.onnx", outputs, (IMAGES,)))
+    line = refused(onnx_networks.answer(tmp_path / "n.onnx", outputs, (IMAGES,)))
     assert f"output {'y' * 200}... has a name of 5,000 characters" in line
 
 
@@ -375,7 +375,7 @@ def refused_3d(parameters: dict[str, Any]) -> str:
 def encoder(folder: Path, output: NDArray[Any] | None = None, points: int = 32) -> str:
     answer_ = np.zeros((40, 9), np.float32) if output is None else output
     shape = ("input_features", [40, points, 9], FLOAT)
-    return networks.answer(folder / "other.onnx", {"largest": answer_}, [shape])
+    return onnx_networks.answer(folder / "other.onnx", {"largest": answer_}, [shape])
 
 
 def test_an_encoder_whose_answer_does_not_fit_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.model.frame import LabelledBoxes3D
-from tests import bags
+from tests.support import bags
 
 AUTOWARE = {
     "ObjectClassification": "uint8 UNKNOWN = 0\nuint8 CAR = 1\nuint8 TRUCK = 2\nuint8 PEDESTRIAN = 7\n"

@@ -47,7 +47,7 @@ from bevviz.why.verdict import Reason
 from bevviz.workbench.controls import controls
 from bevviz.workbench.findings import find_findings
 from bevviz.workbench.trials import trial_effects
-from tests.recordings import Recording
+from tests.support.recordings import Recording
 
 Drive = list[tuple[FrameResult, LabelledBoxes3D]]
 KNOWN = ("car", "person", "cyclist", "truck", "bicycle")

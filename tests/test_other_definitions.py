@@ -34,7 +34,7 @@ from bevviz.messages.topics import Topic
 from bevviz.model.frame import Cloud, Intrinsics
 from bevviz.sync.feed import make_handlers
 from bevviz.sync.synchronizer import Synchronizer
-from tests import bags
+from tests.support import bags
 
 STATED = SourceConfig(lidar_topics=["/other_points", "/packed_points", "/livox/lidar", "/velodyne_packets"])
 STAMPED = bytes(

@@ -17,7 +17,7 @@ from bevviz.cli import main
 from bevviz.config import Config
 from bevviz.drivers import ouster
 from bevviz.errors import UserError
-from tests import bags
+from tests.support import bags
 
 PIXELS, COLUMNS, PACKETS = 16, 64, 4  # of a scan, in packets of 16 columns
 KIND = "ouster_sensor_msgs/msg/PacketMsg"

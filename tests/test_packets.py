@@ -22,7 +22,7 @@ from bevviz.drivers.hesai import MODELS, NOMINAL, Model
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoding import MessageError
-from tests import bags
+from tests.support import bags
 
 SCAN, PACKET = "pandar_msgs/msg/PandarScan", "pandar_msgs/msg/PandarPacket"
 VELODYNE = "velodyne_msgs/msg/VelodyneScan"

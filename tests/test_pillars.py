@@ -32,7 +32,7 @@ from bevviz.stages.pillars.heads import anchor_boxes, decode_boxes
 from bevviz.stages.pillars.nms import survivors
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.controls import controls
-from tests.networks import FLOAT, INT64, Input, answer, node, save
+from tests.support.onnx_networks import FLOAT, INT64, Input, answer, node, save
 
 REFERENCES = Path(__file__).parent / "references/pillars"
 HEADS = ("openpcdet_anchors", "openpcdet_centers", "mmdetection3d_anchors", "mmdetection3d_centers")

@@ -11,8 +11,8 @@ from bevviz.cli import main
 from bevviz.config import load, stated_lines
 from bevviz.config.project import read_project_layers
 from bevviz.errors import UserError
-from tests import bags
-from tests.recordings import Recording
+from tests.support import bags
+from tests.support.recordings import Recording
 
 Capture = pytest.CaptureFixture[str]
 

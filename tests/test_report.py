@@ -36,8 +36,8 @@ from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack
 from bevviz.report.page import spans
 from bevviz.report.plots import ticks
 from bevviz.stages.detector import Detector
-from tests import bags
-from tests.recordings import Recording, verify
+from tests.support import bags
+from tests.support.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
 
 NOTE = 'lost <script>alert("x")</script> & found\nsecond line'

@@ -19,8 +19,8 @@ import rerun as rr
 from bevviz.cli import main
 from bevviz.config import Config, config_yaml
 from bevviz.recording import entities, rerun_cli
-from tests import bags
-from tests.recordings import Recording
+from tests.support import bags
+from tests.support.recordings import Recording
 from tests.test_cli import Capture, error_of
 
 

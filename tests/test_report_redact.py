@@ -26,8 +26,8 @@ from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, Redactor, _encoded, grow_boxes, hide_boxes
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.synthetic import SyntheticSource
-from tests import bags, videos
-from tests.recordings import Recording, verify
+from tests.support import bags, videos
+from tests.support.recordings import Recording, verify
 from tests.test_cli import Capture, error_of
 
 PNG, RAW, JPEG = "/camera/image_rect_color/compressed", "/annotated", "/other/compressed"

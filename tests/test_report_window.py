@@ -32,8 +32,8 @@ from bevviz.report.bag_window import (
 )
 from bevviz.report.fingerprints import StageDigest, compare, digest
 from bevviz.synthetic.bag import _qos
-from tests import bags
-from tests.waiting import PATIENCE
+from tests.support import bags
+from tests.support.waiting import PATIENCE
 
 CONFIG = Config()
 

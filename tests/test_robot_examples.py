@@ -17,8 +17,8 @@ import pytest
 
 from bevviz.cli import _parser
 from bevviz.config.reloading import ReloadableConfig
-from tests.graphs import own_graph
-from tests.waiting import PATIENCE
+from tests.support.ros_graphs import own_graph
+from tests.support.waiting import PATIENCE
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robot"
 CONFIG = EXAMPLES / "robot.yaml"

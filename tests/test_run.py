@@ -18,7 +18,7 @@ import bevviz.pipeline.run
 from bevviz.model.frame import Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.pipeline.run import DropPolicy, RunEnd, iterate_results, map_ahead, run
-from tests.waiting import PATIENCE, until
+from tests.support.waiting import PATIENCE, until
 
 
 class Numbers:

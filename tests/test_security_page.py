@@ -21,7 +21,7 @@ from bevviz.config.project import named_code, read_project_layers
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import grant_trust
 from bevviz.errors import UserError
-from tests import bags
+from tests.support import bags
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "security.md"
 FUNCTION = "clustering.method=page_tools:cells"

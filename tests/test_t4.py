@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import bevviz
-from tests import datasets
+from tests.support import datasets
 
 
 def rewrite(table: Path, change: Any) -> None:

@@ -15,8 +15,8 @@ from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.support import table
 from bevviz.support.text import fenced, markdown, printable
-from tests import bags
-from tests.recordings import Recording
+from tests.support import bags
+from tests.support.recordings import Recording
 
 READER = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
 ANYTHING = st.one_of(

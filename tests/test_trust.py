@@ -25,7 +25,7 @@ from bevviz.errors import UserError
 from bevviz.live.remote_requests import Orders
 from bevviz.recording.source_lookup import Origin, RecordingSource
 from bevviz.why.hints import with_changes
-from tests import bags
+from tests.support import bags
 
 Capture = pytest.CaptureFixture[str]
 PACKAGE = Path(bevviz.__file__).parent

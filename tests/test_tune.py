@@ -25,9 +25,9 @@ from bevviz.recording.sinks import open_recording
 from bevviz.stages import detector
 from bevviz.sweep.tune import ConfigSaves, FrameTuner, Version, VersionRecorder, create_config_file
 from bevviz.synthetic import SyntheticSource
-from tests import bags
-from tests.recordings import Recording, verify
-from tests.waiting import PATIENCE
+from tests.support import bags
+from tests.support.recordings import Recording, verify
+from tests.support.waiting import PATIENCE
 
 MODEL = "detector.model=demo"
 

@@ -18,7 +18,7 @@ from bevviz.datasets.kitti import read_labels
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
 from bevviz.messages.encode import encode_boxes_3d, typestore
 from bevviz.model.frame import Boxes3D
-from tests import bags, datasets, forms
+from tests.support import bags, datasets, documented_json
 
 GOOD = "Car 0.00 0 -1.57 120 40 180 80 1.5 1.6 4.0 0.0 1.5 10.0 -1.57"
 REGION = "DontCare -1 -1 -10 200 0 299 99 -1 -1 -1 -1000 -1000 -1000 -10"
@@ -112,7 +112,7 @@ def test_evaluate_says_how_many_labels_were_left_out(folder: Path, tmp_path: Pat
     assert f"4 labels are left out, the first: frame 0: {file}: line 1 (Car): its x is nan" in out
     assert f"2 box(es) of /ground_truth could not be used, the first: {file}: line 1 (Car)" in err
     tree = json.loads((tmp_path / "found.json").read_text())
-    forms.check(tree, "bevviz.evaluate/1")
+    documented_json.check(tree, "bevviz.evaluate/1")
     assert tree["unusable_labels"] == 4
     assert tree["unusable_examples"][1] == "frame 0: box 0 (Car): a side of it is 0 m long"
 

@@ -21,10 +21,10 @@ from bevviz.drivers.bitstream import Continuity, is_key
 from bevviz.model.frame import Frame, Image
 from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window
 from bevviz.sync import video
-from tests import bags, videos
-from tests.networks import FLOAT, answer
-from tests.recordings import Recording, verify
-from tests.videos import encode, number_of, numbered
+from tests.support import bags, videos
+from tests.support.onnx_networks import FLOAT, answer
+from tests.support.recordings import Recording, verify
+from tests.support.videos import encode, number_of, numbered
 
 FOXGLOVE, FFMPEG = "foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 IMAGE = "sensor_msgs/msg/CompressedImage"

@@ -25,8 +25,8 @@ from bevviz.why.answer_text import summary_line
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import projected_box
 from bevviz.why.verdict import Reason
-from tests import bags, forms
-from tests.recordings import Recording
+from tests.support import bags, documented_json
+from tests.support.recordings import Recording
 from tests.test_faults import at, drive, planted, run
 
 CLASSES = ("car", "person", "cyclist")
@@ -544,7 +544,7 @@ def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
     command = ["why", str(bag), "--at", "0", "--model", "demo", "--json", "--point", "10,-2.7,-1.6"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
-    forms.check(found, "bevviz.why/1")
+    documented_json.check(found, "bevviz.why/1")
     (answer,) = found["answers"]
     assert found["preset"] == "default" and answer["kind"] == "point"
     assert answer["reported"] and answer["reason"] == "reported"

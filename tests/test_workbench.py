@@ -41,9 +41,9 @@ from bevviz.workbench.findings import find_findings
 from bevviz.workbench.recording_buffer import RecordingBuffer
 from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.token import persistent_token
-from tests import waiting
+from tests.support import waiting
+from tests.support.waiting import PATIENCE
 from tests.test_files import small_disk
-from tests.waiting import PATIENCE
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -25,10 +25,10 @@ from bevviz.recording import entities
 from bevviz.why.pick import Pick
 from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
 from bevviz.workbench.live_session import KEPT, LiveSession
-from tests.graphs import own_graph, playing
-from tests.live_bench import live_bench
-from tests.ros_player import Play
-from tests.waiting import PATIENCE
+from tests.support.live_sessions import live_bench
+from tests.support.ros_graphs import own_graph, playing
+from tests.support.ros_player import Play
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 HELD = 4

@@ -1,8 +1,8 @@
-"""What nuscenes-devkit makes of the folder of ``tests/datasets.py``, for ``tests/test_datasets.py``.
+"""What nuscenes-devkit makes of the folder of ``tests/support/datasets.py``, for ``tests/test_datasets.py``.
 
 Needs an environment with nuscenes-devkit 1.2.0 (and its older NumPy), not that of bevviz::
 
-    python -c "from pathlib import Path; from tests import datasets; datasets.nuscenes(Path('made'))"
+    python -c "from pathlib import Path; from tests.support import datasets; datasets.nuscenes(Path('made'))"
     DEVKIT/bin/python tools/make_nuscenes_reference.py made tests/references/metrics/nuscenes_devkit.json
 """
 

@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.torture.worker import Outcome, Worker
-from tests import bags, datasets
+from tests.support import bags, datasets
 
 SLOW = 30.0  # seconds of processor time for one command, above which a case has failed
 MEMORY = 2000.0  # MB for one command, above which a case has failed

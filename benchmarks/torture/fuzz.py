@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from tqdm import tqdm
 
 from benchmarks.torture.worker import Outcome, Worker
-from tests import bags
+from tests.support import bags
 
 BATCH = 40  # messages in a bag
 TF, ODOMETRY = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"

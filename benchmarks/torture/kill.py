@@ -19,7 +19,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from bevviz.support.files import unfinished_files
-from tests import bags
+from tests.support import bags
 
 SCANS = 40
 SHORT = (10, 3, 6)  # scans of each of a batch's bags
@@ -268,7 +268,7 @@ def _files(folder: Path) -> set[str]:
 
 
 def _frames(path: Path, entity: str = "/bev") -> int:
-    from tests.recordings import Recording
+    from tests.support.recordings import Recording
 
     return len(Recording(path).rows[entity]) if path.exists() else 0
 

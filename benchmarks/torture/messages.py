@@ -33,7 +33,7 @@ from benchmarks.torture.worker import Outcome, Worker
 from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.messages import grid_map_msgs
 from bevviz.messages.decoders import register_definitions
-from tests import bags, videos
+from tests.support import bags, videos
 
 SCANS = 52  # of a drive
 BATCH = 50  # messages of a drive that are changed; the first ones stay sound

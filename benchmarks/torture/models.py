@@ -24,7 +24,7 @@ from onnx import TensorProto, helper, numpy_helper
 from tqdm import tqdm
 
 from benchmarks.torture.worker import Outcome, Worker
-from tests.networks import answer, image_input, node, save
+from tests.support.onnx_networks import answer, image_input, node, save
 
 SECONDS = 3.0  # that a network has to load, and to answer, in place of the 120 s of users
 MEMORY = 2**30  # bytes that a network may take, in place of the 8 GiB of users

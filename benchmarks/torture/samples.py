@@ -13,7 +13,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from tests import bags
+from tests.support import bags
 
 SCANS, POINTS = 40, 150  # 161 messages
 CHUNK_SIZE = 40_000  # bytes

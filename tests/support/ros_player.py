@@ -34,7 +34,7 @@ class Play:
     without: tuple[str, ...] = ()  # topics that are not published
 
     def arguments(self) -> list[str]:
-        return [sys.executable, "-m", "tests.ros_player", json.dumps(asdict(self))]
+        return [sys.executable, "-m", "tests.support.ros_player", json.dumps(asdict(self))]
 
 
 def main(play: Play) -> None:

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from rosbags.typesys import get_types_from_msg
 
 from bevviz.model.frame import U8
-from tests import bags
+from tests.support import bags
 
 VIDEO = "/camera/image_rect_color/foxglove"
 ENCODERS = {"h264": "libx264", "h265": "libx265", "av1": "libsvtav1", "vp9": "libvpx-vp9"}

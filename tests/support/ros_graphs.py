@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.ros_player import Play
+from tests.support.ros_player import Play
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOMAINS = range(1, 102)  # the ports of higher ones are taken by the system
 
 
