@@ -21,7 +21,7 @@ from bevviz.live.ouster_sensors import Ousters
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import BUILT_IN, declared_decoder, decoders, find_decoder
 from bevviz.messages.topics import Topic
-from tests import test_compressed_clouds, test_livox, test_ouster, test_packets
+from tests import test_compressed_clouds, test_lidar_packets, test_livox, test_ouster
 from tests.support import bags, videos
 
 ROOT = Path(__file__).parents[1]
@@ -71,8 +71,11 @@ def test_bags_and_live_decode_livox_alike(tmp_path: Path) -> None:
 
 
 def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
-    made, data = test_packets.messages(), test_packets.packet(test_packets.BY_NAME["PandarXT16"], 0)
-    item = bags.Item("/p", test_packets.SCAN, 1, test_packets.scan(made, bags.START, [data]))
+    made, data = (
+        test_lidar_packets.messages(),
+        test_lidar_packets.packet(test_lidar_packets.BY_NAME["PandarXT16"], 0),
+    )
+    item = bags.Item("/p", test_lidar_packets.SCAN, 1, test_lidar_packets.scan(made, bags.START, [data]))
     in_bag, live = both(tmp_path / "bag", item, made)
     assert in_bag.width > 100
     assert_same(in_bag, live)
@@ -80,10 +83,10 @@ def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
 
 def test_bags_and_live_decode_velodyne_packets_alike(tmp_path: Path) -> None:
     pytest.importorskip("velodyne_decoder")
-    made, kind = test_packets.messages(), test_packets.VELODYNE
+    made, kind = test_lidar_packets.messages(), test_lidar_packets.VELODYNE
     block = b"\xff\xee\0\0" + b"\xe8\x03\x10" * 32
     data = block * 12 + bytes(4) + b"\x37\x22"  # a VLP-16 in the mode of strongest returns
-    item = bags.Item("/v", kind, 1, test_packets.scan(made, bags.START, [data], kind))
+    item = bags.Item("/v", kind, 1, test_lidar_packets.scan(made, bags.START, [data], kind))
     # As clouds: the library leaves bytes between its fields as they are.
     in_bag, live = (decode_cloud(m, "/v", 0) for m in both(tmp_path / "bag", item, made))
     assert len(in_bag.xyz) > 100 and in_bag.stamp == live.stamp

@@ -11,7 +11,7 @@ import pytest
 
 from bevviz.support import cleanup
 from tests.support.waiting import PATIENCE
-from tests.test_cli import environment
+from tests.test_commands import environment
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

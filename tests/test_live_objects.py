@@ -24,7 +24,7 @@ from bevviz.synthetic import SyntheticSource
 from tests.support import bags
 from tests.support.ros_graphs import own_graph
 from tests.support.waiting import until
-from tests.test_objects import (
+from tests.test_object_messages import (
     AUTOWARE,
     BOX,
     PRIVATE,

@@ -38,7 +38,7 @@ from bevviz.report.plots import ticks
 from bevviz.stages.detector import Detector
 from tests.support import bags
 from tests.support.recordings import Recording, verify
-from tests.test_cli import Capture, error_of
+from tests.test_commands import Capture, error_of
 
 NOTE = 'lost <script>alert("x")</script> & found\nsecond line'
 WHOLE = "the recording is, byte for byte, the file that the page beside it tells of"

@@ -28,7 +28,7 @@ from bevviz.report.summary import STRIP_WIDTH
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags, videos
 from tests.support.recordings import Recording, verify
-from tests.test_cli import Capture, error_of
+from tests.test_commands import Capture, error_of
 
 PNG, RAW, JPEG = "/camera/image_rect_color/compressed", "/annotated", "/other/compressed"
 PERSON = np.array([712, 143, 811, 308])  # the pedestrian of KITTI 000000

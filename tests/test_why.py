@@ -27,7 +27,7 @@ from bevviz.why.subject import projected_box
 from bevviz.why.verdict import Reason
 from tests.support import bags, documented_json
 from tests.support.recordings import Recording
-from tests.test_faults import at, drive, planted, run
+from tests.test_planted_faults import at, drive, planted, run
 
 CLASSES = ("car", "person", "cyclist")
 Capture = pytest.CaptureFixture[str]

@@ -43,7 +43,7 @@ from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.token import persistent_token
 from tests.support import waiting
 from tests.support.waiting import PATIENCE
-from tests.test_files import small_disk
+from tests.test_output_files import small_disk
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -106,7 +106,7 @@ class Tally:
 @cache
 def _messages() -> bags.Messages:
     """Return a message factory that knows all types."""
-    from tests import test_objects
+    from tests import test_object_messages
 
     made = bags.Messages()
     grid_map_msgs.register(made.store)
@@ -114,9 +114,9 @@ def _messages() -> bags.Messages:
     for name, text in videos.DEFINITIONS.items():
         made.store.register(get_types_from_msg(text, name))
     for package, texts in (
-        ("autoware_perception_msgs", test_objects.AUTOWARE),
-        ("radar_msgs", test_objects.RADAR),
-        ("my_msgs", test_objects.PRIVATE),
+        ("autoware_perception_msgs", test_object_messages.AUTOWARE),
+        ("radar_msgs", test_object_messages.RADAR),
+        ("my_msgs", test_object_messages.PRIVATE),
     ):
         types: dict[str, Any] = {}
         for name, text in texts.items():
@@ -157,7 +157,7 @@ def _livox() -> list[Row]:
 
 
 def _pandar(model: str) -> list[Row]:
-    from tests.test_packets import BY_NAME, SCAN, packet, scan
+    from tests.test_lidar_packets import BY_NAME, SCAN, packet, scan
 
     packets = [packet(BY_NAME[model], number) for number in range(3)]
     return _drive(
@@ -166,7 +166,7 @@ def _pandar(model: str) -> list[Row]:
 
 
 def _velodyne() -> list[Row]:
-    from tests.test_packets import VELODYNE, scan
+    from tests.test_lidar_packets import VELODYNE, scan
 
     blocks = b""
     for block in range(12):
@@ -222,7 +222,7 @@ def _video(kind: str, codec: str = "h264") -> list[Row]:
 
 
 def _objects(kind: str) -> list[Row]:
-    from tests.test_objects import autoware
+    from tests.test_object_messages import autoware
 
     package = "autoware_perception_msgs"
     outline = [(-2, -1), (2, -1), (2, 1)] if kind == "Detected" else ()
@@ -233,13 +233,13 @@ def _objects(kind: str) -> list[Row]:
 
 
 def _radar() -> list[Row]:
-    from tests.test_objects import radar
+    from tests.test_object_messages import radar
 
     return _drive("radar_msgs/msg/RadarTracks", lambda stamp: _stamped(radar(_messages()), stamp))
 
 
 def _private() -> list[Row]:
-    from tests.test_objects import private
+    from tests.test_object_messages import private
 
     return _drive("my_msgs/msg/Things", lambda stamp: _stamped(private(_messages()), stamp))
 
@@ -249,7 +249,7 @@ def _stamped(message: Any, stamp: int) -> Any:
 
 
 def _markers() -> list[Row]:
-    from tests.test_objects import pose
+    from tests.test_object_messages import pose
 
     made = _messages()
 

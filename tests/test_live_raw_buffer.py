@@ -42,7 +42,7 @@ from tests.support.recordings import Recording, verify
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
 from tests.support.waiting import PATIENCE, until
-from tests.test_cli import environment
+from tests.test_commands import environment
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

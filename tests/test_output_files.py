@@ -29,7 +29,7 @@ from bevviz.workbench.recording_buffer import RecordingBuffer
 from tests.support import bags
 from tests.support.recordings import Recording, verify
 from tests.support.waiting import PATIENCE
-from tests.test_cli import Capture, environment, error_of
+from tests.test_commands import Capture, environment, error_of
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
