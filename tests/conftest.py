@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Failed assertions in helpers show their values, too.
+pytest.register_assert_rewrite("tests.support")
+
 # The same examples in every CI run, so that a red one is about the change; new ones on a developer's machine.
 settings.register_profile("ci", derandomize=True, deadline=None)
 settings.register_profile("developer", deadline=None)

@@ -24,7 +24,7 @@ from bevviz.model.results import (
 )
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
-from tests.test_tracking import CAR, PERSON, scene
+from tests.support.tracking_scenes import CAR, PERSON, scene
 
 CONFIG = load()
 TRACKING = CONFIG.tracking

@@ -23,8 +23,8 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why.verdict import HOPELESS, Reason
 from tests.support import bags
-from tests.test_planted_faults import at, drive, planted
-from tests.test_planted_faults import run as run_fault
+from tests.support.planted_faults import at, drive, planted
+from tests.support.planted_faults import run as run_fault
 
 
 def test_a_repeated_bag_goes_on_in_time(tmp_path: Path) -> None:

@@ -24,21 +24,11 @@ from bevviz.model.results import FrameResult
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.support.files import unfinished_files
 from tests.support import bags
+from tests.support.commands import Capture, environment, error_of
 from tests.support.recordings import Recording
 from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
-
-Capture = pytest.CaptureFixture[str]
-
-
-def error_of(capsys: Capture, *arguments: str | Path) -> str:
-    """Return the one line that a wrong call prints."""
-    assert main([str(a) for a in arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("bevviz: error: ")
-    assert said.count("\n") == 1
-    return said
 
 
 def small_bag(change: Callable[[list[bags.Item], bags.Messages], None] | None = None, scans: int = 5) -> Path:
@@ -377,12 +367,6 @@ def test_an_interrupt_that_gets_lost_in_a_library(
     assert main(["bag", "drive", "--save", "out.rrd"]) == 130
     assert "interrupted after 4 frames" in capsys.readouterr().err
     assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 4
-
-
-def environment() -> dict[str, str]:
-    """Of a process that finds this checkout and no display."""
-    kept = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    return {**kept, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
 
 
 # --- what nobody foresaw -----------------------------------------------------------------------

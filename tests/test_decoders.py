@@ -21,8 +21,7 @@ from bevviz.live.ouster_sensors import Ousters
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import BUILT_IN, declared_decoder, decoders, find_decoder
 from bevviz.messages.topics import Topic
-from tests import test_compressed_clouds, test_lidar_packets, test_livox, test_ouster
-from tests.support import bags, videos
+from tests.support import bags, compressed_clouds, lidar_packets, livox_messages, ouster_packets, videos
 
 ROOT = Path(__file__).parents[1]
 MINE = """
@@ -63,8 +62,8 @@ def both(path: Path, item: bags.Item, made: bags.Messages) -> tuple[Any, Any]:
 
 def test_bags_and_live_decode_livox_alike(tmp_path: Path) -> None:
     package = "livox_ros_driver2"
-    made = test_livox.messages(False, package)
-    content = test_livox.scan(made, package, bags.START)
+    made = livox_messages.messages(False, package)
+    content = livox_messages.scan(made, package, bags.START)
     in_bag, live = both(tmp_path / "bag", bags.Item("/l", f"{package}/msg/CustomMsg", 1, content), made)
     assert in_bag.width == 50
     assert_same(in_bag, live)
@@ -72,10 +71,10 @@ def test_bags_and_live_decode_livox_alike(tmp_path: Path) -> None:
 
 def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
     made, data = (
-        test_lidar_packets.messages(),
-        test_lidar_packets.packet(test_lidar_packets.BY_NAME["PandarXT16"], 0),
+        lidar_packets.messages(),
+        lidar_packets.packet(lidar_packets.BY_NAME["PandarXT16"], 0),
     )
-    item = bags.Item("/p", test_lidar_packets.SCAN, 1, test_lidar_packets.scan(made, bags.START, [data]))
+    item = bags.Item("/p", lidar_packets.SCAN, 1, lidar_packets.scan(made, bags.START, [data]))
     in_bag, live = both(tmp_path / "bag", item, made)
     assert in_bag.width > 100
     assert_same(in_bag, live)
@@ -83,10 +82,10 @@ def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
 
 def test_bags_and_live_decode_velodyne_packets_alike(tmp_path: Path) -> None:
     pytest.importorskip("velodyne_decoder")
-    made, kind = test_lidar_packets.messages(), test_lidar_packets.VELODYNE
+    made, kind = lidar_packets.messages(), lidar_packets.VELODYNE
     block = b"\xff\xee\0\0" + b"\xe8\x03\x10" * 32
     data = block * 12 + bytes(4) + b"\x37\x22"  # a VLP-16 in the mode of strongest returns
-    item = bags.Item("/v", kind, 1, test_lidar_packets.scan(made, bags.START, [data], kind))
+    item = bags.Item("/v", kind, 1, lidar_packets.scan(made, bags.START, [data], kind))
     # As clouds: the library leaves bytes between its fields as they are.
     in_bag, live = (decode_cloud(m, "/v", 0) for m in both(tmp_path / "bag", item, made))
     assert len(in_bag.xyz) > 100 and in_bag.stamp == live.stamp
@@ -97,28 +96,28 @@ def test_bags_and_live_decode_velodyne_packets_alike(tmp_path: Path) -> None:
 
 
 def test_bags_and_live_decode_ouster_scans_alike(tmp_path: Path) -> None:
-    text, kind = test_ouster.metadata("RNG15_RFL8_NIR8"), test_ouster.KIND
-    path = test_ouster.bag(tmp_path / "bag", told=text, scans=1)
+    text, kind = ouster_packets.metadata("RNG15_RFL8_NIR8"), ouster_packets.KIND
+    path = ouster_packets.bag(tmp_path / "bag", told=text, scans=1)
     ousters, live = Ousters(), list[Any]()
-    ousters.look([Topic(test_ouster.LIDAR, kind)], {})
-    ousters.add_metadata(test_ouster.TOLD, text)
-    sensor = ousters.sensor(test_ouster.LIDAR)
+    ousters.look([Topic(ouster_packets.LIDAR, kind)], {})
+    ousters.add_metadata(ouster_packets.TOLD, text)
+    sensor = ousters.sensor(ouster_packets.LIDAR)
     with Recording([path]) as recording:
-        for message in recording.messages([test_ouster.LIDAR]):
+        for message in recording.messages([ouster_packets.LIDAR]):
             for packets in ousters.add_packet(message.topic, message.received, bytes(message.content())):
                 scan = LiveMessage(message.topic, kind, message.received, b"", sensor, packets)
                 live.append(scan.decode())
-        in_bag = [recording.decode(scan) for scan in recording.scans([test_ouster.LIDAR])]
+        in_bag = [recording.decode(scan) for scan in recording.scans([ouster_packets.LIDAR])]
     assert len(in_bag) == 1 and in_bag[0].width > 100
     assert_same(in_bag, live)
 
 
 @pytest.mark.parametrize("form", ["zstd", "zlib"])
 def test_bags_and_live_decode_compressed_clouds_alike(tmp_path: Path, form: str) -> None:
-    made = test_compressed_clouds.messages()
-    cloud = made.cloud(bags.START, test_compressed_clouds.points(0))
-    data = test_compressed_clouds.packed(form, bytes(cloud.data))
-    content = test_compressed_clouds.compressed(made, cloud, form, data)
+    made = compressed_clouds.messages()
+    cloud = made.cloud(bags.START, compressed_clouds.points(0))
+    data = compressed_clouds.packed(form, bytes(cloud.data))
+    content = compressed_clouds.compressed(made, cloud, form, data)
     in_bag, live = both(tmp_path / "bag", bags.Item("/c", COMPRESSED, 1, content), made)
     assert in_bag.width == 500
     assert_same(in_bag, live)

@@ -19,57 +19,26 @@ from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector import COCO, Detector, nms
 from bevviz.stages.detector.names import COCO_CATEGORIES
 from tests.support import onnx_networks
-from tests.support.onnx_networks import FLOAT, FLOAT16, INT64, UINT8, Input, image_input, node
+from tests.support.onnx_networks import (
+    CELLS,
+    FLOAT,
+    FLOAT16,
+    INT64,
+    UINT8,
+    H,
+    W,
+    constant,
+    head,
+    image_input,
+    node,
+)
 
-H, W = 64, 96  # of the small networks' input
-STRIDES = (8, 16, 32)
-CELLS = sum((H // s) * (W // s) for s in STRIDES)
 KEPT, BELOW, SUPPRESSED = DetectionState.KEPT, DetectionState.BELOW_THRESHOLD, DetectionState.SUPPRESSED
 NAMES = {"names": "{0: 'car', 1: 'person', 2: 'cyclist'}"}
 ULTRALYTICS = {**NAMES, "author": "Ultralytics", "task": "detect", "head": "Detect"}
 IMAGE = np.zeros((H, W, 3), np.uint8)  # of the input's size: boxes come back as they are, less half a pixel
 
 LAYOUTS = ("YOLOv8", "YOLOv5", "YOLOv6", "YOLOX", "YOLOX decoded", "end-to-end")
-
-
-def constant(
-    path: Path,
-    *outputs: NDArray[Any],
-    inputs: tuple[Input, ...] = (image_input(1, 3, H, W),),
-    metadata: dict[str, str] | None = None,
-) -> str:
-    """Save a network that gives these outputs for every image."""
-    return onnx_networks.answer(path, {f"output{i}": o for i, o in enumerate(outputs)}, inputs, metadata)
-
-
-def head(
-    layout: str, boxes: NDArray[Any], score: NDArray[Any], classes: NDArray[Any], count: int = 3
-) -> NDArray[Any]:
-    """Encode boxes x0, y0, x1, y1 of the network input as the output of a network of this layout."""
-    center, size = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
-    by_class = np.zeros((len(boxes), count))
-    if layout == "end-to-end":
-        rows = np.zeros((20, 6))
-        rows[: len(boxes)] = np.column_stack([boxes, score, classes])
-    elif layout == "YOLOv8":
-        by_class[np.arange(len(boxes)), classes] = score
-        rows = np.zeros((CELLS, 4 + count))
-        rows[:] = [W / 2, H / 2, W, H, *[0] * count]
-        rows[: len(boxes)] = np.hstack([center, size, by_class])
-        return np.asarray(rows.T[None], np.float32)
-    else:
-        by_class[np.arange(len(boxes)), classes] = score if layout == "YOLOv6" else 0.9
-        objectness = (score * 0 + 1 if layout == "YOLOv6" else score / 0.9)[:, None]
-        rows = np.zeros((CELLS * (3 if layout == "YOLOv5" else 1), 5 + count))
-        place = np.arange(len(boxes))
-        if layout == "YOLOX":  # the last cells: stride 32, row and column by hand
-            place = CELLS - 1 - place
-            grid = np.array([(2, 1), (1, 1), (0, 1), (2, 0)])[: len(boxes)]
-            center, size = center / 32 - grid, np.log(size / 32)
-        else:
-            rows[:] = [W / 2, H / 2, W, H, layout == "YOLOv6", *[0] * count]
-        rows[place] = np.hstack([center, size, objectness, by_class])
-    return np.asarray(rows[None], np.float32)
 
 
 def to_input(layout: str, boxes: NDArray[Any], width: int, height: int) -> NDArray[Any]:

@@ -21,7 +21,15 @@ from bevviz.model.results import (
     Splits,
 )
 from bevviz.stages.fusion import fuse
-from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, PERSON, clusters_of, detections_of, silhouette, slab
+from tests.support.fusion_scenes import (
+    CAMERA,
+    CAMERA_FROM_LIDAR,
+    PERSON,
+    clusters_of,
+    detections_of,
+    silhouette,
+    slab,
+)
 
 DEFAULT = load(None, ["detector.model=model.onnx"])
 

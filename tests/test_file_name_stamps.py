@@ -14,7 +14,7 @@ import bevviz
 from bevviz import UserError
 from bevviz.datasets.folder import Folder
 from bevviz.datasets.stamps import file_times, group_by_sensor
-from tests.test_plain_folders import cloud
+from tests.support.datasets import cloud
 
 START = 1_700_000_000_950_000_000
 STAMPS = [START + 100_000_000 * i + 100 * (i * 7919 % 30_000) for i in range(40)]  # 10 Hz, some jitter

@@ -12,12 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import kitti
-from bevviz.config import CLASS_SIZES, ClusteringConfig, FusionConfig, ObjectsConfig, load
+from bevviz.config import CLASS_SIZES, ClusteringConfig, FusionConfig, load
 from bevviz.errors import UserError
-from bevviz.model.frame import F32, F64, Camera
+from bevviz.model.frame import F32
 from bevviz.model.geometry import apply, project
 from bevviz.model.results import (
-    CameraResult,
     Claims,
     Clusters,
     ClusterState,
@@ -27,30 +26,17 @@ from bevviz.model.results import (
 )
 from bevviz.stages.box_fit import MAX_SPREAD, NO_EDGE, fit
 from bevviz.stages.clustering import cluster
-from bevviz.stages.frustum import claim_clusters
 from bevviz.stages.fusion import fuse, merge
-from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
-
-CLUSTERING = ClusteringConfig()
-Claimed = tuple[Clusters, tuple[Claims | None, ...], Splits]
-
-
-def looked(
-    points: F32, detections: Detections, turn: F64 = CAMERA_FROM_LIDAR, name: str = "front"
-) -> CameraResult:
-    """Project the points into a camera."""
-    uv, depth = project(apply(turn, points), CAMERA)
-    outside = ~((uv >= -0.5) & (uv < [CAMERA.width - 0.5, CAMERA.height - 0.5])).all(axis=1)
-    uv[outside] = np.nan
-    return CameraResult(Camera(name, None, CAMERA, turn, None), detections, None, uv, depth)
-
-
-def claimed(
-    points: F32, clusters: Clusters, *cameras: CameraResult, config: FusionConfig | None = None
-) -> Claimed:
-    return claim_clusters(
-        points, None, clusters, cameras, config or FusionConfig(), ObjectsConfig(), CLUSTERING
-    )
+from tests.support.fusion_scenes import (
+    CAMERA,
+    CAMERA_FROM_LIDAR,
+    CLUSTERING,
+    claimed,
+    detections_of,
+    looked,
+    silhouette,
+    slab,
+)
 
 
 def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Splits]:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.config import ClusteringConfig, Config, FusionConfig, load
-from bevviz.model.frame import F32, F64, Boxes3D, Camera, Intrinsics
+from bevviz.model.frame import F32, F64, Camera, Intrinsics
 from bevviz.model.geometry import apply, inverse, iou, project
 from bevviz.model.results import (
     CameraResult,
@@ -29,52 +29,17 @@ from bevviz.stages.detector import Detector
 from bevviz.stages.fusion import assign, fuse, merge
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import voxel_grid
+from tests.support.fusion_scenes import (
+    CAMERA,
+    CAMERA_FROM_LIDAR,
+    PERSON,
+    clusters_of,
+    detections_of,
+    silhouette,
+    slab,
+)
 
-K = np.array([[300.0, 0, 320], [0, 300, 180], [0, 0, 1]])
-CAMERA = Intrinsics(640, 360, K)
-CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 DEFAULT, REFERENCE = FusionConfig(), FusionConfig(method="centroid")
-
-
-def slab(x: float, y: float, z: float, width: float, height: float, step: float = 0.1) -> F32:
-    """Points of an upright surface that faces the sensor, x ahead, with its centre at y, z."""
-    ys = np.arange(-width / 2, width / 2 + 1e-6, step) + y
-    zs = np.arange(-height / 2, height / 2 + 1e-6, step) + z
-    grid = np.stack(np.meshgrid([x], ys, zs, indexing="ij"), -1).reshape(-1, 3)
-    return np.asarray(grid, np.float32)
-
-
-def clusters_of(parts: list[F32], noise: F32 | None = None) -> tuple[F32, Clusters]:
-    points = np.concatenate([*parts, np.zeros((0, 3), np.float32) if noise is None else noise])
-    labels = np.full(len(points), -1, np.int32)
-    count = np.array([len(p) for p in parts], np.int32)
-    labels[: count.sum()] = np.repeat(np.arange(len(parts)), count)
-    low = np.array([p.min(axis=0) for p in parts], np.float32).reshape(-1, 3)
-    high = np.array([p.max(axis=0) for p in parts], np.float32).reshape(-1, 3)
-    boxes = Boxes3D(np.asarray((low + high) / 2, np.float32), high - low, np.zeros(len(parts), np.float32))
-    centroid = np.array([p.mean(axis=0) for p in parts], np.float32).reshape(-1, 3)
-    return points, Clusters(labels, np.zeros(len(parts), np.int32), count, centroid, boxes, boxes)
-
-
-def detections_of(boxes: list[F32], scores: list[float] | None = None, names: str = "person") -> Detections:
-    count = len(boxes)
-    return Detections(
-        xyxy=np.array(boxes, np.float32).reshape(-1, 4),
-        score=np.array(scores or [0.9 - 0.01 * i for i in range(count)], np.float32),
-        class_id=np.zeros(count, np.int32),
-        names=tuple(names.split() * count)[:count],
-        state=np.zeros(count, np.int32),
-        suppressed_by=np.full(count, -1, np.int32),
-        overlap=np.zeros(count, np.float32),
-    )
-
-
-def silhouette(points: F32, across: float = 2.0, along: float = 2.0) -> F32:
-    """Return the box that a perfect detector would give, with a margin."""
-    margin = np.array([across, along])
-    uv, _ = project(apply(CAMERA_FROM_LIDAR, points), CAMERA)
-    box = np.concatenate([uv.min(axis=0) - margin, uv.max(axis=0) + margin])
-    return np.asarray(np.clip(box, -0.5, [639.5, 359.5, 639.5, 359.5]), np.float32)
 
 
 def run(points: F32, clusters: Clusters, detections: Detections, config: FusionConfig = DEFAULT) -> Fusion:
@@ -108,9 +73,6 @@ def check(fusion: Fusion, clusters: Clusters, detections: Detections, config: Fu
         assert d < 0 or (d, k) in pairs
     assert fusion.detection_decision.dtype == fusion.cluster_detection.dtype == np.int32
     assert fusion.pairs.cost.dtype == fusion.pairs.depth.dtype == fusion.cluster_uv.dtype == np.float32
-
-
-PERSON = slab(8, 0, -0.5, 0.6, 1.8)
 
 
 def test_a_pedestrian_before_a_wall_is_the_pedestrian() -> None:

@@ -20,7 +20,7 @@ from bevviz.datasets.dataset import read_points, read_table
 from bevviz.datasets.folder import read_cloud
 from bevviz.support.files import CONFIG_LIMIT, SENSOR_LIMIT, TABLE_LIMIT, drive_files
 from tests.support import bags, datasets
-from tests.test_commands import Capture, error_of
+from tests.support.commands import Capture, error_of
 
 NESTED = "[" * 3000
 

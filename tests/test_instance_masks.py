@@ -23,9 +23,17 @@ from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
 from bevviz.stages.mask_lookup import is_covered
 from bevviz.synthetic import SyntheticSource
+from tests.support.fusion_scenes import (
+    CAMERA,
+    CAMERA_FROM_LIDAR,
+    CLUSTERING,
+    claimed,
+    detections_of,
+    looked,
+    silhouette,
+    slab,
+)
 from tests.support.recordings import Recording
-from tests.test_frustum import CLUSTERING, claimed, looked
-from tests.test_fusion import CAMERA, CAMERA_FROM_LIDAR, detections_of, silhouette, slab
 
 PERSON = slab(8, 0, -0.7, 0.5, 1.7)
 BUSH = slab(8, 0.6, -0.7, 0.5, 1.7)  # in the person's box, and touching it

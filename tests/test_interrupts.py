@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from bevviz.support import cleanup
+from tests.support.commands import environment
 from tests.support.waiting import PATIENCE
-from tests.test_commands import environment
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

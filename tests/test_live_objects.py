@@ -22,9 +22,7 @@ from bevviz.messages.definitions import store_of
 from bevviz.messages.encode import encode_cloud, typestore
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags
-from tests.support.ros_graphs import own_graph
-from tests.support.waiting import until
-from tests.test_object_messages import (
+from tests.support.object_messages import (
     AUTOWARE,
     BOX,
     PRIVATE,
@@ -37,6 +35,8 @@ from tests.test_object_messages import (
     radar,
     vector,
 )
+from tests.support.ros_graphs import own_graph
+from tests.support.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

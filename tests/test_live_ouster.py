@@ -10,10 +10,21 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
+from tests.support.ouster_packets import (
+    COLUMNS,
+    IMU,
+    KIND,
+    LIDAR,
+    PACKETS,
+    PIXELS,
+    TOLD,
+    metadata,
+    millimetres,
+    packet,
+)
+from tests.support.ouster_packets import where as place
 from tests.support.ros_graphs import own_graph
 from tests.support.waiting import until
-from tests.test_ouster import COLUMNS, IMU, KIND, LIDAR, PACKETS, PIXELS, TOLD, metadata, millimetres, packet
-from tests.test_ouster import where as place
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

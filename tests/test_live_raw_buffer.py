@@ -38,11 +38,11 @@ from bevviz.support.files import unfinished_files, write_all
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
+from tests.support.commands import environment
 from tests.support.recordings import Recording, verify
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
 from tests.support.waiting import PATIENCE, until
-from tests.test_commands import environment
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 

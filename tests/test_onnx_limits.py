@@ -21,7 +21,7 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import Detector, session
 from tests.support import onnx_networks
 from tests.support.onnx_networks import FLOAT, INT64, Input, image_input, node
-from tests.test_pillars import autoware, stated
+from tests.support.pillar_networks import autoware, stated
 
 H, W = 64, 96
 CELLS = sum((H // s) * (W // s) for s in (8, 16, 32))

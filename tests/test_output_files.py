@@ -6,13 +6,10 @@ import errno
 import os
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +24,10 @@ from bevviz.errors import UserError
 from bevviz.support.files import ScratchFolder, atomic_write, claim_target, save_text, unfinished_files
 from bevviz.workbench.recording_buffer import RecordingBuffer
 from tests.support import bags
+from tests.support.commands import Capture, environment, error_of
 from tests.support.recordings import Recording, verify
+from tests.support.small_disk import small_disk
 from tests.support.waiting import PATIENCE
-from tests.test_commands import Capture, environment, error_of
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -225,19 +223,6 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     assert Path("out.rrd").read_text() == "an older result"
     frames = len(Recording(left).rows["/bev"])
     assert 0 < frames < 1000
-
-
-@contextmanager
-def small_disk(folder: Path, size: str) -> Iterator[Path]:
-    """Mount a disk in memory. Only root may."""
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("needs the right to mount")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def test_a_full_temporary_disk_names_its_folder(

@@ -19,19 +19,7 @@ from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
 from bevviz.model.geometry import has_distortion
 from bevviz.support.open3d import load
-
-
-def cloud(columns: int, points: int = 3000, seed: int = 0) -> np.ndarray:
-    """x, y, z, intensity, ring, time, and the distance, of points in no order."""
-    rng = np.random.default_rng(seed)
-    xyz = rng.normal([5, 0, -1], [20, 15, 0.7], (points, 3))
-    rest = [
-        rng.integers(0, 256, points),
-        rng.integers(0, 32, points),
-        rng.random(points) * 0.1,
-        np.linalg.norm(xyz, axis=1),
-    ]
-    return np.column_stack([xyz, *rest])[:, :columns].astype("<f4")
+from tests.support.datasets import cloud
 
 
 @given(st.integers(3, 7), st.integers(0, 1000), st.integers(500, 5000))

@@ -37,8 +37,8 @@ from bevviz.report.page import spans
 from bevviz.report.plots import ticks
 from bevviz.stages.detector import Detector
 from tests.support import bags
+from tests.support.commands import Capture, error_of
 from tests.support.recordings import Recording, verify
-from tests.test_commands import Capture, error_of
 
 NOTE = 'lost <script>alert("x")</script> & found\nsecond line'
 WHOLE = "the recording is, byte for byte, the file that the page beside it tells of"

@@ -20,8 +20,8 @@ from bevviz.cli import main
 from bevviz.config import Config, config_yaml
 from bevviz.recording import entities, rerun_cli
 from tests.support import bags
+from tests.support.commands import Capture, error_of
 from tests.support.recordings import Recording
-from tests.test_commands import Capture, error_of
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,8 @@ from bevviz.report.redact import CELLS, Redactor, _encoded, grow_boxes, hide_box
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags, videos
+from tests.support.commands import Capture, error_of
 from tests.support.recordings import Recording, verify
-from tests.test_commands import Capture, error_of
 
 PNG, RAW, JPEG = "/camera/image_rect_color/compressed", "/annotated", "/other/compressed"
 PERSON = np.array([712, 143, 811, 308])  # the pedestrian of KITTI 000000
@@ -194,8 +194,8 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
 ) -> None:
     """126 people on top of each other, each a little weaker: all but a few are suppressed."""
     pytest.importorskip("onnx", reason="the test networks are built with onnx")
-    from tests.test_detector import CELLS as PEOPLE
-    from tests.test_detector import H, W, constant, head
+    from tests.support.onnx_networks import CELLS as PEOPLE
+    from tests.support.onnx_networks import H, W, constant, head
 
     rng = np.random.default_rng(0)
     corner = rng.uniform(0, 8, (PEOPLE, 2))
@@ -218,7 +218,7 @@ def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
 def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
     """A stronger box that nobody sees would suppress one that somebody does."""
     pytest.importorskip("onnx", reason="the test networks are built with onnx")
-    from tests.test_detector import H, W, constant, head
+    from tests.support.onnx_networks import H, W, constant, head
 
     boxes = np.array([[-50.0, 0, -1, 40], [-45, 0, 6, 40]])
     output = head("YOLOv8", boxes, np.array([0.9, 0.8]), np.array([0, 0]))

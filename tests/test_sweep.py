@@ -25,8 +25,8 @@ from bevviz.sweep import Parameter, Sweep, combine, parse
 from bevviz.sweep.chart import HEIGHT, WIDTH, axis_scale
 from bevviz.synthetic import SyntheticSource, write_bag
 from tests.support import bags
+from tests.support.kitti_labels import labels
 from tests.support.recordings import Recording, verify
-from tests.test_kitti import labels
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 

@@ -26,8 +26,8 @@ from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import projected_box
 from bevviz.why.verdict import Reason
 from tests.support import bags, documented_json
+from tests.support.planted_faults import at, drive, planted, run
 from tests.support.recordings import Recording
-from tests.test_planted_faults import at, drive, planted, run
 
 CLASSES = ("car", "person", "cyclist")
 Capture = pytest.CaptureFixture[str]

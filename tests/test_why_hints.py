@@ -13,7 +13,7 @@ from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.hints import SURE, Hint, HintSearch
 from bevviz.why.verdict import Reason
-from tests.test_planted_faults import at, run
+from tests.support.planted_faults import at, run
 
 CLASSES = ("car", "person", "cyclist")
 

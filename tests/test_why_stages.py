@@ -18,7 +18,7 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.verdict import Reason
-from tests.test_planted_faults import at
+from tests.support.planted_faults import at
 
 CLASSES = ("car", "person", "cyclist")
 MODULE = '''

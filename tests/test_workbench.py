@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
-import signal
-import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from html import unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,55 +35,25 @@ from bevviz.workbench.findings import find_findings
 from bevviz.workbench.recording_buffer import RecordingBuffer
 from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.token import persistent_token
-from tests.support import waiting
+from tests.support.small_disk import small_disk
 from tests.support.waiting import PATIENCE
-from tests.test_output_files import small_disk
+from tests.support.workbench_pages import FRAMES, POLL, chromium, demo_bag, serving, state, until, verdict
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-FRAMES = 6
-POLL = 0.5  # seconds: a page that draws without a graphics card has little time to be asked
 CLICK = 20.0  # seconds that it has to say what was clicked, before it is clicked again
-SOFTWARE_GL = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-]
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("workbench") / "demo.mcap"
-    assert main(["demo", "--frames", str(FRAMES), "--bag", str(path)]) == 0
-    return path
+    return demo_bag(tmp_path_factory.mktemp("workbench"))
 
 
 @pytest.fixture(scope="module")
 def result() -> Iterator[FrameResult]:
     with bevviz.simulate(frames=3, set={"clustering.min_cluster_points": 30}) as drive:  # some are set aside
         yield drive.at(frame=1)
-
-
-@contextmanager
-def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``bevviz open`` as a user starts it, in a folder that is not the bag's: its address and its process."""
-    command = [sys.executable, "-m", "bevviz.cli", *arguments, "--model", model, "--no-browser"]
-    beside = next(Path(argument).parent for argument in arguments if argument.endswith(("mcap", "bag")))
-    (folder := beside / "elsewhere").mkdir(exist_ok=True)
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as server:
-        try:
-            assert server.stderr is not None
-            for line in server.stderr:
-                if found := re.search(r"workbench at (\S+)", line):
-                    yield found[1], server
-                    break
-            else:
-                pytest.fail("the server has said no address")
-        finally:
-            server.send_signal(signal.SIGINT)
-            server.communicate(timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -100,17 +64,8 @@ def address(bag: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    executable = (
-        os.environ.get("BEVVIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-    )
-    if executable is None:
-        pytest.skip("needs a browser: apt-get install chromium (or BEVVIZ_CHROMIUM=its path)")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=executable, args=SOFTWARE_GL)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @contextmanager
@@ -159,25 +114,10 @@ def events(page: Page, kind: str) -> list[dict[str, Any]]:
     return [event for event in found if event["type"] == kind]
 
 
-until = partial(waiting.until, every=POLL)
-
-
-def verdict(page: Page) -> str:
-    """Return the sentence of the newest answer; empty while the answer is pending."""
-    answer = page.locator("#answer")
-    busy = "busy" in (answer.get_attribute("class") or "")
-    return "" if busy else page.inner_text("#verdict")
-
-
 def new_verdict(page: Page, before: str) -> str:
     """Wait for the next verdict and return it."""
     until(lambda: verdict(page) not in ("", before))
     return verdict(page)
-
-
-def state(page: Page) -> dict[str, list[str]]:
-    """Return the state that the page's address holds."""
-    return parse_qs(urlsplit(page.url).fragment)
 
 
 # --- the whole way, in a browser ----------------------------------------------------------------

@@ -16,7 +16,7 @@ from rerun.experimental import ViewerClient
 from bevviz.cli import main
 from bevviz.recording import entities, rerun_cli
 from bevviz.recording.ports import LOOPBACK, free_port, is_listening
-from tests.test_workbench import FRAMES, bag, browser, serving, state, until, verdict  # noqa: F401
+from tests.support.workbench_pages import FRAMES, chromium, demo_bag, serving, state, until, verdict
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -24,6 +24,17 @@ if TYPE_CHECKING:
 START = 1_750_000_000_000_000_000  # stamp of the synthetic drive's first scan
 LAST = 300_000_000  # of a later one
 NO_VULKAN = "needs Vulkan, if only in software: apt-get install mesa-vulkan-drivers"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return demo_bag(tmp_path_factory.mktemp("workbench"))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture
@@ -60,8 +71,8 @@ def shown(client: ViewerClient) -> tuple[str | None, int | None]:
 
 
 def test_panel_and_viewer_are_at_the_same_time(
-    bag: Path,  # noqa: F811
-    browser: Browser,  # noqa: F811
+    bag: Path,
+    browser: Browser,
     native: tuple[str, subprocess.Popen[bytes]],
 ) -> None:
     """A row of the list moves the viewer and is marked in it; the viewer's own slider moves the panel."""
@@ -103,7 +114,7 @@ def test_panel_and_viewer_are_at_the_same_time(
     ],
 )
 def test_what_cannot_be_is_said(
-    bag: Path,  # noqa: F811
+    bag: Path,
     given: list[str],
     said: str,
     monkeypatch: pytest.MonkeyPatch,

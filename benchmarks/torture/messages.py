@@ -106,7 +106,7 @@ class Tally:
 @cache
 def _messages() -> bags.Messages:
     """Return a message factory that knows all types."""
-    from tests import test_object_messages
+    from tests.support import object_messages
 
     made = bags.Messages()
     grid_map_msgs.register(made.store)
@@ -114,9 +114,9 @@ def _messages() -> bags.Messages:
     for name, text in videos.DEFINITIONS.items():
         made.store.register(get_types_from_msg(text, name))
     for package, texts in (
-        ("autoware_perception_msgs", test_object_messages.AUTOWARE),
-        ("radar_msgs", test_object_messages.RADAR),
-        ("my_msgs", test_object_messages.PRIVATE),
+        ("autoware_perception_msgs", object_messages.AUTOWARE),
+        ("radar_msgs", object_messages.RADAR),
+        ("my_msgs", object_messages.PRIVATE),
     ):
         types: dict[str, Any] = {}
         for name, text in texts.items():
@@ -148,7 +148,7 @@ def _drive(kind: str, make: Callable[[int], Any], *, without: str = "", topic: s
 
 
 def _livox() -> list[Row]:
-    from tests.test_livox import scan
+    from tests.support.livox_messages import scan
 
     package = "livox_ros_driver2"
     return _drive(
@@ -157,7 +157,7 @@ def _livox() -> list[Row]:
 
 
 def _pandar(model: str) -> list[Row]:
-    from tests.test_lidar_packets import BY_NAME, SCAN, packet, scan
+    from tests.support.lidar_packets import BY_NAME, SCAN, packet, scan
 
     packets = [packet(BY_NAME[model], number) for number in range(3)]
     return _drive(
@@ -166,7 +166,7 @@ def _pandar(model: str) -> list[Row]:
 
 
 def _velodyne() -> list[Row]:
-    from tests.test_lidar_packets import VELODYNE, scan
+    from tests.support.lidar_packets import VELODYNE, scan
 
     blocks = b""
     for block in range(12):
@@ -181,23 +181,25 @@ def _velodyne() -> list[Row]:
 
 
 def _ouster() -> list[Row]:
-    from tests import test_ouster
+    from tests.support import ouster_packets
 
     made, profile = _messages(), "RNG15_RFL8_NIR8"
-    text = made.make("std_msgs/msg/String", data=test_ouster.metadata(profile))
+    text = made.make("std_msgs/msg/String", data=ouster_packets.metadata(profile))
     items = [item for item in _base() if item.topic != CLOUD]
-    items.append(bags.Item(test_ouster.TOLD, "std_msgs/msg/String", bags.START - 1, text))
-    for number in range(SCANS * test_ouster.PACKETS):
-        scan, part = divmod(number, test_ouster.PACKETS)
+    items.append(bags.Item(ouster_packets.TOLD, "std_msgs/msg/String", bags.START - 1, text))
+    for number in range(SCANS * ouster_packets.PACKETS):
+        scan, part = divmod(number, ouster_packets.PACKETS)
         at = bags.START + scan * bags.PERIOD
-        data = test_ouster.packet(profile, scan + 65534 & 0xFFFF, part, at)
-        message = made.make(test_ouster.KIND, buf=np.frombuffer(data, np.uint8))
-        items.append(bags.Item(test_ouster.LIDAR, test_ouster.KIND, at + (part + 1) * 16_000_000, message))
+        data = ouster_packets.packet(profile, scan + 65534 & 0xFFFF, part, at)
+        message = made.make(ouster_packets.KIND, buf=np.frombuffer(data, np.uint8))
+        items.append(
+            bags.Item(ouster_packets.LIDAR, ouster_packets.KIND, at + (part + 1) * 16_000_000, message)
+        )
     return _rows(items)
 
 
 def _compressed_cloud(form: str) -> list[Row]:
-    from tests import test_compressed_clouds as samples
+    from tests.support import compressed_clouds as samples
 
     made = _messages()
 
@@ -222,7 +224,7 @@ def _video(kind: str, codec: str = "h264") -> list[Row]:
 
 
 def _objects(kind: str) -> list[Row]:
-    from tests.test_object_messages import autoware
+    from tests.support.object_messages import autoware
 
     package = "autoware_perception_msgs"
     outline = [(-2, -1), (2, -1), (2, 1)] if kind == "Detected" else ()
@@ -233,13 +235,13 @@ def _objects(kind: str) -> list[Row]:
 
 
 def _radar() -> list[Row]:
-    from tests.test_object_messages import radar
+    from tests.support.object_messages import radar
 
     return _drive("radar_msgs/msg/RadarTracks", lambda stamp: _stamped(radar(_messages()), stamp))
 
 
 def _private() -> list[Row]:
-    from tests.test_object_messages import private
+    from tests.support.object_messages import private
 
     return _drive("my_msgs/msg/Things", lambda stamp: _stamped(private(_messages()), stamp))
 
@@ -249,7 +251,7 @@ def _stamped(message: Any, stamp: int) -> Any:
 
 
 def _markers() -> list[Row]:
-    from tests.test_object_messages import pose
+    from tests.support.object_messages import pose
 
     made = _messages()
 
@@ -323,14 +325,14 @@ def _foxglove(image: str, encoding: str) -> list[Row]:
     from google.protobuf.json_format import MessageToDict, ParseDict
 
     from bevviz.messages.foxglove import parse
-    from tests import test_foxglove
+    from tests.support import foxglove_bags
 
     with tempfile.TemporaryDirectory(prefix="bevviz-torture-") as folder:
-        path = test_foxglove.write(Path(folder) / "drive.mcap", image=image)
+        path = foxglove_bags.write(Path(folder) / "drive.mcap", image=image)
         with path.open("rb") as file:
             found = [(s, c.topic, m.log_time, m.data) for s, c, m in make_reader(file).iter_messages() if s]
     rows = []
-    period = test_foxglove.SCANS * bags.PERIOD
+    period = foxglove_bags.SCANS * bags.PERIOD
     for schema, name, at, data in found:
         text = schema.data.decode("latin-1")
         fields = MessageToDict(
@@ -338,11 +340,11 @@ def _foxglove(image: str, encoding: str) -> list[Row]:
             preserving_proto_field_name=True,
             use_integers_for_enums=True,
         )
-        for turn in range(-(-SCANS // test_foxglove.SCANS)):
+        for turn in range(-(-SCANS // foxglove_bags.SCANS)):
             moment = at + turn * period
             stamped = _at(fields, moment)
             if encoding == "json":
-                content = json.dumps(test_foxglove._times(stamped)).encode()
+                content = json.dumps(foxglove_bags._times(stamped)).encode()
                 rows.append(
                     Row(name, schema.name, moment, content, b'{"type": "object"}', "jsonschema", "json")
                 )

@@ -296,3 +296,16 @@ def matrix(text: str, columns: int = 3) -> NDArray[np.float64]:
 
 def lines_of(values: Sequence[float]) -> str:
     return " ".join(map(str, values))
+
+
+def cloud(columns: int, points: int = 3000, seed: int = 0) -> np.ndarray:
+    """x, y, z, intensity, ring, time, and the distance, of points in no order."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.normal([5, 0, -1], [20, 15, 0.7], (points, 3))
+    rest = [
+        rng.integers(0, 256, points),
+        rng.integers(0, 32, points),
+        rng.random(points) * 0.1,
+        np.linalg.norm(xyz, axis=1),
+    ]
+    return np.column_stack([xyz, *rest])[:, :columns].astype("<f4")
