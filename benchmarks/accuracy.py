@@ -16,13 +16,13 @@ from tqdm import tqdm
 
 from benchmarks import kitti
 from benchmarks.pages import write_section
-from benchmarks.tracking import Tallies, TrackTally, add_tracks, truth_of
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
 from bevviz.model.geometry import iou
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
+from tests.support.track_metrics import Tallies, TrackTally, add_tracks, truth_of
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")

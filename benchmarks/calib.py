@@ -11,7 +11,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,15 +19,13 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.calib import AXES, Axis, AxisFinding, Calibration, calibrate, gather
-from bevviz.calib.offsets import SCALES, TIME, error_pose
-from bevviz.model import geometry
+from bevviz.calib.offsets import SCALES, TIME
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
-from bevviz.synthetic import SyntheticSource
+from tests.support.miscalibrated_drives import EVERY, Drive, stated_wrongly
 
 BEGIN, END = "<!-- benchmarks.calib: begin -->", "<!-- benchmarks.calib: end -->"
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZES = {"deg": (0.5, 1.0, 2.0), "cm": (5.0, 10.0, 20.0), "ms": (20.0, 40.0, 80.0)}
-EVERY = 3  # frames of the synthetic drive from one that is taken to the next
 CHOSEN = range(6)  # frames of KITTI on which the thresholds of bevviz.calib were chosen
 
 
@@ -53,44 +51,6 @@ class Case:
 
 
 # --- frames ------------------------------------------------------------------------------------
-
-
-def stated_wrongly(frames: Iterable[Frame], offsets: F64) -> Iterator[Frame]:
-    """Yield the frames with the mounting of their first camera wrong by (7,) ``offsets`` (rad, metres)."""
-    stated_from_true = geometry.inverse(error_pose(offsets))
-    for frame in frames:
-        camera = frame.cameras[0]
-        assert camera.camera_from_points is not None
-        wrong = replace(camera, camera_from_points=stated_from_true @ camera.camera_from_points)
-        yield replace(frame, cameras=(wrong,))
-
-
-class Drive:
-    """Frames of a synthetic drive, rendered once: an error of what is stated changes no pixel, no point."""
-
-    def __init__(self, frames: int, seed: int, weave: bool, every: int = EVERY) -> None:
-        self.source = SyntheticSource(frames, seed, weave=weave)
-        numbers = tqdm(range(0, frames, every), unit="scan", desc="simulate", disable=None, leave=False)
-        self.frames = [self.source.snapshot(i).frame for i in numbers]
-
-    def pose(self, frame: Frame, stamp: int) -> F64:
-        return self.source.map_from_base(stamp) @ self.source.base_from_lidar
-
-    def planted(self, offsets: F64) -> Iterator[Frame]:
-        """Yield the frames as a robot delivers them whose calibration is wrong by (7,) ``offsets``."""
-        camera_from_lidar = geometry.inverse(self.source.base_from_camera) @ self.source.base_from_lidar
-        stated = geometry.inverse(error_pose(offsets)) @ camera_from_lidar
-        for frame in self.frames:
-            camera = frame.cameras[0]
-            assert camera.image is not None
-            stamp = camera.image.stamp + round(offsets[TIME] * 1e9)
-            moved = geometry.inverse(self.pose(frame, stamp)) @ self.pose(frame, frame.stamp)
-            image = replace(camera.image, stamp=stamp)
-            wrong = replace(camera, image=image, camera_from_points=stated @ moved)
-            yield replace(frame, cameras=(wrong,))
-
-    def calibrate(self, offsets: F64) -> Calibration:
-        return calibrate(gather(self.planted(offsets), ["zed"], self.pose)["zed"])
 
 
 class Kitti:

@@ -15,7 +15,7 @@ from time import process_time
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.kitti import DATA, shots
+from benchmarks.kitti import DATA
 from benchmarks.pages import write_section
 from bevviz.config import Config, load
 from bevviz.evaluate.ground_score import GROUND_LABELS
@@ -25,6 +25,7 @@ from bevviz.stages.clustering import cluster
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import voxel_grid
 from bevviz.synthetic import SyntheticSource
+from tests.support.kitti_accuracy import shots
 
 INTRO = """## Ground against Patchwork++
 

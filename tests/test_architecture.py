@@ -1,7 +1,8 @@
-"""The page of the architecture agrees with the package."""
+"""Rules of the code: the architecture page agrees with the package, and test files keep their order."""
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from itertools import pairwise
@@ -9,6 +10,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/architecture.md").read_text()
+MAX_NAME = 60  # characters of the name of a test
+TESTS_OF_BENCHMARKS = ("test_benchmarks.py", "test_torture_benchmark.py")
 
 
 def contract() -> list[set[str]]:
@@ -46,3 +49,34 @@ def test_every_package_has_a_sentence_that_says_what_it_holds() -> None:
         if (package / "__init__.py").is_file():
             first = (package / "__init__.py").read_text().partition("\n")[0]
             assert re.fullmatch(r'"""[A-Z].*\.(""")?', first), package.name
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Return the modules, and the names in modules, that a file imports anywhere."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+def test_test_files_import_helpers_from_support_only() -> None:
+    files = [path for folder in ("tests", "benchmarks", "tools") for path in (ROOT / folder).rglob("*.py")]
+    assert len(files) > 150
+    for path in files:
+        imported = imported_modules(path)
+        name = path.relative_to(ROOT).as_posix()
+        outside = {m for m in imported if m.startswith("tests.") and not m.startswith("tests.support")}
+        assert not outside, f"{name} imports {sorted(outside)}: move the shared helpers to tests/support"
+        if name.startswith("tests/") and path.name not in TESTS_OF_BENCHMARKS:
+            of_benchmarks = {m for m in imported if m.partition(".")[0] == "benchmarks"}
+            assert not of_benchmarks, f"{name} imports {sorted(of_benchmarks)}"
+
+
+def test_names_of_tests_are_short_enough_to_read() -> None:
+    for path in (ROOT / "tests").glob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                assert len(node.name) < MAX_NAME, f"{path.name}: {node.name} has {len(node.name)} characters"

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.calib import Drive, stated_wrongly
 from bevviz.bags.source import BagSource
 from bevviz.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
 from bevviz.calib.edges import cloud_edges
@@ -25,6 +24,7 @@ from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrin
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
 from tests.support import bags, documented_json
+from tests.support.miscalibrated_drives import Drive, stated_wrongly
 from tests.support.recordings import Recording, verify
 
 pytestmark = pytest.mark.usefixtures("elsewhere")

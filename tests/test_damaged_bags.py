@@ -15,8 +15,6 @@ import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 
-from benchmarks.torture.judges import judges, taken
-from benchmarks.torture.samples import FORMATS, items
 from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
 from bevviz.bags.reader import LEAST, DamageError, FileBytes, unpack
@@ -25,6 +23,8 @@ from bevviz.bags.source import BagSource
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import describe_bag, render_bag_info
+from tests.support.bag_formats import FORMATS, items
+from tests.support.foreign_readers import judges, taken
 
 Found = list[tuple[str, int, bytes]]
 

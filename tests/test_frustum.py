@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks import kitti
 from bevviz.config import CLASS_SIZES, ClusteringConfig, FusionConfig, load
 from bevviz.errors import UserError
 from bevviz.model.frame import F32
@@ -37,6 +36,7 @@ from tests.support.fusion_scenes import (
     silhouette,
     slab,
 )
+from tests.support.kitti_accuracy import Case, Tally, measure
 
 
 def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Splits]:
@@ -305,11 +305,11 @@ def test_sizes_are_stated_class_by_class() -> None:
 
 
 @pytest.fixture(scope="module")
-def tally(shared: Path) -> kitti.Tally:
-    return kitti.measure(shared / "kitti", {"default": kitti.Case(load())})["default"]
+def tally(shared: Path) -> Tally:
+    return measure(shared / "kitti", {"default": Case(load())})["default"]
 
 
-def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
+def test_objects_of_labelled_frames(tally: Tally) -> None:
     """Floors well below what was measured: docs/performance.md has the figures."""
     assert len(tally.objects) == 30
     assert sum(v.distance <= 2 for v in tally.objects) >= 28
@@ -319,7 +319,7 @@ def test_objects_of_labelled_frames(tally: kitti.Tally) -> None:
     assert sum(b.nearest > 2 for b in tally.boxes) <= 1
 
 
-def test_nothing_named_in_them_is_too_large(tally: kitti.Tally) -> None:
+def test_nothing_named_in_them_is_too_large(tally: Tally) -> None:
     for box in tally.boxes:
         size = CLASS_SIZES.get(box.name.lower())
         limit = 8.0 if size is None else size[0] + MAX_SPREAD * size[3] + 0.01

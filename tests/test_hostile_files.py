@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 import bevviz
-from benchmarks.torture import folders
 from bevviz import UserError
 from bevviz.cli import main
 from bevviz.datasets.dataset import read_points, read_table
@@ -101,7 +100,7 @@ def plain_folder(calibration: str = "") -> Path:
 def test_a_pipe_in_a_data_set_is_not_waited_for(name: str) -> None:
     root = Path("set")
     root.mkdir()
-    folders.kitti_object(root)
+    datasets.kitti_object(root)
     (root / name).unlink()
     os.mkfifo(root / name)
     assert main(["info", "set"]) == 0
@@ -121,7 +120,7 @@ def test_a_table_that_is_a_pipe_is_refused(capsys: Capture) -> None:
         ("lidars: " + NESTED, "too deep"),
         ("cameras: {camera: {K: [72, 0, 61, 0, 72, 17, 0, 0, 1], size: [4294967296, 1]}}", "size the width"),
         ("rate: 1e-300", "not frames a second"),
-        (folders.LAUGHS + "rate: *a11", "its aliases stand for more than"),
+        (datasets.LAUGHS + "rate: *a11", "its aliases stand for more than"),
     ],
 )
 def test_a_strange_calibration_is_one_line(calibration: str, said: str, capsys: Capture) -> None:

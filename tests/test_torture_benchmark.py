@@ -16,9 +16,9 @@ import pytest
 from benchmarks.torture import damage, folders, fuzz, kill, messages, models
 from benchmarks.torture.__main__ import SHARE
 from benchmarks.torture.damage import DAMAGES, Tally, judged
-from benchmarks.torture.judges import judges, taken
-from benchmarks.torture.samples import FORMATS, items
 from benchmarks.torture.worker import Outcome, Worker
+from tests.support.bag_formats import FORMATS, items
+from tests.support.foreign_readers import judges, taken
 
 SHORT = ("mcap, no checksums", "mcap, zstd", "mcap, flat", "mcap.zstd", "sqlite3, with a log", "ros1, lz4")
 

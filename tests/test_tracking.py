@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.tracking import Tallies, TrackTally, Truth, add_tracks, truth_of
 from bevviz.config import TrackingConfig, load
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
@@ -19,6 +18,7 @@ from bevviz.pipeline.session import Session
 from bevviz.stages.tracking import Tracker
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
+from tests.support.track_metrics import Tallies, TrackTally, Truth, add_tracks, truth_of
 from tests.support.tracking_scenes import CAR, PERSON, scene
 
 CONFIG = TrackingConfig()

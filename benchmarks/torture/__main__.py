@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Mapping
 
 from benchmarks.torture import damage, folders, fuzz, kill, messages, models
-from benchmarks.torture.samples import FORMATS
+from tests.support.bag_formats import FORMATS
 
 EXAMPLES = 40  # of what went wrong that are printed
 SHARE = 0.995  # of the messages that the best other reader gives

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.torture.judges import Found, judges, taken
-from benchmarks.torture.samples import FORMATS, items
 from benchmarks.torture.worker import Outcome, Worker
+from tests.support.bag_formats import FORMATS, items
+from tests.support.foreign_readers import Found, judges, taken
 
 Damage = Callable[[bytearray, random.Random], object]
 

@@ -50,23 +50,6 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 # --- sound folders -----------------------------------------------------------------------------
 
 
-def kitti_object(root: Path) -> Path:
-    for folder in ("velodyne", "calib", "image_2", "label_2"):
-        (root / folder).mkdir()
-    for number in range(3):
-        datasets.scan(number).tofile(root / f"velodyne/{number:06d}.bin")
-        datasets.image(root / f"image_2/{number:06d}.png", 50 * number)
-        (root / f"calib/{number:06d}.txt").write_text(
-            f"P0: {datasets.P2}\nP1: {datasets.P2}\nP2: {datasets.P2}\nP3: {datasets.P2}\n"
-            f"R0_rect: {datasets.R_RECT}\nTr_velo_to_cam: {datasets.TR}\nTr_imu_to_velo: {datasets.IMU_TR}\n"
-        )
-        (root / f"label_2/{number:06d}.txt").write_text(
-            "Car 0.00 0 -1.57 48.00 14.00 70.00 28.00 1.50 1.60 4.00 0.07 1.71 11.73 -1.57\n"
-            "DontCare -1 -1 -10 0.00 1.00 2.00 3.00 -1 -1 -1 -1000 -1000 -1000 -10\n"
-        )
-    return root
-
-
 def plain(root: Path) -> Path:
     """Two LiDARs in different formats, a camera, and all files that may lie beside."""
     (root / "front").mkdir()
@@ -115,7 +98,7 @@ def kitti_tracking(root: Path) -> Path:
 
 
 FOLDERS: Mapping[str, Callable[[Path], Path]] = {
-    "kitti-object": kitti_object,
+    "kitti-object": datasets.kitti_object,
     "kitti-raw": datasets.kitti_raw,
     "kitti-tracking": kitti_tracking,
     "kitti-odometry": lambda root: datasets.kitti_odometry(root, labels=False),
@@ -336,9 +319,6 @@ VALUES = (
         "1:2:3",
     ),
 )
-LAUGHS = "a0: &a0 [x, x]\n" + "".join(
-    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12)
-)
 BOMBS = (
     "a." * 100_000 + "a = 1\n",
     "[" + "a." * 100_000 + "a]\n",
@@ -352,9 +332,9 @@ BOMBS = (
     "#" * 900_000,
     "".join(f"k{i} = {i}\n" for i in range(40_000)),
     "".join(f"[clustering.k{i}]\n" for i in range(20_000)),
-    LAUGHS,
-    LAUGHS + "voxel: {size: *a11}\n",
-    LAUGHS + "source: {lidar_topics: *a11}\n",
+    datasets.LAUGHS,
+    datasets.LAUGHS + "voxel: {size: *a11}\n",
+    datasets.LAUGHS + "source: {lidar_topics: *a11}\n",
     "\n".join(" " * i + "a:" for i in range(1400)),
     "? " * 100_000,
     "- " * 100_000,

@@ -1,4 +1,4 @@
-"""Readers that are not bevviz's: what they get out of a damaged bag is what is to be reached."""
+"""Readers of bags that are not bevviz's. From a damaged bag, bevviz must read at least what they read."""
 
 from __future__ import annotations
 
