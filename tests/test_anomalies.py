@@ -273,7 +273,7 @@ def test_what_lasts_is_one_and_is_held_for_a_while() -> None:
     assert str(drive.summary) == "2 sync (first at 0.1 s)"
 
 
-def test_news_is_told_once_also_where_its_first_frame_was_left_out() -> None:
+def test_news_is_told_once_if_its_first_frame_was_skipped() -> None:
     onsets = Onsets()
     one, two = Anomaly("tf", "zed", "lost", since=5), Anomaly("sync", "zed", "late", since=6)
     assert onsets.of([]) == []

@@ -191,7 +191,7 @@ def cluster() -> Iterator[Any]:
         yield started
 
 
-def test_a_dask_worker_that_dies_loses_no_bag_and_does_none_twice(
+def test_death_of_a_dask_worker_loses_and_repeats_no_bag(
     cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scans = {"a": 6, "b": 120, "c": 4, "d": 5, "e": 3}
@@ -315,7 +315,7 @@ def test_the_worst_frames_have_pictures(batch: Batch) -> None:
     )
 
 
-def test_frames_are_counted_and_filtered_by_the_gravest_thing_in_them(batch: Batch) -> None:
+def test_frames_are_counted_by_their_worst_finding(batch: Batch) -> None:
     text = (batch.folder / "summary.html").read_text()
     frames = pq.read_table(batch.folder / "summary.parquet").to_pylist()
     kinds = Counter(severity(row) for row in frames)
@@ -501,7 +501,7 @@ def test_a_damaged_result_is_named_and_made_again(done: Job, damage: Any, line: 
     assert unfinished_jobs([done], False, warnings.append) == [] and len(warnings) == 2
 
 
-def test_a_table_without_the_checksum_of_its_recording_is_made_again(done: Job) -> None:
+def test_a_table_without_checksum_is_written_again(done: Job) -> None:
     table = pq.read_table(done.table)
     about = json.loads(table.schema.metadata[b"bevviz"])
     del about["recording_size"], about["recording_sha256"]

@@ -111,7 +111,7 @@ def test_why_is_right_about_objects_and_its_hints_hold() -> None:
     assert "| merged |" in details_of(tallies) and "A question takes " in section_of(tallies, "2 frames.")
 
 
-def test_the_rule_knows_the_planted_faults_and_a_wrong_answer_counts_as_wrong(
+def test_the_rule_judges_answers_about_planted_faults(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     reasons = {
@@ -141,7 +141,7 @@ def test_a_section_takes_the_place_of_its_older_self_alone(tmp_path: Path) -> No
     assert page.read_text().endswith("kept\n\n## Three\n\nlast\n")
 
 
-def test_the_page_has_the_place_of_each_benchmark_that_writes_it() -> None:
+def test_the_page_has_a_section_for_each_benchmark() -> None:
     page = (Path(__file__).parents[1] / "docs/performance.md").read_text()
     for module in (calib, performance):
         assert page.count(module.BEGIN) == page.count(module.END) == 1

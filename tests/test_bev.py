@@ -188,7 +188,7 @@ def test_rich_style_against_plain_python(points: F32, data: st.DataObject) -> No
         np.testing.assert_array_equal(result.image[cell], color)
 
 
-def test_rich_style_tells_ground_from_obstacles_and_does_not_spoil_its_background() -> None:
+def test_rich_style_tells_ground_from_obstacles() -> None:
     config = BevConfig(range_x=20, range_y=20, resolution=0.5, channels=())
     points = np.array([[5.2, 5.2, -1.7], [-5.2, 5.2, -1.7], [-5.2, 5.2, 0.5]], np.float32)
     ground = np.array([True, True, False])

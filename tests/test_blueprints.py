@@ -67,7 +67,7 @@ def test_every_layout_fits_every_scene(name: str, scene: Scene, tmp_path: Path) 
     assert found["3D"][:2] == ["/world/**", "/robot/**"]
 
 
-def test_the_eye_stays_with_the_robot_and_looks_at_what_is_explained(tmp_path: Path) -> None:
+def test_the_eye_follows_the_robot_and_the_explained_object(tmp_path: Path) -> None:
     scene = replace(SCENES["one camera"], focus=(10.0, 0.0, -1.0))
     _, debug = properties(save(blueprints.load("debug", scene), tmp_path / "debug.rbl"))["3D"]
     assert debug["EyeControls3D:position"] == [[-16, 5, 11]]

@@ -372,7 +372,7 @@ def test_an_interrupt_that_gets_lost_in_a_library(
 # --- what nobody foresaw -----------------------------------------------------------------------
 
 
-def test_a_stage_that_fails_is_one_line_and_its_traceback_is_for_who_asks(
+def test_a_failing_stage_prints_one_line_unless_debugging(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("broken.py").write_text("def cluster(points):\n    return 1 // 0\n")

@@ -30,7 +30,7 @@ def test_without_a_place_they_are_compiled_anew() -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr
 
 
-def test_the_clock_of_the_stages_stands_still_while_they_are_compiled() -> None:
+def test_stage_times_exclude_compilation() -> None:
     def twice(x: float) -> float:
         return 2 * x
 

@@ -149,7 +149,7 @@ def test_tracking_is_evaluated_and_swept(tmp_path: Path, capsys: Capture) -> Non
     assert "recall" in capsys.readouterr().out
 
 
-def test_a_sequence_of_the_odometry_benchmark_is_what_pykitti_reads(tmp_path: Path) -> None:
+def test_an_odometry_sequence_equals_what_pykitti_reads(tmp_path: Path) -> None:
     sequence = datasets.kitti_odometry(tmp_path)
     theirs = pykitti.odometry(str(tmp_path), "00")
     with bevviz.open(sequence) as drive:
@@ -263,7 +263,7 @@ def test_nuscenes_from_its_tables_folder_and_with_lost_files(tmp_path: Path, cap
     assert "ego_pose.json: is cut, or no table of nuScenes" in capsys.readouterr().err
 
 
-def test_a_part_of_nuscenes_is_used_and_what_is_absent_is_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_a_part_of_nuscenes_is_read_and_missing_files_counted(tmp_path: Path, capsys: Capture) -> None:
     root = datasets.nuscenes(tmp_path)
     for file in root.glob("s*/*/*__153240298*"):  # of the second scene
         file.unlink()

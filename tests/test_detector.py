@@ -165,7 +165,7 @@ def test_float16_and_open_sizes(tmp_path: Path) -> None:
     assert result.names == ("class_1",)
 
 
-def test_metadata_gives_the_size_that_the_model_was_trained_with(tmp_path: Path) -> None:
+def test_metadata_states_the_input_size_of_the_training(tmp_path: Path) -> None:
     rows = np.zeros((1, 7, CELLS), np.float32)
     meta = {"imgsz": f"[{H}, {W}]", "stride": "32"}
     inputs = (image_input("b", 3, "h", "w"),)
@@ -246,7 +246,7 @@ def test_boxes_are_clipped_after_the_nms(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.xyxy, np.array(inside) - 0.5, atol=1e-5)
 
 
-def test_what_lies_outside_the_image_suppresses_but_is_not_shown(tmp_path: Path) -> None:
+def test_boxes_outside_the_image_suppress_but_are_not_shown(tmp_path: Path) -> None:
     boxes = np.array([[-50.0, 0, -1, 40], [-49, 0, 1, 40], [50, 0, 90, 40]])
     model = constant(
         tmp_path / "m.onnx", head("YOLOv8", boxes, np.array([0.9, 0.8, 0.7]), np.array([1, 1, 1]))
@@ -398,7 +398,7 @@ def expect(result: Detections, boxes: NDArray[Any] = BOXES, atol: float = 0.01) 
     "metadata", [{"head": "RTDETRDecoder"}, {"description": "Ultralytics rtdetr-l model"}]
 )
 @pytest.mark.parametrize("listed", [True, False])
-def test_rtdetr_of_ultralytics_is_stretched_and_states_fractions(
+def test_rtdetr_of_ultralytics_is_stretched_with_fractions(
     metadata: dict[str, str], listed: bool, tmp_path: Path
 ) -> None:
     scored = np.column_stack([SCORES, CLASSES]) if listed else np.eye(3)[CLASSES] * SCORES[:, None]
@@ -451,7 +451,7 @@ def test_rtdetr_and_dfine_of_their_repositories(tmp_path: Path) -> None:
     assert detector(model, names="coco")(IMAGE).names == ("person", "bicycle", "car")
 
 
-def test_rtdetr_of_its_repository_is_resampled_as_by_torchvision(tmp_path: Path) -> None:
+def test_rtdetr_of_its_repository_resamples_like_torchvision(tmp_path: Path) -> None:
     """From all pixels that a new one covers: stripes of one pixel become grey."""
     stripes = np.zeros((H, 3 * W, 3), np.uint8)
     stripes[:, ::2] = 200
@@ -538,7 +538,7 @@ def test_torchvision_counts_its_classes_from_one(tmp_path: Path) -> None:
     assert detector(model, names="coco91")(np.zeros((120, 200, 3), np.uint8)).names[0] == "person"
 
 
-def test_six_columns_of_end_to_end_heads_for_masks_and_key_points(tmp_path: Path) -> None:
+def test_end_to_end_heads_with_masks_and_key_points_are_read(tmp_path: Path) -> None:
     rows = head("end-to-end", to_input("YOLOv8", BOXES, 200, 120), SCORES, CLASSES)
     more = np.concatenate([rows, np.full((1, 20, 32), 7, np.float32)], axis=2)
     metadata = {**ULTRALYTICS, "task": "pose", "end2end": "True"}
@@ -661,9 +661,7 @@ def test_strangers_are_called_by_name(
         ([10.0, 10, 30, 30, 0.9, 7], "class 7, but 3 class names"),
     ],
 )
-def test_a_list_that_was_empty_when_the_model_was_read_is_looked_at_later(
-    row: list[float], said: str, tmp_path: Path
-) -> None:
+def test_an_empty_list_of_detections_is_checked_later(row: list[float], said: str, tmp_path: Path) -> None:
     """A network with NMS may find nothing in the image that tells its layout, this one in any dark image."""
     nodes = [
         node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3], keepdims=1),

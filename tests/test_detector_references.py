@@ -96,7 +96,7 @@ def test_the_network_sees_what_the_exporter_shows_it(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", [name for name in UPRIGHT if "dynamic" not in name])  # of another size then
-def test_without_metadata_the_boxes_are_the_same_or_the_model_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_model_without_metadata_is_refused_or_read_alike(name: str, tmp_path: Path) -> None:
     reference = Reference(name)
     if name in NOT_WITHOUT_METADATA:
         with pytest.raises(UserError, match=r"detector\.model .*: (read as|no detector).*; its outputs: "):

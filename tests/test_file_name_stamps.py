@@ -308,7 +308,7 @@ def test_a_pose_in_millimetres_is_told(tmp_path: Path) -> None:
     assert said in drive_in.warnings  # type: ignore[attr-defined]
 
 
-def test_images_taken_in_their_order_are_at_the_times_of_the_clouds(tmp_path: Path) -> None:
+def test_images_paired_by_order_get_the_times_of_the_clouds(tmp_path: Path) -> None:
     about = "lidars: {top: {rate: 5}}\ncameras: {front: {rate: 30}}"
     there = drive_in(tmp_path, {"top": "3.bin 4.bin", "front": "a.png b.png"}, about)
     assert there["front"] == there["top"] == [1.6, 1.8]

@@ -208,7 +208,7 @@ def test_boxes_are_upright_where_the_points_are(
     np.testing.assert_allclose(boxes.yaw, [0.5] * len(frames), atol=1e-6)
 
 
-def test_of_boxes_in_several_frames_those_without_a_place_are_left_out_and_said(tmp_path: Path) -> None:
+def test_boxes_in_unplaced_frames_are_dropped_and_reported(tmp_path: Path) -> None:
     m = bags.Messages()
     items = [
         bags.Item(
@@ -228,7 +228,7 @@ def test_of_boxes_in_several_frames_those_without_a_place_are_left_out_and_said(
     assert "frame 'camera_optical' is unknown: the boxes of /objects are left out" in said
 
 
-def test_objects_with_headers_of_their_own_count_where_the_message_states_no_frame() -> None:
+def test_headers_of_objects_replace_a_missing_message_frame() -> None:
     def one(frame: str) -> Any:
         place = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
         return SimpleNamespace(header=header(frame), pose=place, size=(4.0, 2.0, 1.5))
@@ -264,7 +264,7 @@ def test_messages_that_cannot_be_used_are_counted_once(tmp_path: Path) -> None:
         ["compare", "--set-b", "clustering.method=topic:/nothing", "--save", "compared.rrd"],
     ],
 )
-def test_a_stage_that_fails_is_said_where_only_its_result_is_judged(
+def test_a_failing_stage_is_reported_where_it_is_evaluated(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """All objects are missed then, and labels empty: as if the robot had found nothing."""

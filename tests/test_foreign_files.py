@@ -88,7 +88,7 @@ def test_pointer_of_git_lfs_gives_no_points(suffix: str, tmp_path: Path) -> None
         read_cloud(file, ("x", "y", "z", "intensity"))
 
 
-def test_pointers_of_git_lfs_in_a_data_set_are_counted_in_one_line(tmp_path: Path) -> None:
+def test_git_lfs_pointers_are_counted_in_one_line(tmp_path: Path) -> None:
     kitti_odometry(tmp_path)
     scans = sorted((tmp_path / "sequences/00/velodyne").iterdir())
     for scan in scans[:2]:

@@ -122,7 +122,7 @@ def test_boxes_may_be_the_truth(tmp_path: Path) -> None:
     assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet"]) == 0
 
 
-def test_a_transform_that_was_stated_long_before_holds_in_the_midst_of_a_drive(tmp_path: Path) -> None:
+def test_an_early_transform_still_holds_later_in_the_drive(tmp_path: Path) -> None:
     context, path = foxglove.Context(), tmp_path / "drive.mcap"
     with foxglove.open_mcap(path, context=context):
         raw = channels.RawImageChannel("/CAM_FRONT/image_raw", context=context)

@@ -119,7 +119,7 @@ def test_an_uncalibrated_camera_needs_no_other_topic(tmp_path: Path) -> None:
         assert not [text for text in source.warnings if "record" in text]
 
 
-def test_where_no_frame_id_is_stated_no_extrinsics_are_asked_for(tmp_path: Path) -> None:
+def test_without_frame_ids_no_extrinsics_are_asked_for(tmp_path: Path) -> None:
     """They have two names, one of which would be empty."""
 
     def nameless(topic: str) -> str:

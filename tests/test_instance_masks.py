@@ -65,7 +65,7 @@ WIDE = detections_of([silhouette(POINTS)])
 SEGMENTED = replace(WIDE, masks=masks_of(silhouette(PERSON)))
 
 
-def test_the_points_in_the_mask_are_taken_and_not_those_in_the_box() -> None:
+def test_points_in_the_mask_are_taken_rather_than_in_the_box() -> None:
     by_box, _ = outcome(WIDE)
     assert by_box[len(PERSON) :].mean() > 0.5, "the box alone cannot tell them apart"
     taken, fusion = outcome(SEGMENTED)

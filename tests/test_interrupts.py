@@ -29,7 +29,7 @@ def python(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_nothing_is_imported_before_an_interrupt_just_ends_the_process(tmp_path: Path) -> None:
+def test_an_interrupt_during_imports_ends_the_process(tmp_path: Path) -> None:
     """Among imports Python answers one with a traceback."""
     script = (
         "import sys, _signal\n"

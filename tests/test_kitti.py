@@ -102,9 +102,7 @@ def test_nothing_is_matched_far_from_a_label(shared: Path, results: list[FrameRe
     assert len(said) == len(camera.detections) > 0
 
 
-def test_however_low_the_threshold_nothing_is_matched_far_from_a_label(
-    shared: Path, bag: Path, model: Path
-) -> None:
+def test_no_threshold_matches_objects_far_from_a_label(shared: Path, bag: Path, model: Path) -> None:
     """The small objects of 000001 do appear as weak detections: those that match must match rightly."""
     truth = labels(shared, "000001")
     config = load(settings=[f"detector.model={model}", "detector.conf_threshold=0.1"])

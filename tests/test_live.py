@@ -178,7 +178,7 @@ def shown(recording: Recording) -> list[int]:
 
 
 @given(st.lists(st.booleans()), st.integers(1, 4))
-def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bool], size: int) -> None:
+def test_a_queue_returns_the_newest_items_and_counts_drops(moves: list[bool], size: int) -> None:
     queue: NewestQueue[int] = NewestQueue(size)
     items = iter(queue)
     waiting: list[int] = []
@@ -196,7 +196,7 @@ def test_a_queue_hands_out_the_newest_items_and_counts_the_others(moves: list[bo
     assert queue.dropped == sum(moves) - taken - len(waiting)
 
 
-def test_what_comes_together_waits_and_who_is_behind_gets_the_newest() -> None:
+def test_simultaneous_scans_wait_and_slow_runs_get_the_newest() -> None:
     queue: NewestQueue[int] = NewestQueue(3, catch_up=True)
     items = iter(queue)
     for number in range(0, 10, 2):  # pairs, for one who is quick
@@ -282,7 +282,7 @@ class Unread:
             self.got += len(data)
 
 
-def test_a_viewer_that_is_late_gets_the_newest_and_its_lag_is_known(
+def test_a_slow_viewer_gets_the_newest_and_its_lag_is_known(
     results: list[FrameResult], drive: SyntheticSource
 ) -> None:
     program = Unread()
@@ -487,7 +487,7 @@ def merged(first: int, second: int) -> Frame:
     return Frame(0, 0, 0, "lidars", points, "base_link", {"ring": number}, clouds=clouds)
 
 
-def test_observing_logs_what_the_robot_publishes_and_nothing_else(
+def test_observing_logs_only_what_the_robot_publishes(
     run: Run, frames: list[Frame], drive: SyntheticSource
 ) -> None:
     robot = [

@@ -22,7 +22,7 @@ class Watched:
             self.now += step
 
 
-def test_a_stream_that_stops_is_silent_and_one_that_was_sent_once_is_not() -> None:
+def test_a_stopped_stream_is_silent_but_a_latched_topic_is_not() -> None:
     watched = Watched()
     watched.watch.add("/camera_info", 10)
     watched.stream("/image", 2.0)
@@ -48,7 +48,7 @@ def test_a_slow_stream_is_not_silent_between_two_messages() -> None:
     assert watched.watch.silent_for("/map") > 5
 
 
-def test_what_cannot_be_used_is_told_at_once_and_not_with_every_message() -> None:
+def test_an_unusable_topic_is_reported_once_at_its_start() -> None:
     watched = Watched()
     watch, said = watched.watch, watched.said
     for _ in range(3):

@@ -42,7 +42,7 @@ def graph() -> Iterator[None]:
         yield
 
 
-def test_scans_wait_for_their_metadata_and_end_with_the_next_one(graph: None) -> None:
+def test_scans_wait_for_metadata_and_end_with_the_next_scan(graph: None) -> None:
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from std_msgs.msg import String
 

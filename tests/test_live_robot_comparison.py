@@ -54,7 +54,7 @@ def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0
     return replace(FrameResult.unprocessed(frame, CONFIG), objects=objects)
 
 
-def test_boxes_may_come_with_their_frame_after_it_or_before_its_result(first: Frame) -> None:
+def test_boxes_may_arrive_before_or_after_the_result(first: Frame) -> None:
     against = AgainstRobot("", CONFIG.live)
     (with_it,) = against.see(result(first, 0, robot=10.1))
     assert [d.change for d in with_it.found.objects] == [Change.SAME] and against.topic == TOPIC
@@ -78,7 +78,7 @@ def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
     )
 
 
-def test_image_boxes_count_where_they_come_before_the_boxes_in_space(first: Frame) -> None:
+def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
     against = AgainstRobot("", CONFIG.live)
     camera = first.cameras[0].name
     assert against.see(result(first, 0)) == []

@@ -211,7 +211,7 @@ def test_info_says_what_is_missing() -> None:
         assert made.missing == ("no message on /points yet", "no detector: --model FILE.onnx")
 
 
-def test_what_stops_or_cannot_be_used_is_told_at_once_and_when_it_is_over() -> None:
+def test_stopped_topics_are_reported_and_so_is_their_return() -> None:
     said: list[str] = []
     kind = "sensor_msgs/msg/PointCloud2"
     with Node(name="driver") as driver, LiveSource(load(), tell=said.append) as source:
@@ -255,7 +255,7 @@ def test_what_stops_or_cannot_be_used_is_told_at_once_and_when_it_is_over() -> N
             until_told("another node is called /bevviz")
 
 
-def test_clouds_that_come_together_are_all_taken_and_none_is_missed_once_it_is_over() -> None:
+def test_all_clouds_that_arrive_together_are_taken() -> None:
     kind = "sensor_msgs/msg/PointCloud2"
     whole = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
     with Node(name="driver") as driver, LiveSource(load()) as source:
@@ -374,7 +374,7 @@ def test_refused_arguments() -> None:
         LiveSource(load(), arguments=["-r", "no rule"])
 
 
-def test_late_publisher_then_restart_with_other_qos_and_calibration() -> None:
+def test_a_late_publisher_may_restart_with_other_qos() -> None:
     said: list[str] = []
     with LiveSource(load(), tell=said.append) as source:
         assert not source.wait(1.0)

@@ -236,7 +236,7 @@ def test_a_cloud_without_points_is_empty() -> None:
 
 
 @pytest.mark.parametrize(("padding", "whole"), [(0, 2 * 25 + 7), (8, 2 * 25)])
-def test_of_cut_data_the_whole_points_are_kept_and_the_others_counted(padding: int, whole: int) -> None:
+def test_whole_points_of_cut_data_are_kept_and_others_counted(padding: int, whole: int) -> None:
     points = random_points(100)
     msg = cloud_message(points, height=4, row_padding=padding)
     msg.data = msg.data[: 2 * msg.row_step + 7 * msg.point_step + 3]
@@ -262,7 +262,7 @@ def test_row_step_and_count_that_old_drivers_leave_at_zero() -> None:
     assert len(clouds.decode_cloud(msg, "/p", 0).xyz) == 100
 
 
-def test_coordinates_beyond_float32_are_dropped_without_a_warning() -> None:
+def test_coordinates_beyond_float32_are_dropped_silently() -> None:
     points = random_points(3, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
     points["x"][1] = 1e300
     points["y"][0] = 4_500_000.25
@@ -458,7 +458,7 @@ def test_a_grey_png_of_16_bits_is_shown_as_it_was_reduced() -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_raw_pixels_of_a_colour_sensor_that_were_compressed_as_they_are_show_the_colour(bits: int) -> None:
+def test_compressed_bayer_pixels_are_shown_in_colour(bits: int) -> None:
     """As compressed_image_transport does with bayer; they were shown as a grey checkerboard."""
     scale = 257 if bits == 16 else 1
     tile = np.array([[130, 20], [250, 130]], np.uint16) * scale  # green, blue, red, green
@@ -792,7 +792,7 @@ def png_of(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", rows) + part(b"IEND", b"")
 
 
-def test_an_image_that_would_take_gigabytes_is_refused_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_of_gigabytes_is_refused_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     bomb = png_of(32_000, 32_000)
     jpeg = encoded(".jpg", random_pixels(16, 16, 3))
     at = jpeg.index(b"\xff\xc0") + 5
@@ -853,7 +853,7 @@ DECODERS: dict[str, Callable[[Any], object]] = {
         ),
     ],
 )
-def test_a_definition_with_other_fields_is_the_failure_of_its_messages(kind: str, msg: Message) -> None:
+def test_messages_with_other_fields_are_counted_as_failures(kind: str, msg: Message) -> None:
     with pytest.raises(MessageError, match=r"^/t: .*\S$") as caught:
         guard(LiveMessage("/t", "some/msg/Kind", 0, b""), DECODERS[kind], msg)
     assert "\n" not in str(caught.value)

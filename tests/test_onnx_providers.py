@@ -44,7 +44,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch, error: str) -> None:
 MISSING = "libcublasLt.so.13: cannot open shared object file: No such file or directory"
 
 
-def test_a_missing_library_is_told_once_and_the_processor_takes_over(
+def test_a_missing_library_is_told_once_and_the_cpu_is_used(
     gpu_package: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     libraries(monkeypatch, MISSING)

@@ -143,7 +143,7 @@ def test_a_text_goes_into_a_pipe(capfd: Capture) -> None:
         ("report", ["--at", "0", "-o", "c.rrd", "--force"]),
     ],
 )
-def test_every_output_of_a_command_gets_its_name_when_it_is_whole(
+def test_outputs_get_their_names_when_they_are_complete(
     command: str, options: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is opened for writing under the name that it has in the end."""
@@ -262,7 +262,7 @@ def test_no_temporary_folder_at_all_is_one_line(monkeypatch: pytest.MonkeyPatch,
 # --- what a killed process leaves --------------------------------------------------------------
 
 
-def test_a_temporary_folder_does_not_outlive_its_process_for_long(
+def test_temporary_folders_are_deleted_after_their_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -57,7 +57,7 @@ def params_of(reference: Reference, **changed: Any) -> PillarParams:
 
 
 @pytest.mark.parametrize("name", HEADS)
-def test_boxes_are_those_that_the_makers_take_from_the_same_maps(name: str, tmp_path: Path) -> None:
+def test_boxes_equal_those_of_the_reference_implementations(name: str, tmp_path: Path) -> None:
     reference = Reference(name)
     boxes, score, names = reference.network(tmp_path / "net.onnx")(CLOUD)
 
@@ -74,7 +74,7 @@ def test_boxes_are_those_that_the_makers_take_from_the_same_maps(name: str, tmp_
         assert np.cos(boxes.yaw[k] - box[6]) == pytest.approx(1, abs=1e-6)
 
 
-def test_pillars_are_those_of_spconv_and_features_those_of_openpcdet() -> None:
+def test_pillars_equal_spconv_and_features_equal_openpcdet() -> None:
     with np.load(REFERENCES / "features.npz") as file:
         points, counts, cells, shown = (file[key] for key in ("points", "counts", "cells", "shown"))
     points = points.astype(np.float32)
@@ -258,7 +258,7 @@ def test_the_configurations_in_the_docs_are_valid(tmp_path: Path) -> None:
     assert autoware is not None and autoware.grid == (480, 480)
 
 
-def test_a_file_is_loaded_once_for_configurations_that_show_it_the_same(tmp_path: Path) -> None:
+def test_a_network_is_loaded_once_for_equal_settings(tmp_path: Path) -> None:
     config = load(settings=Reference("openpcdet_anchors").settings(tmp_path / "net.onnx"))
     loader = StageLoader()
     one, other, third = (
@@ -334,7 +334,7 @@ def test_files_that_are_none_and_pairs_that_do_not_fit(tmp_path: Path) -> None:
         assert words in str(caught.value), changed
 
 
-def test_scores_that_are_probabilities_already_are_not_squeezed_again(tmp_path: Path) -> None:
+def test_probabilities_are_not_passed_through_a_sigmoid_again(tmp_path: Path) -> None:
     reference = Reference("openpcdet_anchors")
     plain = reference.network(tmp_path / "net.onnx")(CLOUD)
     reference.outputs["cls_preds"] = 1 / (1 + np.exp(-reference.outputs["cls_preds"]))

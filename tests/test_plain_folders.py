@@ -215,7 +215,7 @@ def measured() -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_ply_keeps_every_field_and_of_a_cut_one_the_whole_points(
+def test_ply_keeps_every_field_and_whole_points_of_cut_files(
     kind: str, measured: np.ndarray, tmp_path: Path
 ) -> None:
     head, body = ply(measured, kind)

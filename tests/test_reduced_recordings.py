@@ -160,7 +160,7 @@ def test_every_decision_box_track_and_explanation_is_kept(read: dict[str, Record
                     )
 
 
-def test_inspect_has_each_voxel_once_and_raw_clouds_where_something_begins(
+def test_inspect_keeps_voxels_and_raw_clouds_at_findings(
     saved: dict[str, Path], read: dict[str, Recording]
 ) -> None:
     whole, less = read["everything"], read["inspect"]

@@ -189,7 +189,7 @@ def test_a_narrow_configuration_does_not_count(drive: Path, shared: Path) -> Non
 
 @pytest.mark.parametrize("limit", [1, 100])
 @pytest.mark.parametrize("overlap", [0.01, 0.99])
-def test_every_candidate_is_hidden_however_many_the_configuration_keeps(
+def test_every_candidate_is_redacted_whatever_is_configured(
     limit: int, overlap: float, tmp_path: Path
 ) -> None:
     """126 people on top of each other, each a little weaker: all but a few are suppressed."""
@@ -418,7 +418,7 @@ SIDE = st.floats(-20, 140, width=32)
     st.floats(0.5, 100, width=32),
     st.floats(0.5, 100, width=32),
 )
-def test_a_box_becomes_a_few_flat_cells_and_nothing_else_changes(
+def test_redaction_flattens_the_box_and_nothing_else(
     seed: int, x: float, y: float, width: float, height: float
 ) -> None:
     image: U8 = np.random.default_rng(seed).integers(0, 256, (90, 120, 3), np.uint8)

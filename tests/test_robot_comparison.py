@@ -115,7 +115,7 @@ def test_what_both_have_is_confirmed_and_nothing_is_missed() -> None:
         assert (said.subject, said.state) in (("object", "confirmed"), ("fused", "found"))
 
 
-def test_what_the_method_has_not_is_missed_with_what_the_fusion_has() -> None:
+def test_objects_that_only_the_fusion_has_count_as_missed() -> None:
     result = ours()
     fused = result.objects
     assert fused is not None and result.clusters is not None
@@ -193,7 +193,7 @@ def test_when_a_camera_has_to_find_a_box_can_be_said(
     assert [e for e in told if e.subject == "object" and said in e.text]
 
 
-def test_how_much_a_detection_without_a_cluster_has_to_overlap_can_be_said() -> None:
+def test_the_overlap_of_unclustered_detections_is_configurable() -> None:
     result = ours()
     fused = result.objects
     assert fused is not None
@@ -360,7 +360,7 @@ def counted(kitti: Drive, by: float | None = 0.0) -> tuple[Counter[str], int, in
     return counts, missed, ours
 
 
-def test_labels_are_confirmed_and_nearly_none_of_our_objects_is_missed(kitti: Drive) -> None:
+def test_labels_are_confirmed_and_few_of_our_objects_missed(kitti: Drive) -> None:
     """What is contradicted is what the small detector does not find: the far and the hidden."""
     counts, missed, ours = counted(kitti)
     assert counts["confirmed"] >= 22 and counts["contradicted"] <= 8 and counts["named otherwise"] <= 2
@@ -375,7 +375,7 @@ def test_labels_five_metres_aside_are_contradicted(kitti: Drive) -> None:
     assert missed >= 0.7 * ours
 
 
-def test_where_a_detection_went_is_as_far_away_as_the_cluster_is_said_to_be(kitti: Drive) -> None:
+def test_distance_of_a_detection_is_that_of_its_cluster(kitti: Drive) -> None:
     """Boxes six metres behind what is labelled: the two distances of a sentence are of one kind."""
     counted = 0
     for result, labelled in kitti:

@@ -92,7 +92,7 @@ def test_both_cameras_of_a_stereo_pair_play_once_each() -> None:
     }
 
 
-def test_variants_of_an_image_count_once_while_no_frame_is_known() -> None:
+def test_variants_of_an_image_count_once_without_frame_ids() -> None:
     live = [Topic(t.name, t.type) for t in TUTORIAL]
     assert cameras(find_roles(live, DEFAULT)) == {"zed": "/zed2/zed/rgb/image_rect_color"}
 
@@ -113,7 +113,7 @@ AUTOWARE = {  # cloud topics of its sensing, below /sensing/lidar, by frame
 }
 
 
-def test_one_lidar_is_not_taken_twice_raw_and_moved_to_the_robots_frame() -> None:
+def test_raw_and_transformed_clouds_count_as_one_lidar() -> None:
     topics = [
         Topic(f"/sensing/lidar/{name}", CLOUD, 9, frame)
         for frame, names in AUTOWARE.items()
@@ -156,7 +156,7 @@ def test_a_radars_cloud_is_not_merged_with_a_lidars(radar: str) -> None:
     assert find_roles(topics[1:], DEFAULT).lidars == (radar,)
 
 
-def test_of_colour_and_infrared_in_one_frame_the_colour_is_taken() -> None:
+def test_colour_is_preferred_to_infrared_in_one_frame() -> None:
     topics = [Topic(f"/kinect/{kind}/image_raw", IMAGE, 9, "camera") for kind in ("ir", "rgb")]
     assert list(cameras(find_roles(topics, DEFAULT)).values()) == ["/kinect/rgb/image_raw"]
 
@@ -393,7 +393,7 @@ def test_a_sensor_called_like_something_else_in_a_recording(name: str) -> None:
     assert name in found
 
 
-def test_the_name_of_every_entity_beside_the_sensors_is_reserved() -> None:
+def test_sensor_names_may_not_be_reserved_entity_names() -> None:
     """They are constants, those of sensors functions."""
     roots = (entities.WORLD, entities.COMPARE, entities.BEV)
     paths = [value for value in vars(entities).values() if isinstance(value, str)]

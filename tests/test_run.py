@@ -156,7 +156,7 @@ def test_a_signal_ends_it_after_the_result_at_hand() -> None:
     assert seen.ended == 1
 
 
-def test_a_signal_between_two_looks_ends_it_after_the_result_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_ends_the_run_after_the_current_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """It may come at any call of the thread that waits, and not only while it sleeps."""
     seen = Seen()
 

@@ -227,7 +227,7 @@ def test_the_links_of_a_robots_description() -> None:
             decode_shapes(make("std_msgs/msg/String", data=wrong), "String", "/robot_description")
 
 
-def test_the_robots_own_picture_and_obstacles_are_shown_where_nothing_of_ours_is(tmp_path: Path) -> None:
+def test_image_and_obstacles_of_the_robot_replace_missing_ones(tmp_path: Path) -> None:
     kinds = {"/points": "PointCloud2", "/lidar/points_no_ground": "PointCloud2"}
     kinds |= {"/visualization/bev_image": "Image", "/camera/image": "Image"}
     topics = [Topic(name, f"sensor_msgs/msg/{kind}", None, name) for name, kind in kinds.items()]

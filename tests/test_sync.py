@@ -190,7 +190,7 @@ def test_static_point_seen_from_a_turning_robot_projects_right(compensated: bool
         np.testing.assert_allclose(camera.world_from_camera, seen, atol=1e-9)
 
 
-def test_transforms_are_awaited_so_that_the_pose_is_interpolated() -> None:
+def test_frames_wait_for_transforms_to_interpolate_the_pose() -> None:
     feed = Feed(replace(ONE, cameras=(), tf=("/tf",)))
     feed.calibration()
     feed.odometry(turning, 0.0, 0.98)
@@ -201,7 +201,7 @@ def test_transforms_are_awaited_so_that_the_pose_is_interpolated() -> None:
     np.testing.assert_allclose(frame.world_from_points, turning(1.01) @ pose(0.3, 0, 1.2), atol=1e-4)
 
 
-def test_waits_no_longer_than_max_wait_and_tells_what_was_missing() -> None:
+def test_a_frame_waits_for_max_wait_and_names_what_was_missing() -> None:
     feed = Feed(ONE, "sync.max_wait=0.3")
     feed.calibration()
     feed.info()
@@ -263,7 +263,7 @@ def test_undecodable_image_is_a_problem_of_its_camera() -> None:
     assert feed.sync.report.warnings()[0] == f"camera 'zed': an image {said}"
 
 
-def test_without_transforms_the_frame_is_made_and_names_the_option() -> None:
+def test_a_frame_without_transforms_names_the_option() -> None:
     feed = Feed()
     feed.info()
     feed.sync.add_cloud(cloud(0.0))
@@ -788,7 +788,7 @@ def test_a_zoom_that_is_told_just_after_its_image() -> None:
     assert [i.K[0, 0] for i in found if i is not None] == [320.0] * 5 + [640.0] * 5
 
 
-def test_a_calibration_that_is_sent_once_is_not_waited_for_again() -> None:
+def test_a_calibration_that_was_sent_once_is_not_awaited_again() -> None:
     feed = Feed()
     feed.calibration()
     feed.info()

@@ -89,7 +89,7 @@ def test_held_past_the_end_within_the_tolerance(robot: TransformBuffer) -> None:
         robot.lookup("rslidar", "map", -SECOND // 2, 0.2)
 
 
-def test_a_held_pose_that_is_stated_again_and_again_holds_until_there_is_another() -> None:
+def test_a_repeated_pose_holds_until_the_next_pose() -> None:
     buffer = TransformBuffer()
     for t in (3.0, 8.0):
         buffer.add(sample("base_link", "camera", t, pose(0.5)), held=True)
@@ -177,7 +177,7 @@ def test_unusable_samples_are_left_out_and_counted(robot: TransformBuffer) -> No
     assert len(robot.problems) == 2 and robot.problems[1].endswith("(2 times)")
 
 
-def test_history_is_bounded_and_a_clock_that_jumps_back_clears_it() -> None:
+def test_history_is_bounded_and_cleared_when_time_jumps_back() -> None:
     buffer = TransformBuffer(duration=5.0)
     for i in range(10_000):
         buffer.add(sample("odom", "base_link", i * 0.01, pose(i)))

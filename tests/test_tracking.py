@@ -80,7 +80,7 @@ def test_the_robots_own_motion_is_no_speed() -> None:
     np.testing.assert_allclose(tracks.boxes.center, [[10, 0, 0.5]], atol=1e-3)
 
 
-def test_without_a_fixed_frame_speeds_are_those_against_the_robot() -> None:
+def test_without_a_fixed_frame_speeds_are_relative_to_the_robot() -> None:
     tracker = Tracker()
     for i in range(20):
         tracks = step(tracker, i, [(30 - 0.8 * i, 2, 0)], CAR, ("car",), lost=True)
@@ -89,7 +89,7 @@ def test_without_a_fixed_frame_speeds_are_those_against_the_robot() -> None:
     np.testing.assert_allclose(tracks.velocity, [[-8, 0, 0]], atol=0.1)
 
 
-def test_a_fast_car_is_caught_from_its_second_frame_on_at_a_low_rate() -> None:
+def test_a_fast_car_is_tracked_from_its_second_frame_on() -> None:
     tracker = Tracker()
     for i in range(8):
         tracks = step(tracker, 5 * i, [(80 - 7 * i, 2, 0)], CAR, ("car",))
@@ -130,7 +130,7 @@ def test_two_who_pass_each_other_keep_their_ids() -> None:
     assert tracks.id[np.argsort(tracks.boxes.center[:, 0])].tolist() == [0, 1]
 
 
-def test_the_class_is_that_of_most_votes_and_is_forgotten_only_in_view() -> None:
+def test_the_class_has_most_votes_and_expires_only_in_view() -> None:
     tracker = Tracker()
     for i in range(10):
         name = "bicycle" if i in (3, 7) else "person"
@@ -276,7 +276,7 @@ def test_figures_of_a_known_mix_up() -> None:
     assert max(tally.speeds) < 0.01
 
 
-def test_true_boxes_of_the_synthetic_drive_are_tracked_without_a_mistake() -> None:
+def test_true_boxes_are_tracked_without_a_mistake() -> None:
     """The tracker alone: what it is given is exact, so every switch and every speed error is its own."""
     few = Lidar(beams=2, azimuths=8), PinholeCamera(width=8, height=4, focal=5.0)
     source = SyntheticSource(frames=20, seed=3, lidar=few[0], camera=few[1])

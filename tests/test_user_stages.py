@@ -331,7 +331,7 @@ def test_what_cannot_be_had_is_one_clear_line(here: Path, settings: list[str], m
         ("objects.method=mine.stages:raising", "objects", "ZeroDivisionError"),
     ],
 )
-def test_what_a_stage_does_wrong_is_a_reason_and_the_frame_lives(
+def test_a_wrong_stage_result_is_a_reason_and_the_frame_goes_on(
     here: Path, frame: Frame, setting: str, stage: str, reason: str
 ) -> None:
     result = Session(configured(setting)).run(frame)
@@ -466,7 +466,7 @@ def test_the_robots_own_stages(robot: Path) -> None:
         assert both.total() >= 0.85 * max(len(theirs.objects), len(mine.objects))
 
 
-def test_image_boxes_of_nobody_knows_which_camera_are_not_those_of_all() -> None:
+def test_image_boxes_of_an_unknown_camera_go_to_no_camera() -> None:
     boxes = np.array([[1, 2, 3, 4]], np.float32)
     found = LabelledBoxes2D("/boxes", 0, "yolo", boxes, ("car",), np.ones(1, np.float32))
     front, rear = (Camera(name, None, None, None, None) for name in ("front", "rear"))

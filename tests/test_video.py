@@ -67,9 +67,7 @@ def numbers(frames: Sequence[Frame]) -> list[int | None]:
         ("vp9", FOXGLOVE),
     ],
 )
-def test_each_scan_gets_the_picture_of_its_stamp_in_order_and_at_random(
-    codec: str, kind: str, tmp_path: Path
-) -> None:
+def test_each_scan_gets_the_video_picture_of_its_stamp(codec: str, kind: str, tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", encode(numbered(30), codec), kind=kind, codec=codec)
     with BagSource([path], load()) as source:
         assert source.roles.cameras[0].kind == "CompressedVideo"
@@ -80,7 +78,7 @@ def test_each_scan_gets_the_picture_of_its_stamp_in_order_and_at_random(
         assert not any("decoded" in warning for warning in source.warnings)
 
 
-def test_pictures_that_need_later_ones_are_those_of_their_packets(tmp_path: Path) -> None:
+def test_pictures_with_b_frames_match_their_packets(tmp_path: Path) -> None:
     packets = encode(numbered(20), b_frames=2)
     path = drive(tmp_path / "drive.mcap", packets, scans=20)
     with BagSource([path], load()) as source:
@@ -105,7 +103,7 @@ def test_a_key_frame_far_back_is_found_and_memory_is_bounded(
             assert numbers(list(sparse)) == [expected[n] for n in (0, 25, 50)]
 
 
-def test_what_comes_before_the_first_key_frame_is_told_in_one_line(tmp_path: Path) -> None:
+def test_packets_before_the_first_key_frame_are_reported_once(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", encode(numbered(30)), lost=range(4))
     with BagSource([path], load()) as source:
         assert numbers(list(source)) == [*[None] * 10, *range(10, 30)]
@@ -115,9 +113,7 @@ def test_what_comes_before_the_first_key_frame_is_told_in_one_line(tmp_path: Pat
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
-def test_lost_packets_cost_the_pictures_that_need_them_and_are_told_in_one_line(
-    codec: str, tmp_path: Path
-) -> None:
+def test_lost_packets_drop_only_the_pictures_that_need_them(codec: str, tmp_path: Path) -> None:
     packets = encode(numbered(30), codec)
     path = drive(tmp_path / "drive.mcap", packets, lost=(13, 14), codec=codec)
     with BagSource([path], load()) as source:
@@ -127,7 +123,7 @@ def test_lost_packets_cost_the_pictures_that_need_them_and_are_told_in_one_line(
         assert "lost" in told[0]
 
 
-def test_a_stream_without_whole_pictures_begins_where_it_says_that_it_recovers() -> None:
+def test_a_stream_without_key_frames_begins_at_a_recovery_point() -> None:
     """As encoders with intra-refresh write it, among other messages in one unit."""
     said, slice_p = b"\0\0\1\x67\x42\0\x1e\0\0\1\x68\xce", b"\0\0\1\x41\x9a"
     long = bytes([5, 255, 3]) + bytes(258)
@@ -138,9 +134,7 @@ def test_a_stream_without_whole_pictures_begins_where_it_says_that_it_recovers()
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
-def test_what_a_stream_says_of_itself_before_each_picture_makes_no_key_frames(
-    codec: str, tmp_path: Path
-) -> None:
+def test_parameter_sets_before_each_picture_are_no_key_frames(codec: str, tmp_path: Path) -> None:
     """Some encoders repeat their parameter sets: each picture was decoded alone, and all but a few failed."""
     packets = encode(numbered(30), codec)
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
@@ -157,7 +151,7 @@ def test_what_a_stream_says_of_itself_before_each_picture_makes_no_key_frames(
         assert number_of(image(source.frame(27)).bgr) == 27  # type: ignore[union-attr]
 
 
-def test_where_packets_do_not_tell_that_one_is_lost_the_gap_is_said(tmp_path: Path) -> None:
+def test_a_gap_is_reported_where_packets_have_no_numbers(tmp_path: Path) -> None:
     packets = encode(numbered(30), "vp9")
     for lost in ((), (20,), (13, 14)):
         path = drive(tmp_path / f"{len(lost)}.mcap", packets, lost=lost, codec="vp9")
@@ -257,7 +251,7 @@ def test_video_can_be_saved_as_images(tmp_path: Path) -> None:
     assert len(recording.column("/world/camera/image", "EncodedImage:blob")) == 30
 
 
-def test_a_part_cut_out_has_the_video_that_its_first_pictures_need(tmp_path: Path) -> None:
+def test_a_cut_out_part_has_the_video_that_it_needs(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", encode(numbered(60), group=60), scans=60)
     target = tmp_path / "cut.mcap"
     with BagSource([path], load()) as source:
@@ -275,7 +269,7 @@ def alone(path: Path) -> Path:
     return videos.write_mcap(path, found, made)
 
 
-def test_cameras_alone_make_frames_and_the_detector_is_explained(
+def test_cameras_alone_make_frames_with_explained_detections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = np.array([[[8, 8, 40, 40, 0.9, 2], [4, 4, 20, 30, 0.1, 0]]], np.float32)

@@ -47,7 +47,7 @@ def test_averages_equal_open3d(points: F32, size: float) -> None:
     assert_equal_to_open3d(points, size, 5e-6)
 
 
-def test_averages_equal_open3d_where_cell_indices_outgrow_64_bits() -> None:
+def test_averages_equal_open3d_where_indices_exceed_64_bits() -> None:
     clump = np.random.default_rng(1).uniform(-2, 2, (500, 3))
     corners = np.array([[0, 0, 0], [1e6, 1e6, 1e6], [-1e6, 1e6, -1e6], [-1e6, -1e6, 3e6]])
     points = (corners[:, None] + clump).reshape(-1, 3).astype(np.float32)

@@ -220,7 +220,7 @@ def test_the_fates_add_up() -> None:
         assert numbers(answer, "raw cloud")["points"] == there.sum()
 
 
-def test_a_pixel_lists_all_that_lies_there_and_begins_with_what_it_shows() -> None:
+def test_a_pixel_lists_its_objects_with_the_visible_one_first() -> None:
     """A cyclist that is missed before a car: neither the pixel nor the box is answered for the car."""
     shot, questioner = at("merged_people"), FrameExplainer(run("merged_people", "default"), classes=CLASSES)
     asked_for = 0
@@ -272,7 +272,7 @@ def test_a_cell_of_the_birds_eye_view_is_the_column_over_it() -> None:
         questioner.ask(Selection(cell=(900, 3)))
 
 
-def test_a_track_is_its_cluster_or_the_place_where_it_is_expected() -> None:
+def test_a_track_is_its_cluster_or_its_expected_place() -> None:
     source, session = SyntheticSource(20, seed=3), Session(config_of("default"))
     for index in range(6):
         result = session.run(source.frame(index))
@@ -321,7 +321,7 @@ def test_the_nearest_missed_is_near_and_missed() -> None:
     assert [a.distance for a in missed] == sorted(a.distance for a in missed)
 
 
-def test_weak_detections_are_not_told_unasked_and_the_surest_comes_first() -> None:
+def test_weak_detections_are_told_only_on_request() -> None:
     result = run("merged_people", "default")
     blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
     told, everything = (blind.explain(Selection(), 0, everything=flag) for flag in (False, True))
@@ -337,7 +337,7 @@ def test_weak_detections_are_not_told_unasked_and_the_surest_comes_first() -> No
 # --- stages that did not run -------------------------------------------------------------------
 
 
-def test_without_a_model_or_an_image_the_detector_is_not_said_to_have_looked() -> None:
+def test_without_a_model_no_detector_is_said_to_have_looked() -> None:
     frame = at("merged_people").frame
     lens = replace(frame.cameras[0], image=None, problems=("no image within 0.1 s",))
     no_model = Session(load()).run(frame)
@@ -551,7 +551,7 @@ def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
     assert [step["stage"] for step in answer["chain"]][:3] == ["camera zed", "raw cloud", "occlusion"]
 
 
-def test_a_number_below_zero_a_scan_by_its_number_and_what_is_folded(bag: Path, capsys: Capture) -> None:
+def test_frames_are_chosen_by_negative_or_scan_numbers(bag: Path, capsys: Capture) -> None:
     command = ["why", str(bag), "--model", "demo"]
     assert main([*command, "--at-frame", "0", "--point", "-5,1,-1.9"]) == 0
     said = capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_changes_that_help_together_only_are_named_together() -> None:
             assert again("reference", alone).verdict.reason is not Reason.REPORTED, setting
 
 
-def test_a_change_of_limits_is_named_where_the_detection_is_its_own_without_a_doubt() -> None:
+def test_a_change_of_limits_is_named_for_a_certain_detection() -> None:
     """Too small, and then the score is too low: three settings, of two stages, for a box that fits."""
     (answer,) = near("default")
     keys = [setting.partition("=")[0] for setting in answer.hints[0].settings]
@@ -74,7 +74,7 @@ def test_a_change_of_limits_is_named_where_the_detection_is_its_own_without_a_do
     assert max(c.overlap for c in after.evidence.candidates if c.row == named.detection) >= SURE
 
 
-def test_where_nothing_helps_it_is_said_how_far_what_was_tried_goes() -> None:
+def test_without_a_remedy_the_tried_range_is_stated() -> None:
     vain = [a for a in near("reference") if not a.hints and a.verdict.reason is not Reason.REPORTED]
     searches = [questioner("reference").search(a) for a in vain]
     assert any(search.furthest for search in searches)

@@ -755,7 +755,7 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
         bench.close()
 
 
-def test_a_frame_shows_nothing_of_those_that_a_page_has_got_before(bag: Path, tmp_path: Path) -> None:
+def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) -> None:
     """It was drawn before all others, or came before those just before it."""
     from rerun.chunk import RrdReader
 
