@@ -100,7 +100,7 @@ class Drive:
             self.frame([(8, 0, 0)], PERSON, ("person",), **more)
 
 
-def test_a_quiet_drive_has_none() -> None:
+def test_a_quiet_drive_has_no_anomalies() -> None:
     drive = Drive()
     for i in range(20):
         drive.frame([(10, 0.14 * i, 0), (30 - 0.8 * i, 3, 0)], [PERSON, CAR], ("person", "car"))
@@ -108,7 +108,7 @@ def test_a_quiet_drive_has_none() -> None:
     assert str(drive.summary) == "none"
 
 
-def test_an_object_that_the_detector_no_longer_sees() -> None:
+def test_an_object_lost_by_the_detector_is_found() -> None:
     drive = Drive()
     drive.person(12)
     for _ in range(6):
@@ -117,7 +117,7 @@ def test_an_object_that_the_detector_no_longer_sees() -> None:
     assert drive.said == [(15, "one_sensor", text)]
 
 
-def test_a_longer_past_is_a_stronger_witness() -> None:
+def test_the_loss_of_a_longer_track_is_reported_sooner() -> None:
     told = []
     for frames in (8, 12, 40):
         drive = Drive()
@@ -129,7 +129,7 @@ def test_a_longer_past_is_a_stronger_witness() -> None:
     assert told[-1] == 2  # in the third frame
 
 
-def test_no_surprise_that_the_past_explains() -> None:
+def test_a_loss_that_earlier_frames_explain_is_none() -> None:
     """An object that is found in every other frame is not missed."""
     drive = Drive()
     for i in range(30):
@@ -149,7 +149,7 @@ WALL = [(4.0, y, z) for y in np.linspace(-1, 1, 80) for z in np.linspace(-1.5, 1
         {"camera": replace(CAMERA, camera_from_points=geometry.transform((0, 0, 0), (0, 0, 0, 1)))},
     ],
 )
-def test_what_is_excused(excuse: dict[str, Any]) -> None:
+def test_excused_losses_are_no_anomalies(excuse: dict[str, Any]) -> None:
     drive = Drive()
     drive.person(12)
     for _ in range(6):
@@ -157,7 +157,7 @@ def test_what_is_excused(excuse: dict[str, Any]) -> None:
     assert [kind for _, kind, _ in drive.said if kind != "tf"] == []
 
 
-def test_a_class_that_is_gone_altogether_is_told_sooner() -> None:
+def test_a_class_that_disappears_is_reported_sooner() -> None:
     drive = Drive()
     places = [(8, 0, 0), (10, 2, 0), (12, -2, 0)]
     for _ in range(12):
@@ -169,7 +169,7 @@ def test_a_class_that_is_gone_altogether_is_told_sooner() -> None:
     )  # fmt: skip
 
 
-def test_an_object_that_the_lidar_no_longer_sees() -> None:
+def test_an_object_lost_by_the_lidar_is_found() -> None:
     drive = Drive()
     drive.person(12)
     for _ in range(6):
@@ -178,14 +178,14 @@ def test_an_object_that_the_lidar_no_longer_sees() -> None:
     assert (15, "one_sensor", text) in drive.said
 
 
-def test_a_box_that_jumps() -> None:
+def test_a_box_that_jumps_is_found() -> None:
     drive = Drive()
     drive.person(12)
     drive.frame([(8, 1.4, 0)], PERSON, ("person",))
     assert drive.said == [(12, "jump", "person #0: 1.4 m from where it was expected")]
 
 
-def test_a_box_that_jumps_out_of_its_track() -> None:
+def test_a_box_that_jumps_out_of_its_track_is_found() -> None:
     drive = Drive()
     drive.person(12)
     drive.frame([(10, 0, 0)], PERSON, ("person",))
@@ -194,7 +194,7 @@ def test_a_box_that_jumps_out_of_its_track() -> None:
     assert drive.said == [(12, "jump", "person #0: 2.0 m from where it was expected, as a new track")]
 
 
-def test_no_jump_of_what_is_measured_in_another_length() -> None:
+def test_a_changed_box_length_is_no_jump() -> None:
     """Two that are merged, or a car of which more comes into view."""
     drive = Drive()
     drive.person(12)
@@ -202,7 +202,7 @@ def test_no_jump_of_what_is_measured_in_another_length() -> None:
     assert drive.said == []
 
 
-def test_what_only_the_camera_sees() -> None:
+def test_objects_that_only_the_camera_sees_are_found() -> None:
     """The LiDAR sees the wall behind it; where it sees nothing of what is near, nothing can be said."""
     behind = [(20.0, y, z) for y in np.linspace(-2, 2, 80) for z in np.linspace(-2, 2, 80)]
     for points, said in ((behind, 1), (WALL, 0), ((), 0)):
@@ -220,7 +220,7 @@ def test_detections_at_other_places_are_not_one_object() -> None:
     assert drive.said == []
 
 
-def test_the_worst_comes_first() -> None:
+def test_the_worst_anomaly_comes_first() -> None:
     drive = Drive()
     drive.person(12)
     late = replace(CAMERA, sync_error=-0.06, camera_from_points=None)
@@ -229,7 +229,7 @@ def test_the_worst_comes_first() -> None:
     assert kinds[:2] == ["tf", "sync"]
 
 
-def test_clocks_and_images() -> None:
+def test_wrong_clocks_and_late_images_are_found() -> None:
     drive = Drive()
     late = replace(CAMERA, sync_error=-0.06)
     for camera in (CAMERA, late, late, replace(CAMERA, image=None, sync_error=float("nan"))):
@@ -238,7 +238,7 @@ def test_clocks_and_images() -> None:
     assert [a.text for a in drive.frame()] == ["zed has no image at the time of the cloud"]
 
 
-def test_transforms_that_are_lost_or_old() -> None:
+def test_lost_and_old_transforms_are_found() -> None:
     drive = Drive(hold=0.1)
     lost = replace(CAMERA, camera_from_points=None)
     drive.frame(camera=lost)  # it was never there
@@ -252,7 +252,7 @@ def test_transforms_that_are_lost_or_old() -> None:
     ]
 
 
-def test_stages_that_fail_or_take_long() -> None:
+def test_failing_and_slow_stages_are_found() -> None:
     drive = Drive(stage_time=0.1)
     drive.frame(timings={"ground": 0.05})
     drive.frame(timings={"ground": 0.2}, failures=(Failure("fusion", "ZeroDivisionError: planted"),))
@@ -262,7 +262,7 @@ def test_stages_that_fail_or_take_long() -> None:
     ]
 
 
-def test_what_lasts_is_one_and_is_held_for_a_while() -> None:
+def test_a_lasting_anomaly_is_one_and_is_held() -> None:
     drive = Drive(hold=0.3)
     late = replace(CAMERA, sync_error=0.08)
     shown = [len(drive.frame(camera=late if i in (1, 3) else CAMERA)) for i in range(10)]
@@ -283,7 +283,7 @@ def test_news_is_told_once_if_its_first_frame_was_skipped() -> None:
     assert onsets.of([replace(two, since=9)]) == [replace(two, since=9)]
 
 
-def test_a_drive_that_starts_anew() -> None:
+def test_a_new_drive_forgets_the_old_one() -> None:
     drive = Drive()
     late = replace(CAMERA, sync_error=0.08)
     drive.frame(camera=late)

@@ -110,7 +110,7 @@ def test_messages_come_back_as_written(tmp_path: Path, form: str, compression: s
 
 
 @pytest.mark.parametrize("form", ["mcap", "sqlite3"])
-def test_a_lone_file_and_a_folder_without_metadata(tmp_path: Path, form: str) -> None:
+def test_files_and_folders_without_metadata_are_read(tmp_path: Path, form: str) -> None:
     bag = make(tmp_path, form)
     assert len(frames_of(storage_file(bag))) == 30
     (bag / "metadata.yaml").unlink()
@@ -119,7 +119,7 @@ def test_a_lone_file_and_a_folder_without_metadata(tmp_path: Path, form: str) ->
         assert any("metadata.yaml is missing" in w for w in source.warnings)
 
 
-def test_the_kind_of_file_is_told_by_its_content(tmp_path: Path) -> None:
+def test_the_file_type_is_recognized_by_its_content(tmp_path: Path) -> None:
     lone = tmp_path / "recording"
     storage_file(make(tmp_path)).rename(lone)
     assert len(frames_of(lone)) == 30
@@ -142,7 +142,7 @@ def test_several_bags_are_one_recording_in_order_of_time(tmp_path: Path) -> None
         assert scans(frames_of(*paths)) == list(range(30))
 
 
-def test_a_folder_of_split_files(tmp_path: Path) -> None:
+def test_a_folder_of_split_files_is_one_recording(tmp_path: Path) -> None:
     items = bags.small_items()
     bag = tmp_path / "split"
     bag.mkdir()
@@ -180,7 +180,7 @@ def test_messages_outside_chunks_may_be_out_of_order(tmp_path: Path) -> None:
 # --- parts -------------------------------------------------------------------------------------
 
 
-def test_start_and_end(tmp_path: Path) -> None:
+def test_start_and_end_limit_the_frames(tmp_path: Path) -> None:
     bag = make(tmp_path)
     assert scans(frames_of(bag, start="1.0", end="1.5")) == [10, 11, 12, 13, 14]
     stamp = bags.START / 1e9
@@ -190,7 +190,7 @@ def test_start_and_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
-def test_what_is_published_once_holds_after_start(tmp_path: Path, form: str) -> None:
+def test_latched_messages_before_start_still_hold(tmp_path: Path, form: str) -> None:
     messages = bags.Messages(form == "ros1")
     items = bags.small_items(messages)
     once = [i for i in items if i.topic == bags.INFO][:1]
@@ -205,7 +205,7 @@ def test_what_is_published_once_holds_after_start(tmp_path: Path, form: str) -> 
     assert frame.world_from_points is not None
 
 
-def test_every_and_frames(tmp_path: Path) -> None:
+def test_every_and_frames_select_frames(tmp_path: Path) -> None:
     bag = make(tmp_path)
     assert scans(frames_of(bag, every=10)) == [0, 10, 20]
     assert scans(frames_of(bag, frames=(3, 6))) == [3, 4, 5]
@@ -218,7 +218,7 @@ def test_every_and_frames(tmp_path: Path) -> None:
         assert source.total == len(list(source)) == 6
 
 
-def test_the_scan_at_a_time(tmp_path: Path) -> None:
+def test_the_scan_nearest_to_a_time_is_returned(tmp_path: Path) -> None:
     bag = make(tmp_path)
     for time, number in (("0", 0), ("1.04", 10), ("1.07", 11), ("2.9", 29)):
         (frame,) = frames_of(bag, at=time)
@@ -234,7 +234,7 @@ def test_the_scan_at_a_time(tmp_path: Path) -> None:
     first=st.none() | st.integers(-12, 12),
     last=st.none() | st.integers(-12, 12),
 )
-def test_parts_are_python_slices(
+def test_frame_ranges_work_like_python_slices(
     tmp_path_factory: pytest.TempPathFactory, every: int, first: int | None, last: int | None
 ) -> None:
     bag = tmp_path_factory.getbasetemp() / "sliced"
@@ -248,7 +248,7 @@ def test_parts_are_python_slices(
     assert scans(frames_of(bag, every=every, frames=(first, last))) == expected
 
 
-def test_what_is_skipped_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skipped_messages_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded: list[str] = []
     original = Recording.decode
 
@@ -263,7 +263,7 @@ def test_what_is_skipped_is_not_decoded(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("text", ["soon", "-1", "nan", "2026-13-01"])
-def test_a_time_that_is_none(text: str) -> None:
+def test_an_invalid_time_is_refused(text: str) -> None:
     with pytest.raises(UserError, match="is no time"):
         parse_time(text, 0)
 
@@ -342,7 +342,7 @@ def test_a_cut_at_any_byte_never_gives_wrong_messages(
         assert found == whole[: len(found)]
 
 
-def test_a_cut_compressed_file(tmp_path: Path) -> None:
+def test_a_cut_compressed_file_yields_what_precedes_the_cut(tmp_path: Path) -> None:
     bag = make(tmp_path, "mcap", "file", scans=60)
     file = storage_file(bag)
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
@@ -418,18 +418,18 @@ def test_a_recorder_that_was_killed_leaves_an_unindexed_bag(tmp_path: Path) -> N
 # --- what is no bag ----------------------------------------------------------------------------
 
 
-def test_a_missing_file(tmp_path: Path) -> None:
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"nowhere\.mcap: no such file or folder"):
         frames_of(tmp_path / "nowhere.mcap")
 
 
-def test_a_folder_without_a_bag(tmp_path: Path) -> None:
+def test_a_folder_without_a_bag_is_one_line(tmp_path: Path) -> None:
     make(tmp_path)
     with pytest.raises(UserError, match=r"a folder without a bag.*there are bags in its folders: drive"):
         frames_of(tmp_path)
 
 
-def test_an_empty_file(tmp_path: Path) -> None:
+def test_an_empty_file_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "empty.mcap"
     path.touch()
     with pytest.raises(UserError, match=r"empty\.mcap: the file is empty"):
@@ -437,7 +437,7 @@ def test_an_empty_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
-def test_an_empty_bag(tmp_path: Path, form: str) -> None:
+def test_an_empty_bag_is_one_line(tmp_path: Path, form: str) -> None:
     bag = bags.write(tmp_path / "empty.bag", [], form=form, topics=[(bags.CLOUD, CLOUD)])
     with pytest.raises(UserError, match=r"empty\.bag: there are no messages in it"):
         frames_of(bag)
@@ -454,7 +454,7 @@ def test_an_empty_bag(tmp_path: Path, form: str) -> None:
         (b"SQLite format 3\0" + bytes(2000), "nothing of it is left"),
     ],
 )
-def test_other_files(tmp_path: Path, head: bytes, what: str) -> None:
+def test_files_of_other_types_are_refused(tmp_path: Path, head: bytes, what: str) -> None:
     path = tmp_path / "drive.mcap"
     path.write_bytes(head)
     with pytest.raises(UserError, match=what):
@@ -462,7 +462,7 @@ def test_other_files(tmp_path: Path, head: bytes, what: str) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_one_line(tmp_path: Path) -> None:
     path = storage_file(make(tmp_path))
     path.chmod(0)
     with pytest.raises(UserError, match="permission denied"):
@@ -478,7 +478,7 @@ def test_one_bad_file_among_several_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
-def test_a_lidar_topic_without_messages(tmp_path: Path, form: str) -> None:
+def test_a_lidar_topic_without_messages_is_one_line(tmp_path: Path, form: str) -> None:
     messages = bags.Messages(form == "ros1")
     items = [i for i in bags.small_items(messages) if i.topic != bags.CLOUD]
     path = bags.write(tmp_path / "drive.bag", items, messages, form=form, topics=[(bags.CLOUD, CLOUD)])
@@ -493,7 +493,7 @@ def test_the_lidar_topic_that_is_offered_has_messages(tmp_path: Path) -> None:
     assert frames_of(path, config=load(settings=["source.lidar_topics=[/velodyne_points]"]))
 
 
-def test_no_lidar(tmp_path: Path) -> None:
+def test_a_bag_without_a_lidar_is_one_line(tmp_path: Path) -> None:
     path = bags.write(
         tmp_path / "drive", [i for i in bags.small_items() if i.topic not in (bags.CLOUD, bags.IMAGE)]
     )
@@ -523,7 +523,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["000000", "000001"])
 @pytest.mark.parametrize("form", ["mcap", "ros1"])
-def test_projection_is_that_of_kitti(shared: Path, tmp_path: Path, name: str, form: str) -> None:
+def test_projection_equals_kittis(shared: Path, tmp_path: Path, name: str, form: str) -> None:
     messages = bags.Messages(form == "ros1")
     items = bags.kitti_items(shared, messages, [name])
     (frame,) = frames_of(bags.write(tmp_path / "kitti.bag", items, messages, form=form))
@@ -554,7 +554,7 @@ def test_images_pass_through_untouched(shared: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(plain.cameras[0].image.bgr, image.bgr)
 
 
-def test_roles_set_by_hand(tmp_path: Path) -> None:
+def test_stated_roles_are_used(tmp_path: Path) -> None:
     bag = make(tmp_path)
     with BagSource([bag], load(settings=[f"source.camera_topics=[{bags.IMAGE}]"])) as source:
         assert source.roles.cameras[0].topic == bags.IMAGE

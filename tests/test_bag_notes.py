@@ -20,7 +20,7 @@ def bag(tmp_path: Path) -> Path:
     return tmp_path / "drive.mcap"
 
 
-def test_they_are_kept_in_order_and_found_by_time(bag: Path) -> None:
+def test_notes_are_kept_in_order_and_found_by_time(bag: Path) -> None:
     notes = Notes([bag, bag.with_name("second.mcap")])
     for note in (LATE, EARLY):
         notes.add(note)
@@ -34,14 +34,14 @@ def test_they_are_kept_in_order_and_found_by_time(bag: Path) -> None:
 
 
 @given(text=st.text(min_size=1, max_size=50).filter(str.strip))
-def test_any_text_comes_back(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+def test_any_text_of_a_note_is_read_back(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     notes = Notes([tmp_path_factory.mktemp("notes") / "drive.mcap"])
     notes.add(Note(1, 2, text))
     assert [note.text for note in notes] == [text]
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"notes": [{"stamp": 1}]}', '{"notes": 3}'])
-def test_a_file_that_holds_none_is_left_as_it_is(bag: Path, content: str) -> None:
+def test_a_file_without_notes_is_left_unchanged(bag: Path, content: str) -> None:
     notes = Notes([bag])
     notes.path.write_text(content)
     with pytest.raises(UserError, match="holds no notes"):
@@ -51,20 +51,20 @@ def test_a_file_that_holds_none_is_left_as_it_is(bag: Path, content: str) -> Non
     assert notes.path.read_text() == content
 
 
-def test_where_it_cannot_be_written_it_says_so(bag: Path) -> None:
+def test_an_unwritable_notes_file_is_reported(bag: Path) -> None:
     notes = Notes([bag.parent / "missing" / "drive.mcap"])
     with pytest.raises(UserError, match="cannot write the notes: No such file or directory"):
         notes.add(LATE)
 
 
 @pytest.mark.parametrize("text", ["", "  \n", "x" * 3000])
-def test_a_note_says_something_and_no_book(bag: Path, text: str) -> None:
+def test_empty_and_overlong_notes_are_refused(bag: Path, text: str) -> None:
     with pytest.raises(UserError, match="characters"):
         Notes([bag]).add(Note(1, 2, text))
     assert not list(bag.parent.iterdir())
 
 
-def test_they_are_plain_json(bag: Path) -> None:
+def test_notes_are_plain_json(bag: Path) -> None:
     Notes([bag]).add(EARLY)
     (note,) = json.loads(Notes([bag]).path.read_text())["notes"]
     assert note == {

@@ -112,7 +112,7 @@ def jobs_of(batch: Batch, model: str, **settings: Any) -> list[Job]:
 # --- what is done ------------------------------------------------------------------------------
 
 
-def test_a_worker_that_dies_and_a_bad_bag_cost_nothing_else(batch: Batch) -> None:
+def test_dead_workers_and_bad_bags_cost_nothing_else(batch: Batch) -> None:
     assert batch.killed
     assert batch.status == 1
     assert "bad: " in batch.said and "not a bag" in batch.said
@@ -127,7 +127,7 @@ def test_a_worker_that_dies_and_a_bad_bag_cost_nothing_else(batch: Batch) -> Non
     assert len(Recording(batch.folder / "one-drive.rrd").rows["/bev"]) == SCANS
 
 
-def test_only_what_is_missing_or_out_of_date_is_left_to_do(batch: Batch, model: str) -> None:
+def test_only_missing_or_outdated_bags_are_run(batch: Batch, model: str) -> None:
     def left(**settings: Any) -> set[str]:
         return {job.name for job in unfinished_jobs(jobs_of(batch, model, **settings), force=False)}
 
@@ -142,7 +142,7 @@ def test_only_what_is_missing_or_out_of_date_is_left_to_do(batch: Batch, model: 
     assert left() == {"bad"}
 
 
-def test_without_its_recording_a_table_counts_for_nothing(batch: Batch, model: str, tmp_path: Path) -> None:
+def test_a_table_without_its_recording_is_ignored(batch: Batch, model: str, tmp_path: Path) -> None:
     shutil.copytree(batch.folder, tmp_path / "runs")
     other = Batch(batch.root, 0, "", [])
     jobs = [
@@ -155,7 +155,7 @@ def test_without_its_recording_a_table_counts_for_nothing(batch: Batch, model: s
     assert {job.name for job in unfinished_jobs(jobs, force=True)} == {"bad", *GOOD}
 
 
-def test_an_interrupted_batch_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_batch_can_be_continued(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, scans in (("long", 400), ("short", 2)):
         bags.write(tmp_path / "bags" / name, bags.small_items(scans=scans))
     arguments = ["batch", str(tmp_path / "bags"), "-o", str(tmp_path / "runs"), "--jobs", "2"]
@@ -231,7 +231,7 @@ def test_death_of_a_dask_worker_loses_and_repeats_no_bag(
 # --- the summary -------------------------------------------------------------------------------
 
 
-def test_the_summary_says_what_a_direct_run_says(batch: Batch, model: str) -> None:
+def test_the_summary_agrees_with_a_direct_run(batch: Batch, model: str) -> None:
     config = load(None, [f"detector.model={model}", WEAK])
     with BagSource([batch.root / "bags/kitti"], config) as source:
         session = Session(config)
@@ -259,7 +259,7 @@ def test_the_summary_says_what_a_direct_run_says(batch: Batch, model: str) -> No
     assert found[0]["matched"] > 0 and "person" in found[0]["unmatched"]
 
 
-def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
+def test_badness_weighs_the_findings_of_a_frame(batch: Batch) -> None:
     config = Config()
     with BagSource([batch.root / "bags/one/drive"], config) as source:
         session = Session(config)
@@ -278,7 +278,7 @@ def test_badness_weighs_what_went_wrong(batch: Batch) -> None:
     assert "late" in empty["remarks"]
 
 
-def test_the_page_stands_on_its_own(batch: Batch) -> None:
+def test_the_page_needs_no_other_files(batch: Batch) -> None:
     text = (batch.folder / "summary.html").read_text()
     page = Page(text)
     assert not {"script", "link", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
@@ -341,7 +341,7 @@ def test_frames_are_counted_by_their_worst_finding(batch: Batch) -> None:
 # --- the catalog -------------------------------------------------------------------------------
 
 
-def test_a_query_across_the_recordings_of_a_catalog(
+def test_a_query_reads_all_recordings_of_a_catalog(
     batch: Batch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
@@ -378,7 +378,7 @@ def test_a_query_across_the_recordings_of_a_catalog(
     assert answer == wanted != set()
 
 
-def test_a_recording_made_anew_takes_the_place_of_the_old_one(batch: Batch, tmp_path: Path) -> None:
+def test_a_new_recording_replaces_the_old_one(batch: Batch, tmp_path: Path) -> None:
     pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
     from bevviz.fleet.catalog import register
 
@@ -427,7 +427,7 @@ def test_bags_are_found_in_folders_and_by_pattern(tmp_path: Path) -> None:
     assert [bag.name for bag in find_bags([tmp_path / "**/*.mcap"])] == ["a.mcap", "drive_0.mcap"]
 
 
-def test_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
     runs = tmp_path / "runs"
 

@@ -56,7 +56,7 @@ def test_every_point_of_a_bag_is_counted_in_its_recording(
     assert logged_points(Path("part.rrd")) == 1000
 
 
-def test_what_counts_as_the_same_clusters() -> None:
+def test_clusters_are_equal_up_to_their_numbers() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal(at, 0.2, (200, 3)) for at in (0, 5, 10)]).astype(np.float32)
     labels = dbscan(points, 0.5, 50)
@@ -79,7 +79,7 @@ def test_scans_side_by_side_are_no_denser_than_one() -> None:
     assert points[400:800, 1].min() > points[:400, 1].max()
 
 
-def test_sides_take_turns() -> None:
+def test_interleaved_sides_take_turns() -> None:
     said: list[str] = []
     times = interleaved(2, lambda: said.append("a"), lambda: said.append("b"))
     assert "".join(said) == "ab" + "abab"
@@ -132,7 +132,7 @@ def test_the_rule_judges_answers_about_planted_faults(
     assert noise["right"] == noise["asked"] == all_["right"] and len(bench.tally.wrong) > 50
 
 
-def test_a_section_takes_the_place_of_its_older_self_alone(tmp_path: Path) -> None:
+def test_a_section_replaces_only_its_older_version(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Title\n\n## One\n\nold\n\n## Two\n\nkept\n")
     write_section(page, "## One\n\nnew\n")
@@ -153,7 +153,7 @@ def test_the_page_has_a_section_for_each_benchmark() -> None:
         assert page.count(f"\n{heading}\n") == 1, heading
 
 
-def test_targets_are_not_on_the_page() -> None:
+def test_targets_are_kept_off_the_page() -> None:
     assert (
         performance.without_target("| a | b | 1 s | 2 s | 2 x | 3 x | same |")
         == "| a | b | 1 s | 2 s | 2 x | same |"

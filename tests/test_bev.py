@@ -57,7 +57,9 @@ def expected(points: F32, objects: Objects | None) -> U8:
 
 @given(clouds, st.lists(st.tuples(metres, metres, st.floats(0.1, 5), st.floats(0.1, 5)), max_size=4))
 @settings(max_examples=60, deadline=None)
-def test_reference_image_pixel_for_pixel(points: F32, found: list[tuple[float, float, float, float]]) -> None:
+def test_the_reference_image_is_equal_pixel_for_pixel(
+    points: F32, found: list[tuple[float, float, float, float]]
+) -> None:
     objects = None
     if found:
         b = boxes([[x, y, 0] for x, y, _, _ in found], [[a, b, 1] for _, _, a, b in found])
@@ -66,7 +68,7 @@ def test_reference_image_pixel_for_pixel(points: F32, found: list[tuple[float, f
     np.testing.assert_array_equal(result.image, expected(points, objects))
 
 
-def test_reference_image_of_a_real_scan(shared: Path) -> None:
+def test_the_reference_image_of_a_real_scan_is_equal(shared: Path) -> None:
     scan = np.fromfile(shared / "kitti/velodyne/000000.bin", np.float32).reshape(-1, 4)
     points = np.ascontiguousarray(scan[:, :3])
     objects = named(boxes([[8.7, -1.9, -0.7]], [[0.5, 1.2, 1.9]]), "person")
@@ -91,7 +93,7 @@ def test_a_point_falls_on_its_pixel(x: float, y: float, row: int, column: int) -
 
 
 @pytest.mark.parametrize(("x", "y"), [(10.01, 0), (0, 10.01), (-10.0, 0), (0, -10.0), (1e30, 0), (np.nan, 0)])
-def test_a_point_outside_is_left_out(x: float, y: float) -> None:
+def test_a_point_outside_the_image_is_left_out(x: float, y: float) -> None:
     assert not bev(np.array([[x, y, 0]], np.float32), None, None, None, None, REFERENCE).image.any()
 
 
@@ -100,7 +102,7 @@ CHANNELS = ("density", "height", "intensity", "occupancy")
 
 @given(clouds, st.data())
 @settings(max_examples=40, deadline=None)
-def test_channels_against_plain_numpy(points: F32, data: st.DataObject) -> None:
+def test_channels_equal_plain_numpy(points: F32, data: st.DataObject) -> None:
     n = len(points)
     intensity = data.draw(hnp.arrays(np.uint8, n))
     ground = data.draw(hnp.arrays(np.bool_, n))
@@ -128,7 +130,7 @@ def test_channels_against_plain_numpy(points: F32, data: st.DataObject) -> None:
     np.testing.assert_array_equal(result.channels["occupancy"], np.where(solid, 100, np.where(seen, 0, -1)))
 
 
-def test_only_the_channels_asked_for_and_possible() -> None:
+def test_only_requested_and_possible_channels_are_made() -> None:
     points = np.zeros((3, 3), np.float32)
     for style in ("rich", "reference"):
         config = BevConfig(style=style, channels=("height", "occupancy", "intensity"))
@@ -169,7 +171,7 @@ def test_rich_style_turns_the_boxes() -> None:
 
 @given(clouds, st.data())
 @settings(max_examples=15, deadline=None)
-def test_rich_style_against_plain_python(points: F32, data: st.DataObject) -> None:
+def test_rich_style_equals_plain_python(points: F32, data: st.DataObject) -> None:
     ground = data.draw(hnp.arrays(np.bool_, len(points)))
     config = BevConfig(range_x=8, range_y=5, resolution=0.5, channels=CHANNELS)
     result = bev(points, np.zeros(len(points)), ground, None, None, config)

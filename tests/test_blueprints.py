@@ -55,7 +55,7 @@ def save(layout: rrb.Blueprint, path: Path) -> Path:
     return path
 
 
-def test_names() -> None:
+def test_every_layout_is_listed() -> None:
     assert {"debug", "live", "bug_report"} <= set(blueprints.names())
 
 
@@ -77,7 +77,7 @@ def test_the_eye_follows_the_robot_and_the_explained_object(tmp_path: Path) -> N
     assert near["EyeControls3D:position"] == [[4, 2, 1.5]]
 
 
-def test_the_look_from_above_begins_ahead(tmp_path: Path) -> None:
+def test_the_view_from_above_starts_ahead_of_the_robot(tmp_path: Path) -> None:
     scene = SCENES["one camera"]
     path = save(blueprints.load("debug", scene, load()), tmp_path / "layout.rbl")
     _, above = properties(path)["Bird's-eye view"]
@@ -133,7 +133,7 @@ def test_the_layout_of_a_calibration_has_every_camera(scene: Scene, tmp_path: Pa
     assert ("image time, ms" in found) == bool(scene.cameras)
 
 
-def test_a_users_own_python_file(tmp_path: Path) -> None:
+def test_a_python_file_of_the_user_is_a_layout(tmp_path: Path) -> None:
     own = tmp_path / "own.py"
     own.write_text(
         textwrap.dedent("""
@@ -171,7 +171,7 @@ def test_a_saved_layout_is_sent_on_as_it_is(tmp_path: Path) -> None:
         ("a.rbl", "", "a.rbl: "),
     ],
 )
-def test_a_file_that_makes_no_layout(name: str, text: str, message: str, tmp_path: Path) -> None:
+def test_a_file_without_a_layout_is_one_line(name: str, text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(UserError, match=message) as caught:
@@ -188,12 +188,12 @@ def test_a_file_that_makes_no_layout(name: str, text: str, message: str, tmp_pat
         ("/nonexistent/a.rbl", "no such file"),
     ],
 )
-def test_unknown_names(name: str, message: str) -> None:
+def test_an_unknown_layout_is_one_line(name: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         blueprints.load(name, SCENES["lidar only"])
 
 
-def test_installed_beside_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layouts_are_installed_with_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in the wheel: blueprints/ inside the package's folder goes first."""
     package = tmp_path / "bevviz"
     (package / "blueprints").mkdir(parents=True)

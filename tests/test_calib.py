@@ -65,7 +65,7 @@ def findings(result: Calibration) -> dict[str, str]:
     ],
     ids=str,
 )
-def test_what_was_planted_is_found(drive: Drive, planted: dict[str, float]) -> None:
+def test_planted_errors_are_found(drive: Drive, planted: dict[str, float]) -> None:
     result = drive.calibrate(offsets(**planted))
     for axis in result.axes:
         near = {"deg": 0.2, "cm": 2.0, "ms": 10.0}[axis.axis.unit]
@@ -128,7 +128,7 @@ def test_the_correction_undoes_the_error(drive: Drive) -> None:
     )
 
 
-def test_the_gradient_is_that_of_the_score(drive: Drive) -> None:
+def test_the_gradient_equals_differences_of_the_score(drive: Drive) -> None:
     shots = []
     for shot in gather(drive.planted(offsets(ry=0.1)), ["zed"], drive.pose)["zed"].shots[:2]:
         uv, _ = geometry.project(
@@ -204,7 +204,7 @@ def covers(result: Calibration, **planted: float) -> bool:
     return all(abs(axis.offset - planted.get(axis.axis.name, 0.0)) < axis.interval for axis in relied)
 
 
-def test_kitti_is_near_zero(kitti: list[Frame]) -> None:
+def test_errors_of_kittis_calibration_are_near_zero(kitti: list[Frame]) -> None:
     """Six frames, no motion: the turns are sure, and what is not sure is said to be so."""
     result = of_kitti(kitti)
     assert not result.by(AxisFinding.OFF)
@@ -224,7 +224,7 @@ def test_kitti_is_near_zero(kitti: list[Frame]) -> None:
     [{"ry": 1.0}, {"ry": -2.0, "rx": 1.0}, {"rz": 2.0, "tx": -20.0, "ty": 20.0}, {"rx": -0.5, "tz": 20.0}],
     ids=str,
 )
-def test_what_was_planted_in_kitti_is_found(kitti: list[Frame], planted: dict[str, float]) -> None:
+def test_planted_errors_are_found_in_kitti(kitti: list[Frame], planted: dict[str, float]) -> None:
     result = of_kitti(kitti, **planted)
     assert covers(result, **planted)
     assert {axis.axis.name for axis in result.by(AxisFinding.OFF)} == set(planted) - {"tz"}
@@ -232,7 +232,7 @@ def test_what_was_planted_in_kitti_is_found(kitti: list[Frame], planted: dict[st
         assert abs(found(result)["tz"] - planted["tz"]) < result.axes[5].interval
 
 
-def test_three_views_eight_times_are_three_views(kitti: list[Frame]) -> None:
+def test_repeated_views_count_as_three(kitti: list[Frame]) -> None:
     once, often = (calibrate(shots_of(kitti[:3] * times)) for times in (1, 8))
     assert once.by(AxisFinding.FINE)
     assert covers(often)
@@ -240,7 +240,7 @@ def test_three_views_eight_times_are_three_views(kitti: list[Frame]) -> None:
         assert again.interval > 0.6 * axis.interval
 
 
-def test_one_real_view_may_be_too_little(ten: list[Frame]) -> None:
+def test_one_real_view_gives_no_confident_answer(ten: list[Frame]) -> None:
     for times, frames in ((1, "1 frame"), (12, "12 frames, which show as much as 1 different one,")):
         result = calibrate(shots_of(ten[2:3] * times))
         assert set(findings(result).values()) == {"cannot tell"}
@@ -248,7 +248,9 @@ def test_one_real_view_may_be_too_little(ten: list[Frame]) -> None:
 
 
 @pytest.mark.parametrize("planted", [{"ry": 1.0}, {"ty": 20.0}], ids=str)
-def test_a_camera_that_was_moved_on_the_way(ten: list[Frame], planted: dict[str, float]) -> None:
+def test_a_camera_that_moves_during_the_drive_is_reported(
+    ten: list[Frame], planted: dict[str, float]
+) -> None:
     moved = [*ten[:5], *stated_wrongly(ten[5:], offsets(**planted))]
     result = calibrate(shots_of(moved))
     assert set(findings(result).values()) == {"no agreement"}
@@ -257,7 +259,7 @@ def test_a_camera_that_was_moved_on_the_way(ten: list[Frame], planted: dict[str,
     assert not result.correction.any()
 
 
-def test_images_of_other_frames_do_not_agree(kitti: list[Frame]) -> None:
+def test_images_of_other_frames_give_no_answer(kitti: list[Frame]) -> None:
     others = [frame.cameras[0] for frame in (*kitti[1:], kitti[0])]
     swapped = [
         replace(frame, cameras=(replace(frame.cameras[0], image=other.image),))
@@ -275,7 +277,7 @@ def shots_of(frames: Iterable[Frame]) -> Shots:
 # --- what cannot be told -----------------------------------------------------------------------
 
 
-def test_one_view_twelve_times_is_one_view(drive: Drive) -> None:
+def test_one_view_repeated_twelve_times_counts_once(drive: Drive) -> None:
     once, often = (
         calibrate(gather(drive.frames[3:4] * times, ["zed"], drive.pose)["zed"]) for times in (1, 12)
     )
@@ -293,7 +295,7 @@ def changed(drive: Drive, change: object) -> Iterator[Frame]:
         yield replace(frame, cameras=(replace(camera, image=replace(camera.image, bgr=bgr)),))
 
 
-def test_images_without_edges_tell_nothing(drive: Drive) -> None:
+def test_images_without_edges_give_no_answer(drive: Drive) -> None:
     grey = changed(drive, lambda number, bgr: np.full_like(bgr, 90))
     result = calibrate(gather(grey, ["zed"], drive.pose)["zed"])
     assert set(findings(result).values()) == {"cannot tell"}
@@ -301,7 +303,7 @@ def test_images_without_edges_tell_nothing(drive: Drive) -> None:
     assert not result.correction.any()
 
 
-def test_images_of_another_street_do_not_agree(drive: Drive) -> None:
+def test_images_of_another_street_give_no_answer(drive: Drive) -> None:
     mirrored = changed(drive, lambda number, bgr: np.ascontiguousarray(bgr[:, ::-1]))
     result = calibrate(gather(mirrored, ["zed"], drive.pose)["zed"])
     assert set(findings(result).values()) == {"no agreement"}
@@ -309,7 +311,7 @@ def test_images_of_another_street_do_not_agree(drive: Drive) -> None:
     assert not result.correction.any()
 
 
-def test_a_small_part_of_an_image_is_too_little(drive: Drive) -> None:
+def test_a_small_part_of_an_image_gives_no_answer(drive: Drive) -> None:
     """One frame, of which the image shows an eighth: that is little data, and no contradiction."""
 
     def blind(number: int, bgr: U8) -> U8:
@@ -322,7 +324,7 @@ def test_a_small_part_of_an_image_is_too_little(drive: Drive) -> None:
     assert "too little data" in result.answer
 
 
-def test_clouds_without_edges_tell_nothing(drive: Drive) -> None:
+def test_clouds_without_edges_give_no_answer(drive: Drive) -> None:
     few = [
         replace(frame, clouds=tuple(replace(c, xyz=c.xyz[:50], fields={}) for c in frame.clouds))
         for frame in drive.frames[:3]
@@ -332,14 +334,14 @@ def test_clouds_without_edges_tell_nothing(drive: Drive) -> None:
     assert "too little data: only 0 edges" in result.answer
 
 
-def test_a_robot_at_rest_tells_no_time(drive: Drive) -> None:
+def test_a_robot_at_rest_gives_no_time_offset(drive: Drive) -> None:
     still = gather(drive.frames[:3], ["zed"], lambda frame, stamp: drive.pose(frame, frame.stamp))["zed"]
     time = calibrate(still).axes[TIME]
     assert time.finding is AxisFinding.UNKNOWN
     assert "hardly moved" in time.reason
 
 
-def test_no_frame_to_use(drive: Drive) -> None:
+def test_a_drive_without_usable_frames_is_reported(drive: Drive) -> None:
     blind = [
         replace(f, cameras=(replace(f.cameras[0], image=None, problems=("no image",)),)) for f in drive.frames
     ]
@@ -347,7 +349,7 @@ def test_no_frame_to_use(drive: Drive) -> None:
         calibrate(gather(blind, ["zed"], drive.pose)["zed"])
 
 
-def test_edges_of_a_wall_before_a_wall() -> None:
+def test_depth_edges_lie_on_the_nearer_wall() -> None:
     """A near wall that ends at 10 degrees to the left: the border is there, at the near wall's range."""
     azimuth, elevation = np.meshgrid(np.radians(np.arange(-30, 30, 0.2)), np.radians(np.arange(-8, 8, 0.4)))
     unit = np.stack(
@@ -378,7 +380,7 @@ def turned(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_command(turned: Path, capsys: Capture) -> None:
+def test_the_command_reports_and_records_the_calibration(turned: Path, capsys: Capture) -> None:
     arguments = ["calib", str(turned), "--save", "calib.rrd", "--write", "fixed.yaml"]
     assert main(arguments) == 0
     said = capsys.readouterr().out
@@ -401,7 +403,7 @@ def test_command(turned: Path, capsys: Capture) -> None:
     assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 
 
-def test_wrong_input(turned: Path, capsys: Capture) -> None:
+def test_unusable_bags_are_one_line(turned: Path, capsys: Capture) -> None:
     messages = bags.Messages()
     no_image = [i for i in bags.small_items(messages, scans=3) if i.topic != bags.IMAGE]
     bags.write(Path("blind"), no_image, messages)
@@ -424,7 +426,7 @@ def test_wrong_input(turned: Path, capsys: Capture) -> None:
         assert said.strip().splitlines()[-1].startswith("bevviz: error: ")
 
 
-def test_a_late_clock_is_put_right_by_what_is_written() -> None:
+def test_the_written_config_corrects_a_late_clock() -> None:
     """Lateness that is found is taken from what is added to the stamps already."""
     frames = SyntheticSource(4, 3, weave=True)
     shots = gather(frames, ["zed"], lambda frame, stamp: None)["zed"]

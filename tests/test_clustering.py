@@ -133,7 +133,7 @@ def hard_clouds() -> dict[str, F32]:
 
 
 @pytest.mark.parametrize("name", hard_clouds())
-def test_hard_clouds_take_no_longer(name: str) -> None:
+def test_dense_clouds_take_no_longer(name: str) -> None:
     points = hard_clouds()[name]
     dbscan(points[:100], 0.5, 10)  # compiled
     begin = time.perf_counter()
@@ -151,7 +151,7 @@ def test_hard_clouds_take_no_longer(name: str) -> None:
         assert labels.max() + 1 == clusters[name]
 
 
-def test_one_point_and_none() -> None:
+def test_one_point_or_no_point_is_clustered() -> None:
     assert dbscan(np.zeros((0, 3), np.float32), 0.5, 1).shape == (0,)
     np.testing.assert_array_equal(dbscan(np.zeros((1, 3), np.float32), 0.5, 1), [0])
     np.testing.assert_array_equal(dbscan(np.zeros((1, 3), np.float32), 0.5, 2), [-1])
@@ -219,7 +219,7 @@ def test_boxes_hold_their_points(points: F32) -> None:
     assert not found.aabb.yaw.any()
 
 
-def test_size_limits_apply() -> None:
+def test_clusters_beyond_size_limits_are_set_aside() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal([5 * k, 0, 0], 0.1, (n, 3)) for k, n in enumerate([12, 40, 300])])
     found = cluster(
@@ -234,7 +234,7 @@ def test_size_limits_apply() -> None:
 @pytest.mark.parametrize(
     "points", [np.zeros((0, 3), np.float32), np.array([[1, 2, 3], [40, 5, 6]], np.float32)]
 )
-def test_nothing_to_cluster(points: F32) -> None:
+def test_an_empty_cloud_has_no_clusters(points: F32) -> None:
     found = cluster(points, ClusteringConfig())
     assert len(found) == len(found.aabb) == len(found.obb) == 0
     np.testing.assert_array_equal(found.labels, np.full(len(points), -1))

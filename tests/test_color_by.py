@@ -63,7 +63,7 @@ def test_intensity_is_shown_by_its_own_scale(full: float) -> None:
     assert 30 <= half < bright <= 100
 
 
-def test_what_a_cloud_has_not_is_said() -> None:
+def test_a_missing_field_is_reported() -> None:
     assert said("ring") == said("time") == said("intensity") == ["not in this cloud"]
 
 
@@ -76,7 +76,7 @@ def test_every_id_has_a_label_whatever_the_sensor_sends(values: F32, field: Quan
     assert all(said(field, **{field: values}))
 
 
-def test_a_viewer_with_fewer_points_has_the_colours_of_those() -> None:
+def test_thinned_points_keep_their_colours() -> None:
     points = np.arange(300, dtype=np.float32).reshape(100, 3)
     ids: dict[Quantity, Any] = {
         "ring": np.arange(256, 356, dtype=np.uint16),
@@ -102,7 +102,7 @@ def columns(path: Path, entity: str) -> dict[str, int]:
     return found
 
 
-def test_a_recording_has_the_points_once_and_what_was_asked_for(tmp_path: Path) -> None:
+def test_a_recording_has_points_once_and_requested_fields(tmp_path: Path) -> None:
     with bevviz.simulate(frames=1, seed=1, set={"logging.color_by": ["height", "ring"]}) as drive:
         path = drive.save(tmp_path / "drive.rrd")
         lidar = drive.scene.lidar
@@ -125,7 +125,7 @@ def mapped(path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["debug", "live", "workbench", "workbench_live", "bug_report"])
-def test_layouts_have_a_view_for_each(name: str, tmp_path: Path) -> None:
+def test_layouts_have_a_view_for_each_field(name: str, tmp_path: Path) -> None:
     scene, path = Scene("a", "lidar", ("lidar",), ("camera",)), tmp_path / "layout.rbl"
     blueprints.load(name, scene, load()).save("bevviz", str(path))
     assert mapped(path) == {f"ColorBy:{quantity}": "Points3D:class_ids" for quantity in QUANTITIES}

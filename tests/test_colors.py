@@ -62,14 +62,14 @@ def lab(rgb: F64) -> F64:
     ],
     ids=["classes", "states", "sides", "truth", "fates"],
 )
-def test_colours_can_be_told_apart(names: dict[str, Color], sight: str) -> None:
+def test_colours_differ_also_for_the_colour_blind(names: dict[str, Color], sight: str) -> None:
     seen = {name: lab(np.clip(SEEN[sight] @ linear(color), 0, 1)) for name, color in names.items()}
     near = {(a, b): float(np.linalg.norm(seen[a] - seen[b])) for a, b in combinations(seen, 2)}
     assert not {pair: round(away, 1) for pair, away in near.items() if away < TELLS_APART}
 
 
 @pytest.mark.parametrize("back", [(13, 14, 18), (255, 255, 255)], ids=["dark", "light"])
-def test_states_are_seen_on_either_theme(back: Color) -> None:
+def test_states_contrast_with_light_and_dark_themes(back: Color) -> None:
     def luminance(color: Color) -> float:
         return float(XYZ[1] @ linear(color))
 

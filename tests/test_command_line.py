@@ -54,7 +54,7 @@ def refused(capsys: Capture, *arguments: str) -> list[str]:
         ("snap --zebra", "unknown option --zebra", "bevviz snap [FILE.rrd]"),
     ],
 )
-def test_a_slip_gets_the_nearest_name_and_its_commands_usage(
+def test_a_typo_gets_the_nearest_name_and_the_usage(
     capsys: Capture, given: str, error: str, usage: str
 ) -> None:
     said, second = refused(capsys, *given.split())
@@ -68,12 +68,12 @@ def test_a_file_that_is_not_there_is_no_command(capsys: Capture) -> None:
     assert said == "bevviz: error: drvie.mcap: no such file or folder; did you mean 'drive.mcap'?"
 
 
-def test_what_is_for_ros_is_left_alone(capsys: Capture) -> None:
+def test_arguments_for_ros_are_left_alone(capsys: Capture) -> None:
     assert main(["info", "--ros-args", "--remap", "a:=b"]) == 2
     assert "which bag?" in capsys.readouterr().err
 
 
-def test_without_a_word_the_help_is_shown(capsys: Capture) -> None:
+def test_without_arguments_the_help_is_shown(capsys: Capture) -> None:
     assert main([]) == 2
     assert "examples:" in capsys.readouterr().out
 
@@ -108,7 +108,7 @@ def test_colour_is_asked_for_and_refused(capsys: Capture, monkeypatch: pytest.Mo
 # --- without a display ---------------------------------------------------------------------------------
 
 
-def test_a_demo_without_a_display_ends_with_what_shows_it(
+def test_a_demo_without_a_display_names_the_viewer_command(
     monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """The line is typed as it stands. A project's network (there is none of that name) is not the demo's."""
@@ -140,7 +140,7 @@ def test_a_program_that_is_not_on_the_path_is_named_by_its_file(monkeypatch: pyt
     assert program().endswith(" -m bevviz")
 
 
-def test_what_is_no_recording_is_not_shown(capsys: Capture) -> None:
+def test_files_that_are_no_recordings_are_not_shown(capsys: Capture) -> None:
     Path("x.rrd").write_text("nothing")
     assert main(["x.rrd"]) == 2
     assert "x.rrd" in capsys.readouterr().err

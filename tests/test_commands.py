@@ -76,7 +76,7 @@ def test_demo_writes_a_bag_that_runs(tmp_path: Path, capsys: Capture) -> None:
     assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 3
 
 
-def test_selection_of_frames(tmp_path: Path, capsys: Capture) -> None:
+def test_frames_can_be_selected(tmp_path: Path, capsys: Capture) -> None:
     small_bag(scans=20)
     assert main(["bag", "drive", "--frames", "4:12", "--every", "3", "--save", "out.rrd"]) == 0
     assert sorted(row["frame"] for row in Recording(tmp_path / "out.rrd").rows["/bev"]) == [4, 7, 10]
@@ -110,7 +110,7 @@ def test_config_is_read_back(capsys: Capture, tmp_path: Path) -> None:
     assert "size: 0.03" in capsys.readouterr().out
 
 
-def test_help_teaches(capsys: Capture) -> None:
+def test_every_command_has_help(capsys: Capture) -> None:
     for command in ((), ("bag",), ("info",), ("report",), ("demo",), ("config",)):
         with pytest.raises(SystemExit) as ended:
             main([*command, "--help"])
@@ -134,7 +134,7 @@ def test_a_missing_file(capsys: Capture) -> None:
     assert "absent.mcap" in error_of(capsys, "bag", "absent.mcap")
 
 
-def test_a_directory_that_is_no_bag(capsys: Capture) -> None:
+def test_a_directory_without_a_bag_is_one_line(capsys: Capture) -> None:
     Path("folder").mkdir()
     Path("folder/notes.txt").write_text("no bag")
     assert "folder" in error_of(capsys, "bag", "folder")
@@ -145,7 +145,7 @@ def test_an_empty_file(capsys: Capture) -> None:
     assert "empty.mcap" in error_of(capsys, "bag", "empty.mcap")
 
 
-def test_a_bag_without_messages(capsys: Capture) -> None:
+def test_a_bag_without_messages_is_one_line(capsys: Capture) -> None:
     bags.write(Path("empty"), [])
     assert "empty" in error_of(capsys, "bag", "empty")
 
@@ -158,7 +158,7 @@ def test_a_lidar_topic_without_messages(capsys: Capture) -> None:
     assert "nor has any other" in said
 
 
-def test_a_bag_without_a_lidar(capsys: Capture) -> None:
+def test_a_bag_without_a_lidar_is_one_line(capsys: Capture) -> None:
     small_bag(without(bags.CLOUD, bags.IMAGE))
     assert "none of 3 topics is a sensor_msgs/PointCloud2" in error_of(capsys, "bag", "drive")
     shutil.rmtree("drive")
@@ -174,7 +174,7 @@ def told_of_the_model(capsys: Capture) -> str:
     return line
 
 
-def test_a_model_and_only_video(capsys: Capture) -> None:
+def test_undecodable_video_explains_missing_detections(capsys: Capture) -> None:
     kind = "foxglove_msgs/msg/CompressedVideo"
     fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
 
@@ -191,7 +191,7 @@ def test_a_model_and_only_video(capsys: Capture) -> None:
     assert "detector.model demo has seen nothing in 5 frames: no image at the time of any scan" in line
 
 
-def test_a_model_and_images_that_are_video(capsys: Capture) -> None:
+def test_video_in_images_explains_missing_detections(capsys: Capture) -> None:
     def change(items: list[bags.Item], messages: bags.Messages) -> None:
         for i, item in enumerate(items):
             if item.topic == bags.IMAGE:
@@ -205,7 +205,7 @@ def test_a_model_and_images_that_are_video(capsys: Capture) -> None:
     )
 
 
-def test_a_model_and_no_image_at_the_time_of_a_scan(capsys: Capture) -> None:
+def test_late_images_explain_missing_detections(capsys: Capture) -> None:
     def change(items: list[bags.Item], messages: bags.Messages) -> None:
         items[:] = [i for i in items if i.topic != bags.IMAGE or i.received == bags.START]
         items[:] = [i for i in items if i.topic != bags.CLOUD or i.received > bags.START + 3 * bags.PERIOD]
@@ -214,38 +214,38 @@ def test_a_model_and_no_image_at_the_time_of_a_scan(capsys: Capture) -> None:
     assert "has seen nothing in 2 frames: no image at the time of any scan" in told_of_the_model(capsys)
 
 
-def test_a_model_that_sees_something_is_not_spoken_of(capsys: Capture) -> None:
+def test_no_warning_if_the_model_detects_something(capsys: Capture) -> None:
     small_bag()
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
     assert "detector.model" not in capsys.readouterr().err
 
 
-def test_a_topic_that_is_not_there(capsys: Capture) -> None:
+def test_an_unknown_topic_is_one_line(capsys: Capture) -> None:
     small_bag()
     said = error_of(capsys, "bag", "drive", "--set", "source.lidar_topics=[/velodyne_point]")
     assert bags.CLOUD in said
 
 
 @pytest.mark.parametrize("name", ["absent.onnx", "text.onnx"])
-def test_a_model_that_is_none(capsys: Capture, name: str) -> None:
+def test_a_file_that_is_no_model_is_one_line(capsys: Capture, name: str) -> None:
     small_bag()
     Path("text.onnx").write_text("not a network")
     assert name in error_of(capsys, "bag", "drive", "--model", name)
 
 
-def test_a_time_outside_the_bag(capsys: Capture) -> None:
+def test_a_time_outside_the_bag_is_one_line(capsys: Capture) -> None:
     small_bag()
     assert "1000" in error_of(capsys, "bag", "drive", "--start", "1000")
     assert "soon" in error_of(capsys, "bag", "drive", "--start", "soon")
 
 
-def test_an_unknown_blueprint(capsys: Capture) -> None:
+def test_an_unknown_blueprint_is_one_line(capsys: Capture) -> None:
     small_bag()
     said = error_of(capsys, "bag", "drive", "--save", "o.rrd", "--blueprint", "debugg")
     assert "did you mean 'debug'?" in said
 
 
-def test_a_file_that_cannot_be_written(capsys: Capture) -> None:
+def test_an_unwritable_output_is_one_line(capsys: Capture) -> None:
     small_bag()
     assert "absent/o.rrd" in error_of(capsys, "bag", "drive", "--save", "absent/o.rrd")
 
@@ -261,7 +261,7 @@ def test_a_recording_never_overwrites_a_bag(capsys: Capture) -> None:
 
 
 @pytest.mark.parametrize("frames", ["5", "a:b", "1-3"])
-def test_frames_that_are_no_range(capsys: Capture, frames: str) -> None:
+def test_an_invalid_frame_range_is_one_line(capsys: Capture, frames: str) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["bag", "drive", "--frames", frames])
     assert ended.value.code == 2
@@ -271,7 +271,7 @@ def test_frames_that_are_no_range(capsys: Capture, frames: str) -> None:
 # --- bad data: every frame is made, and says what it lacks ---------------------------------------
 
 
-def test_clouds_without_a_point(tmp_path: Path) -> None:
+def test_clouds_without_points_are_processed(tmp_path: Path) -> None:
     none = np.zeros((0, 4), np.float32)
     small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, none)))
     assert main(["bag", "drive", "--save", "out.rrd"]) == 0
@@ -280,7 +280,7 @@ def test_clouds_without_a_point(tmp_path: Path) -> None:
     assert "no finite point" in recording.text("/explain")[0]
 
 
-def test_clouds_of_nan(tmp_path: Path) -> None:
+def test_clouds_of_nan_are_processed(tmp_path: Path) -> None:
     nan = np.full((50, 4), np.nan, np.float32)
     small_bag(replaced(bags.CLOUD, lambda m, t: m.cloud(t, nan)))
     assert main(["bag", "drive", "--save", "out.rrd"]) == 0
@@ -289,7 +289,7 @@ def test_clouds_of_nan(tmp_path: Path) -> None:
     assert "no finite point" in texts[0]
 
 
-def test_an_image_of_unknown_encoding(tmp_path: Path, capsys: Capture) -> None:
+def test_an_unknown_image_encoding_is_reported(tmp_path: Path, capsys: Capture) -> None:
     def strange(messages: bags.Messages, stamp: int) -> Any:
         image = messages.image(stamp, np.zeros((48, 64, 3), np.uint8))
         image.encoding = "rgb565"
@@ -303,7 +303,7 @@ def test_an_image_of_unknown_encoding(tmp_path: Path, capsys: Capture) -> None:
     assert bags.IMAGE in texts[0]
 
 
-def test_no_camera_info(tmp_path: Path) -> None:
+def test_a_missing_camera_info_is_reported(tmp_path: Path) -> None:
     small_bag(without(bags.INFO))
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
     texts = Recording(tmp_path / "out.rrd").text("/explain")
@@ -311,7 +311,7 @@ def test_no_camera_info(tmp_path: Path) -> None:
     assert "no CameraInfo topic for camera 'camera': nothing can be projected into it; record one" in texts[0]
 
 
-def test_no_transforms(tmp_path: Path) -> None:
+def test_missing_transforms_are_reported(tmp_path: Path) -> None:
     small_bag(without("/tf", "/tf_static"))
     assert main(["bag", "drive", "--model", "demo", "--save", "out.rrd"]) == 0
     texts = Recording(tmp_path / "out.rrd").text("/explain")
@@ -319,7 +319,7 @@ def test_no_transforms(tmp_path: Path) -> None:
     assert "source.extrinsics" in texts[0]
 
 
-def test_a_bag_cut_in_the_middle(tmp_path: Path, capsys: Capture) -> None:
+def test_a_cut_bag_is_processed_to_the_cut(tmp_path: Path, capsys: Capture) -> None:
     small_bag(scans=40)
     (whole,) = Path("drive").glob("*.mcap")
     data = whole.read_bytes()
@@ -351,7 +351,7 @@ def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
     assert 0 < len(Recording(saved).rows["/bev"]) < 500
 
 
-def test_an_interrupt_that_gets_lost_in_a_library(
+def test_an_interrupt_swallowed_by_a_library_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     log = FrameLogger.log
@@ -394,7 +394,7 @@ def test_a_failing_stage_prints_one_line_unless_debugging(
     assert 'broken.py", line 2, in cluster' in said
 
 
-def test_an_error_of_bevviz_itself_is_one_line_too(
+def test_an_internal_error_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(self: FrameLogger, result: object) -> None:
@@ -411,7 +411,7 @@ def test_an_error_of_bevviz_itself_is_one_line_too(
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_points_beyond_any_sensor_warn_of_nothing(preset: str, tmp_path: Path) -> None:
+def test_points_beyond_any_sensor_cause_no_warning(preset: str, tmp_path: Path) -> None:
     near = np.random.default_rng(0).normal(0, 10, (200, 4))
     far = [[sign * 1e30 if i == axis else 5.0 for i in range(4)] for axis in range(4) for sign in (1, -1)]
     far += [[3e38, 3e38, 3e38, 3e38], [9e7, 5, 1, 1]]

@@ -99,7 +99,7 @@ def changed(a: SideResult, b: SideResult) -> list[tuple[Change, int, int]]:
         ),
     ],
 )
-def test_planted_differences(a: Any, b: Any, expected: list[tuple[Change, int, int]]) -> None:
+def test_planted_differences_are_found(a: Any, b: Any, expected: list[tuple[Change, int, int]]) -> None:
     assert changed(objects(*a), objects(*b)) == expected
 
 
@@ -120,7 +120,7 @@ def test_each_object_once_and_the_sides_are_alike(seed: int, count_a: int, count
     assert {d.change for d in compare_objects(a, a)} <= {Change.SAME}
 
 
-def test_text_has_the_numbers() -> None:
+def test_the_summary_states_the_numbers() -> None:
     (moved,) = compare_objects(objects(("car", 5, 0)), objects(("car", 5.5, 0)))
     assert moved.text == "car moved by 0.50 m, IoU 0.60"
     (other,) = compare_objects(objects(("car", 5, 0)), objects(("truck", 5, 0)))
@@ -161,7 +161,7 @@ def same_results(a: FrameResult, b: FrameResult) -> None:
     assert a.explanations == b.explanations
 
 
-def test_variants_make_what_a_pipeline_alone_makes() -> None:
+def test_variants_equal_separate_runs() -> None:
     low = load(settings=["detector.model=demo", "detector.conf_threshold=0.1"])
     variants = Variants()
     for config in (REFERENCE, DEFAULT, low, REFERENCE):
@@ -170,7 +170,7 @@ def test_variants_make_what_a_pipeline_alone_makes() -> None:
         same_results(add_explanations(variants.perceive(frame(), config)), session.run(seen_by))
 
 
-def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_common_stages_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     runs: list[int] = []
     infer = detector.Detector.infer
 
@@ -195,7 +195,7 @@ def test_what_is_common_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(runs) == 2  # another frame
 
 
-def test_memo_forgets_the_oldest() -> None:
+def test_the_cache_drops_the_oldest_results() -> None:
     memo = Memo(size=2)
     made: list[int] = []
 
@@ -218,7 +218,7 @@ def test_cameras_without_motion_are_where_they_are_mounted() -> None:
     assert not still.motion_compensated
 
 
-def test_what_frames_are_made_of_is_common() -> None:
+def test_source_settings_must_be_equal() -> None:
     other = load(settings=["sync.tolerance=0.05"])
     with pytest.raises(UserError, match=r"A and B differ in sync.tolerance \(0.1 -> 0.05\)"):
         check_same_frames({"A": load(), "B": other})
@@ -257,7 +257,7 @@ def test_the_robots_boxes_are_compared_in_our_frame() -> None:
         (("/a", "/b"), "/b", "/b"),
     ],
 )
-def test_the_robots_topic(topics: tuple[str, ...], asked: str, expected: str) -> None:
+def test_a_topic_of_the_robot_can_be_a_side(topics: tuple[str, ...], asked: str, expected: str) -> None:
     assert robot_topic(topics, asked) == expected
 
 
@@ -269,7 +269,7 @@ def test_the_robots_topic(topics: tuple[str, ...], asked: str, expected: str) ->
         (("/a",), "/c", "--robot /c: no such Detection3DArray topic; there are: /a"),
     ],
 )
-def test_no_topic_of_the_robot(topics: tuple[str, ...], asked: str, message: str) -> None:
+def test_a_missing_robot_topic_is_one_line(topics: tuple[str, ...], asked: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         robot_topic(topics, asked)
 
@@ -284,7 +284,7 @@ def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, 
     return str(bag), str(shared / "models/yolox_nano.onnx")
 
 
-def test_two_configurations_on_kitti(kitti: tuple[str, str], capsys: Capture) -> None:
+def test_two_configurations_are_compared_on_kitti(kitti: tuple[str, str], capsys: Capture) -> None:
     bag, model = kitti
     # The pedestrian of 000000 has some hundred points: B asks for more.
     planted = "clustering.min_cluster_points=2000"
@@ -319,7 +319,7 @@ def test_two_configurations_on_kitti(kitti: tuple[str, str], capsys: Capture) ->
     assert recording.static["/compare/about"]["TextDocument:text"]
 
 
-def test_two_saved_runs_of_kitti(kitti: tuple[str, str], capsys: Capture) -> None:
+def test_two_saved_runs_of_kitti_are_compared(kitti: tuple[str, str], capsys: Capture) -> None:
     bag, model = kitti
     assert main(["bag", bag, "--model", model, "--save", "old.rrd"]) == 0
     changed = ["--set", "clustering.min_cluster_points=2000", "--frames", ":1"]
@@ -346,7 +346,7 @@ def test_two_saved_runs_of_kitti(kitti: tuple[str, str], capsys: Capture) -> Non
     assert main(["compare", "both.rrd", "new.rrd", "--save", "again.rrd"]) == 0
 
 
-def test_ours_against_the_robots(capsys: Capture) -> None:
+def test_our_results_are_compared_with_the_robots(capsys: Capture) -> None:
     """A bag in which the robot publishes one box; bevviz without a detector names none."""
     messages = bags.Messages()
     items = bags.small_items(messages, scans=3)
@@ -403,7 +403,7 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
         ),
     ],
 )
-def test_wrong_calls(arguments: list[str], message: str, capsys: Capture) -> None:
+def test_wrong_calls_are_one_line(arguments: list[str], message: str, capsys: Capture) -> None:
     if arguments[0] == "drive":
         messages = bags.Messages()
         bags.write(Path("drive"), bags.small_items(messages, scans=2), messages)
@@ -413,7 +413,7 @@ def test_wrong_calls(arguments: list[str], message: str, capsys: Capture) -> Non
     assert message in said
 
 
-def test_files_and_presets_as_sides(capsys: Capture) -> None:
+def test_files_and_presets_can_be_sides(capsys: Capture) -> None:
     messages = bags.Messages()
     bags.write(Path("drive"), bags.small_items(messages, scans=2), messages)
     Path("b.yaml").write_text("clustering:\n  eps: 0.9\n")

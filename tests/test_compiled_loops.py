@@ -25,7 +25,7 @@ print(dbscan(points, 0.5, 2).tolist())
 """
 
 
-def test_without_a_place_they_are_compiled_anew() -> None:
+def test_without_a_cache_folder_loops_are_recompiled() -> None:
     done = subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr
 
@@ -45,7 +45,7 @@ def test_stage_times_exclude_compilation() -> None:
     assert thread_clock() - start >= 0.05
 
 
-def test_other_threads_compile_on_their_own_time() -> None:
+def test_compiling_in_another_thread_is_not_counted() -> None:
     def thrice(x: float) -> float:
         return 3 * x
 
@@ -59,7 +59,7 @@ def test_other_threads_compile_on_their_own_time() -> None:
     assert thread_clock() - start >= wall > common_clock() - common
 
 
-def test_that_stages_are_compiled_is_said_once() -> None:
+def test_compiling_is_announced_once() -> None:
     said: list[str] = []
     progress.set_receiver(said.append)
     try:

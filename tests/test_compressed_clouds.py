@@ -28,7 +28,7 @@ CASES = [name for name in CLOUDINI if not name.endswith("_points")]
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_cloudini_gives_what_its_own_library_does(name: str) -> None:
+def test_cloudini_clouds_equal_those_of_its_library(name: str) -> None:
     """Made by tools/make_cloudini_references.py."""
     header, points = cloudini.decode(CLOUDINI[name].tobytes())
     np.testing.assert_array_equal(points, CLOUDINI[f"{name}_points"])
@@ -49,7 +49,7 @@ def test_damaged_cloudini_is_read_or_refused(name: str, at: int, damage: bytes, 
         assert len(points) == header.points * header.point_step
 
 
-def test_a_message_of_cloudini_and_an_empty_one() -> None:
+def test_cloudini_messages_may_be_empty() -> None:
     made = messages()
     cloud = made.cloud(bags.START, np.zeros((400, 4), np.float32))
     found = decoded(compressed(made, cloud, "cloudini", CLOUDINI["v5_lossy_zstd"].tobytes()))
@@ -68,7 +68,7 @@ def decoded(message: Any) -> Any:
 
 @pytest.mark.parametrize("form", ["zstd", "zlib", "gzip"])
 @pytest.mark.parametrize("ros1", [False, True])
-def test_a_bag_has_the_points_that_were_compressed(tmp_path: Path, form: str, ros1: bool) -> None:
+def test_compressed_points_are_read_from_a_bag(tmp_path: Path, form: str, ros1: bool) -> None:
     made = messages(ros1)
     stamps = [bags.START + i * bags.PERIOD for i in range(3)]
     clouds = [made.cloud(stamp, points(number)) for number, stamp in enumerate(stamps)]
@@ -92,7 +92,9 @@ def test_a_bag_has_the_points_that_were_compressed(tmp_path: Path, form: str, ro
         np.testing.assert_array_equal(frame.fields["intensity"], points(number)[:, 3])
 
 
-def test_beside_the_cloud_itself_it_is_not_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_raw_cloud_is_preferred_to_its_compressed_copy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     made = messages()
     cloud = made.cloud(bags.START, points(0))
     items = [
@@ -106,7 +108,7 @@ def test_beside_the_cloud_itself_it_is_not_taken(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize(("number", "off"), [(0, 0.0), (1, 0.005)])
-def test_draco(number: int, off: float) -> None:
+def test_draco_clouds_are_decoded(number: int, off: float) -> None:
     pytest.importorskip("DracoPy")
     cloud = decoded(draco(b64decode(DRACO[number])))
     assert cloud.dropped == 0
@@ -118,7 +120,7 @@ def test_draco(number: int, off: float) -> None:
     np.testing.assert_array_equal(cloud.fields["rgb"].view(np.uint32)[order], 0x102030 + i)
 
 
-def test_what_cannot_be_unpacked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_undecodable_clouds_state_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     made = messages()
     cloud = made.cloud(bags.START, points(0))
     whole = packed("zstd", cloud.data.tobytes())
@@ -158,7 +160,7 @@ def test_a_cloud_is_unpacked_to_the_size_that_it_states(form: str) -> None:
     assert most < 60e6
 
 
-def test_a_header_of_cloudini_is_not_searched_for_without_end() -> None:
+def test_a_cloudini_header_has_a_limited_length() -> None:
     text = b"a: [" + b"1, " * 5000 + b"1]"
     with pytest.raises(ValueError, match="its cloudini header is damaged"):
         cloudini.read_header(b"CLOUDINI_V04\n" + text + b"\0")

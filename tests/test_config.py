@@ -20,7 +20,7 @@ def test_reference_preset_is_the_tutorial() -> None:
 
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_what_is_printed_is_read_back(tmp_path: Path, preset: config.Preset) -> None:
+def test_a_printed_config_is_read_back(tmp_path: Path, preset: config.Preset) -> None:
     made = config.load(settings=["source.extrinsics={'base cam': [1, 2, 3, 0, 0, 0, 1]}"], preset=preset)
     file = tmp_path / "c.yaml"
     file.write_text(config.config_yaml(made))

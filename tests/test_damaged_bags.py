@@ -89,7 +89,9 @@ def test_a_sound_bag_is_read_without_a_rescue(tmp_path: Path, name: str) -> None
         assert not said
 
 
-def test_a_bug_is_not_taken_for_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_programming_error_is_not_reported_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = FORMATS["mcap"](tmp_path)
 
     def broken(*_: object) -> None:
@@ -162,7 +164,7 @@ def test_an_index_that_contradicts_the_statistics_is_ignored(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("length", [0, 5, 300, 1 << 33, 2**63 - 1, 2**64 - 1])
 @pytest.mark.parametrize("name", ["mcap, flat", "mcap, no checksums", "mcap, one chunk"])
-def test_behind_a_broken_message_the_next_one_is_found(tmp_path: Path, name: str, length: int) -> None:
+def test_reading_resumes_after_a_broken_message(tmp_path: Path, name: str, length: int) -> None:
     path = FORMATS[name](tmp_path)
     at = records(path.read_bytes(), mcap.MESSAGE)[70]
     change(path, at + 1, struct.pack("<Q", length))
@@ -173,7 +175,7 @@ def test_behind_a_broken_message_the_next_one_is_found(tmp_path: Path, name: str
 
 @pytest.mark.parametrize("name", ["mcap", "mcap, lz4", "mcap, zstd"])
 @pytest.mark.parametrize("wrong", [b"\x00", b"\x05", b"\xff"])
-def test_a_chunk_is_known_by_its_content(tmp_path: Path, name: str, wrong: bytes) -> None:
+def test_a_chunk_is_recognized_by_its_content(tmp_path: Path, name: str, wrong: bytes) -> None:
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     change(path, records(data, mcap.CHUNK)[3], wrong)
@@ -201,7 +203,7 @@ def test_a_wrong_checksum_alone_drops_no_message(tmp_path: Path, name: str, end:
 
 
 @pytest.mark.parametrize("name", ["mcap", "mcap, lz4", "mcap, zstd"])
-def test_what_a_damaged_chunk_costs_is_counted(tmp_path: Path, name: str) -> None:
+def test_messages_lost_in_a_damaged_chunk_are_counted(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     change(path, records(data, mcap.CHUNK)[3] + 2000, b"\x55\xaa\x55" * 100)
@@ -254,7 +256,7 @@ def test_a_chunk_is_unpacked_to_a_limit(compression: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mcap", "mcap, zstd", "ros1", "ros1, bz2", "sqlite3"])
-def test_bytes_that_are_missing_in_the_middle(tmp_path: Path, name: str) -> None:
+def test_missing_bytes_lose_only_their_messages(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     path.write_bytes(data[:200_000] + (bytes(300) if name == "sqlite3" else b"") + data[200_300:])
@@ -263,7 +265,7 @@ def test_bytes_that_are_missing_in_the_middle(tmp_path: Path, name: str) -> None
     assert name == "sqlite3" or any(re.search(r"\d+ (are|messages) lost|\d broken place", s) for s in said)
 
 
-def test_damage_met_while_reading_gives_nothing_twice(tmp_path: Path) -> None:
+def test_no_message_is_yielded_twice_after_damage(tmp_path: Path) -> None:
     path = FORMATS["mcap"](tmp_path)
     change(path, records(path.read_bytes(), mcap.CHUNK)[4] + 5000, b"\0\0\0\0\0\0\0\1")
     with Recording([path]) as recording:
@@ -280,7 +282,7 @@ def test_damage_met_while_reading_gives_nothing_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mcap", "mcap, zstd", "mcap, flat", "sqlite3", "ros1", "ros1, lz4"])
-def test_a_file_that_is_cut_while_it_is_read(tmp_path: Path, name: str) -> None:
+def test_a_file_cut_during_reading_is_reported(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     size = path.stat().st_size
     with Recording([path]) as recording:
@@ -327,7 +329,7 @@ def test_a_time_that_no_date_has_is_a_broken_message(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mcap, flat", "ros1"])
-def test_a_definition_that_is_no_utf8(tmp_path: Path, name: str) -> None:
+def test_a_definition_that_is_no_utf8_is_reported(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     path.write_bytes(data.replace(b"uint32 height", b"uint32 \xff\xfe\xfdght"))
@@ -353,7 +355,7 @@ def test_messages_of_an_unknown_connection_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ros1", "ros1, bz2", "ros1, lz4"])
-def test_changed_opcodes_of_ros1_records(tmp_path: Path, name: str) -> None:
+def test_changed_opcodes_of_ros1_records_lose_nothing(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     places = [match.end() for match in re.finditer(b"op=", data)]
@@ -367,7 +369,7 @@ def test_changed_opcodes_of_ros1_records(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [10, 11])
-def test_columns_of_a_type_that_there_is_not(tmp_path: Path, kind: int) -> None:
+def test_columns_of_wrong_types_lose_one_message_at_most(tmp_path: Path, kind: int) -> None:
     path = FORMATS["sqlite3"](tmp_path)
     data = path.read_bytes()
     matches = list(re.finditer(rb"\x00[\x01\x08\x09]\x06", data))  # id, topic, time, and then the data
@@ -431,7 +433,7 @@ def test_a_database_whose_index_disagrees_with_its_messages(tmp_path: Path) -> N
 # --- packed files ------------------------------------------------------------------------------
 
 
-def test_of_a_cut_zstd_file_no_whole_block_is_lost(tmp_path: Path) -> None:
+def test_a_cut_zstd_file_keeps_every_whole_block(tmp_path: Path) -> None:
     path = FORMATS["mcap.zstd"](tmp_path)
     data = path.read_bytes()
     for share in (0.3, 0.61, 0.97):
@@ -444,7 +446,7 @@ def test_of_a_cut_zstd_file_no_whole_block_is_lost(tmp_path: Path) -> None:
         assert any("its end is missing" in text and "could be unpacked" in text for text in said)
 
 
-def test_behind_a_damaged_frame_the_next_one_is_unpacked(tmp_path: Path) -> None:
+def test_unpacking_resumes_after_a_damaged_frame(tmp_path: Path) -> None:
     path = FORMATS["mcap.zstd, several frames"](tmp_path)
     data = path.read_bytes()
     second = data.index(b"\x28\xb5\x2f\xfd", 4)
@@ -459,7 +461,7 @@ def test_behind_a_damaged_frame_the_next_one_is_unpacked(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", ["mcap", "ros1"])
-def test_first_bytes_that_are_damaged(tmp_path: Path, name: str) -> None:
+def test_damaged_first_bytes_are_survived(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     change(path, 0, b"\0\0\0\0")
     found, said = read(path)
@@ -467,7 +469,7 @@ def test_first_bytes_that_are_damaged(tmp_path: Path, name: str) -> None:
     assert any("rescued" in text for text in said)
 
 
-def test_a_database_of_which_all_is_still_in_its_log(tmp_path: Path) -> None:
+def test_a_database_whose_rows_are_all_in_its_log_is_read(tmp_path: Path) -> None:
     path = tmp_path / "bag.db3"
     with sqlite3.connect(FORMATS["sqlite3"](tmp_path)) as source, sqlite3.connect(path) as target:
         target.execute("PRAGMA journal_mode=WAL")
@@ -484,7 +486,7 @@ def test_a_database_of_which_all_is_still_in_its_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["drive #1?.db3", "100%.db3", "drive", "drive.mcap"])
-def test_names_that_mean_something_else(tmp_path: Path, name: str) -> None:
+def test_odd_file_names_are_opened(tmp_path: Path, name: str) -> None:
     path = FORMATS["sqlite3"](tmp_path)
     found, said = read(path.rename(tmp_path / name))
     assert not missing(found, "sqlite3")
@@ -506,7 +508,7 @@ def in_summary(path: Path, old: bytes, new: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", UNSEALED)
-def test_the_data_names_a_topic_where_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
+def test_topics_are_read_if_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     in_summary(path, b"/velodyne_points", b"/velodyne_pojnts")
     found, said = read(path)
@@ -518,7 +520,7 @@ def test_the_data_names_a_topic_where_the_summary_is_damaged(tmp_path: Path, nam
 
 
 @pytest.mark.parametrize("name", UNSEALED)
-def test_the_data_describes_a_type_where_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
+def test_types_are_read_if_the_summary_is_damaged(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path)
     in_summary(path, b"sensor_msgs/msg/PointCloud2", b"sensor_msgs/msg/PointCloud3")
     with Recording([path]) as recording:

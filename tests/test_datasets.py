@@ -37,7 +37,7 @@ def corners(frame: Frame) -> F64:
 # --- KITTI -------------------------------------------------------------------------------------
 
 
-def test_a_raw_drive_is_what_pykitti_reads(tmp_path: Path) -> None:
+def test_a_raw_drive_equals_what_pykitti_reads(tmp_path: Path) -> None:
     path = datasets.kitti_raw(tmp_path)
     theirs = pykitti.raw(str(tmp_path), "2011_09_26", "0001")
     with bevviz.open(path, set=STILL) as drive:
@@ -89,7 +89,7 @@ def test_tracklets_are_where_they_are_labelled(tmp_path: Path) -> None:
     assert truth.must.tolist() == [True]
 
 
-def test_a_raw_drive_is_seen_by_info(tmp_path: Path, capsys: Capture) -> None:
+def test_info_describes_a_raw_drive(tmp_path: Path, capsys: Capture) -> None:
     path = datasets.kitti_raw(tmp_path)
     assert main(["info", str(path)]) == 0
     said = capsys.readouterr().out
@@ -109,7 +109,7 @@ def test_a_grey_camera_that_is_asked_for_is_used(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.camera_from_points, theirs.calib.T_cam0_velo, atol=1e-6)
 
 
-def test_a_tracking_sequence(tmp_path: Path, capsys: Capture) -> None:
+def test_a_tracking_sequence_is_read(tmp_path: Path, capsys: Capture) -> None:
     root = datasets.kitti_tracking(tmp_path)
     theirs = pykitti.tracking(str(root), "0000")
     with bevviz.open(root, set={"source.sequence": "0000"}) as drive:
@@ -187,7 +187,7 @@ def test_semantic_kitti_has_objects_and_ground(tmp_path: Path, capsys: Capture) 
     assert "ground" in said
 
 
-def test_real_frames_as_a_sequence(shared: Path) -> None:
+def test_real_frames_are_read_as_a_sequence(shared: Path) -> None:
     with bevviz.open(shared / "kitti_drive") as drive:
         assert len(drive) == 25
         frame = drive.raw(24)
@@ -213,7 +213,7 @@ def test_a_missed_object_is_asked_about(shared: Path, tmp_path: Path, capsys: Ca
 # --- nuScenes ----------------------------------------------------------------------------------
 
 
-def test_a_scene_of_nuscenes_is_what_its_devkit_reads(tmp_path: Path) -> None:
+def test_a_nuscenes_scene_equals_what_its_devkit_reads(tmp_path: Path) -> None:
     """The reference is what nuscenes-devkit 1.2.0 makes of the same folder, see references/README.md."""
     expected = json.loads((Path(__file__).parent / "references/metrics/nuscenes_devkit.json").read_text())
     root = datasets.nuscenes(tmp_path)
@@ -250,7 +250,7 @@ def test_what_is_ahead_is_ahead_in_nuscenes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(drive.raw(0).points, datasets.scan(0)[:, :3] * [1, -1, 1])
 
 
-def test_nuscenes_from_its_tables_folder_and_with_lost_files(tmp_path: Path, capsys: Capture) -> None:
+def test_nuscenes_is_read_from_its_tables_folder(tmp_path: Path, capsys: Capture) -> None:
     root = datasets.nuscenes(tmp_path)
     assert main(["info", str(root)]) == 2
     assert "choose with --sequence NAME; there are scene-0061, scene-0103" in capsys.readouterr().err
@@ -312,7 +312,7 @@ def plain(root: Path) -> Path:
 POINTS = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
 
 
-def test_a_folder_of_clouds_and_images(tmp_path: Path) -> None:
+def test_a_folder_of_clouds_and_images_is_read(tmp_path: Path) -> None:
     root = plain(tmp_path)
     (root / "calibration.yaml").write_text(
         "cameras:\n  front:\n    K: [100, 0, 62, 0, 100, 19, 0, 0, 1]\n"
@@ -339,7 +339,7 @@ def test_a_folder_of_clouds_and_images(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["bin", "npy", "ply", "ply-ascii"])
-def test_formats_of_clouds(tmp_path: Path, form: str) -> None:
+def test_every_cloud_format_is_read(tmp_path: Path, form: str) -> None:
     """Two frames by number; PLY as its document has it."""
     for i in range(2):
         file = tmp_path / f"{i:06d}.{form[:3]}"
@@ -364,7 +364,7 @@ def test_formats_of_clouds(tmp_path: Path, form: str) -> None:
         np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
 
 
-def test_stamps_of_a_table_and_of_names(tmp_path: Path, capsys: Capture) -> None:
+def test_stamps_come_from_a_table_or_from_names(tmp_path: Path, capsys: Capture) -> None:
     for name in "ab":
         POINTS.tofile(tmp_path / f"{name}.bin")
     (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\nb.bin,1700000000600000000\n")
@@ -482,7 +482,7 @@ def test_a_label_that_is_cut_costs_that_scan_its_labels(tmp_path: Path, capsys: 
     assert "000001.label: 399 labels for 400 points" in said.err
 
 
-def test_which_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> None:
+def test_the_kind_of_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "empty").mkdir()
     assert main(["info", str(tmp_path / "empty"), "--dataset", "kitti-raw"]) == 2
     assert "no drive in it; KITTI raw drive has velodyne_points/data" in capsys.readouterr().err

@@ -140,7 +140,7 @@ def test_the_border_is_grey(tmp_path: Path) -> None:
     height=st.integers(1, 4000),
     layout=st.sampled_from(["YOLOv8", "YOLOX"]),
 )
-def test_the_whole_image_comes_back_whatever_its_size(
+def test_boxes_map_back_for_images_of_any_size(
     width: int, height: int, layout: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     if max(width / height / (W / H), height * W / H / width) > 60:
@@ -152,7 +152,7 @@ def test_the_whole_image_comes_back_whatever_its_size(
     np.testing.assert_allclose(result.xyxy, whole, atol=1e-4 * max(width, height))
 
 
-def test_float16_and_open_sizes(tmp_path: Path) -> None:
+def test_float16_and_dynamic_sizes_are_supported(tmp_path: Path) -> None:
     rows = np.zeros((1, 7, 8400), np.float16)
     rows[0, :, 3] = 320, 200, 64, 32, 0, 0.75, 0
     inputs = (image_input("batch", 3, "height", "width", kind=FLOAT16),)
@@ -184,7 +184,7 @@ some_boxes = st.lists(
 @settings(deadline=None)
 @given(some_boxes, st.floats(0.1, 0.9))
 @example([(0, 0, 4, 4, 0), (0, 0, 4, 40, 0)], 0.1)  # their IoU is the float32 that is next to 0.1, and above
-def test_nms_keeps_what_the_definition_keeps(rows: list[tuple[float, ...]], threshold: float) -> None:
+def test_nms_equals_its_definition(rows: list[tuple[float, ...]], threshold: float) -> None:
     table = np.array(rows, np.float32)
     boxes = np.hstack([table[:, :2], table[:, :2] + table[:, 2:4]])
     classes = table[:, 4].astype(np.int32)
@@ -311,7 +311,7 @@ def test_end_to_end_heads_are_not_suppressed_again(tmp_path: Path) -> None:
     assert result.names == ("class_1", "class_1")
 
 
-def test_only_the_wanted_classes(tmp_path: Path) -> None:
+def test_only_the_configured_classes_are_kept(tmp_path: Path) -> None:
     output = head("YOLOv8", np.array([[0.0, 0, 20, 20], [40, 0, 60, 20]]), SCORES[:2], np.array([0, 2]))
     model = constant(tmp_path / "m.onnx", output, metadata={"names": "['car', 'person', 'cyclist']"})
     assert detector(model, classes=("cyclist",))(np.zeros((H, W, 3), np.uint8)).names == ("cyclist",)
@@ -319,7 +319,7 @@ def test_only_the_wanted_classes(tmp_path: Path) -> None:
         detector(model, classes=("persn",))
 
 
-def test_an_empty_image_and_a_broken_answer_give_no_detection(tmp_path: Path) -> None:
+def test_empty_images_and_nan_outputs_have_no_detections(tmp_path: Path) -> None:
     boxes = np.array([[0.0, 0, np.nan, 20], [0, 0, np.inf, np.inf], [30, 30, 20, 20]])
     model = constant(tmp_path / "m.onnx", head("end-to-end", boxes, SCORES, CLASSES), metadata=ULTRALYTICS)
     assert len(detector(model)(np.zeros((H, W, 3), np.uint8))) == 0
@@ -418,7 +418,7 @@ def test_rtdetr_with_two_classes_is_told_from_its_older_form(tmp_path: Path) -> 
         assert (result.score[0], result.class_id[0]) == (pytest.approx(score), class_id)
 
 
-def test_rtdetr_and_dfine_of_their_repositories(tmp_path: Path) -> None:
+def test_rtdetr_and_dfine_of_their_repositories_are_read(tmp_path: Path) -> None:
     """They are told the image's size and answer in it: this one answers twice what it is told."""
     size = ("orig_target_sizes", ("N", 2), INT64)
     nodes = [
@@ -462,7 +462,7 @@ def test_rtdetr_of_its_repository_resamples_like_torchvision(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("flat", [True, False])
-def test_yolonas_with_its_pre_and_postprocessing(flat: bool, tmp_path: Path) -> None:
+def test_yolonas_with_its_own_processing_is_read(flat: bool, tmp_path: Path) -> None:
     """In a letterbox with a margin of two pixels on each side; lists are filled up with -1."""
     ratio = min((W - 4) / 200, (H - 4) / 120)
     inner = round(200 * ratio), round(120 * ratio)
@@ -504,7 +504,7 @@ def test_two_tables_are_read_where_ultralytics_exported_them(tmp_path: Path) -> 
             detector(constant(tmp_path / "other.onnx", *order, metadata=NAMES))
 
 
-def test_pixels_that_nothing_tells_the_meaning_of_are_refused(tmp_path: Path) -> None:
+def test_an_ambiguous_pixel_format_is_refused(tmp_path: Path) -> None:
     whole, real = image_input(1, 3, H, W, kind=UINT8), image_input(1, 3, H, W)
     rows = {"flat_predictions": np.zeros((0, 7), np.float32)}
     with pytest.raises(UserError, match="YOLO-NAS wants its pixels: export it with preprocessing=True"):
@@ -516,7 +516,7 @@ def test_pixels_that_nothing_tells_the_meaning_of_are_refused(tmp_path: Path) ->
         detector(constant(tmp_path / "v8.onnx", output, inputs=(whole,)))
 
 
-def test_yolov7_with_its_nms(tmp_path: Path) -> None:
+def test_yolov7_with_its_nms_is_read(tmp_path: Path) -> None:
     """Number of the image, box, class, score; one row alone is a list as well."""
     boxes = to_input("YOLOv8", BOXES, 200, 120)
     rows = np.column_stack([np.zeros(3), boxes, CLASSES, SCORES]).astype(np.float32)
@@ -619,7 +619,7 @@ def test_a_decoded_grid_needs_names(tmp_path: Path) -> None:
         detector(model, names=str(names))
 
 
-def test_an_angle_is_no_class(tmp_path: Path) -> None:
+def test_an_angle_column_is_not_read_as_a_class(tmp_path: Path) -> None:
     """Without metadata the angle of oriented boxes looks like a class that is seen everywhere."""
     output = head("YOLOv8", BOXES / 3, SCORES, CLASSES, count=4)
     names = tmp_path / "names.txt"
@@ -645,7 +645,7 @@ def test_an_angle_is_no_class(tmp_path: Path) -> None:
         (("a", "b", "c"), ((1, 3, 8, 12, 8), (1, 3, 4, 6, 8), (1, 3, 2, 3, 8)), "YOLOv7: --grid"),
     ],
 )
-def test_strangers_are_called_by_name(
+def test_networks_of_other_kinds_are_named(
     names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], said: str, tmp_path: Path
 ) -> None:
     outputs = {name: np.zeros(shape, np.float32) for name, shape in zip(names, shapes, strict=True)}
@@ -686,7 +686,7 @@ def test_an_empty_list_of_detections_is_checked_later(row: list[float], said: st
 # --- names -------------------------------------------------------------------------------------
 
 
-def test_names(tmp_path: Path) -> None:
+def test_class_names_come_from_a_file_or_coco(tmp_path: Path) -> None:
     coco = constant(tmp_path / "coco.onnx", np.zeros((1, 84, CELLS), np.float32))
     assert detector(coco).names == COCO
     assert (len(COCO), COCO[0], COCO[79]) == (80, "person", "toothbrush")
@@ -709,7 +709,7 @@ def test_names(tmp_path: Path) -> None:
 # --- what is no detector -----------------------------------------------------------------------
 
 
-def test_files_that_are_no_model(tmp_path: Path) -> None:
+def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         detector(str(tmp_path / "missing.onnx"))
     with pytest.raises(UserError, match="no such file"):
@@ -725,13 +725,13 @@ def test_files_that_are_no_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1, H, W), (1, H, W, 3), (H, W), (1, 3, 1, H, W)])
-def test_inputs_that_are_no_colour_image(shape: tuple[int, ...], tmp_path: Path) -> None:
+def test_inputs_that_are_no_colour_image_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
     model = constant(tmp_path / "m.onnx", np.zeros((1, 7, CELLS), np.float32), inputs=(image_input(*shape),))
     with pytest.raises(UserError, match=r"no detector of one colour image .*; its inputs: images \["):
         detector(model)
 
 
-def test_inputs_for_more_than_the_image(tmp_path: Path) -> None:
+def test_inputs_beside_the_image_are_refused(tmp_path: Path) -> None:
     zeros = np.zeros((1, 7, CELLS), np.float32)
     several = constant(tmp_path / "batch.onnx", zeros, inputs=(image_input(4, 3, H, W),))
     with pytest.raises(
@@ -746,7 +746,7 @@ def test_inputs_for_more_than_the_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1000), (1, 197, 768), (1, 21, 64, 64), (1, 9, 777)])
-def test_outputs_that_are_no_detections(shape: tuple[int, ...], tmp_path: Path) -> None:
+def test_outputs_that_are_no_detections_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
     model = constant(tmp_path / "m.onnx", np.zeros(shape, np.float32))
     with pytest.raises(
         UserError, match=r"no detector that is known here; its outputs: output0 \[1, .*YOLOv8"
@@ -754,13 +754,13 @@ def test_outputs_that_are_no_detections(shape: tuple[int, ...], tmp_path: Path) 
         detector(model)
 
 
-def test_types_that_no_detector_has(tmp_path: Path) -> None:
+def test_unsupported_tensor_types_are_refused(tmp_path: Path) -> None:
     inputs = (image_input(1, 3, H, W, kind=onnx_networks.DOUBLE),)
     with pytest.raises(UserError, match="supported: tensor"):
         detector(constant(tmp_path / "double.onnx", np.zeros((1, 7, CELLS), np.float32), inputs=inputs))
 
 
-def test_execution_providers(tmp_path: Path) -> None:
+def test_execution_providers_are_chosen_by_name(tmp_path: Path) -> None:
     model = constant(tmp_path / "m.onnx", np.zeros((1, 7, CELLS), np.float32))
     assert detector(model, provider="cpu").provider == "CPU"
     assert detector(model, provider="CPUExecutionProvider").provider == "CPU"

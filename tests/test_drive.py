@@ -35,7 +35,7 @@ def drive(bag: Path) -> Iterator[bevviz.Drive]:
         yield drive
 
 
-def test_what_is_there(drive: bevviz.Drive) -> None:
+def test_a_drive_states_its_contents(drive: bevviz.Drive) -> None:
     assert len(drive) == 12
     assert drive.scene.cameras == ("zed",)
     np.testing.assert_allclose(drive.times, 0.1 * np.arange(12), atol=1e-6)
@@ -78,7 +78,7 @@ def test_the_answer_is_that_of_the_command(
     assert [answer.verdict.text for answer in answers] == [answer["verdict"] for answer in told]
 
 
-def test_one_questioner_answers_for_a_scan(drive: bevviz.Drive) -> None:
+def test_several_questions_share_one_run_of_a_scan(drive: bevviz.Drive) -> None:
     questioner = drive.questioner(0.5)
     assert drive.questioner(0.5) is questioner
     number = len(drive.at(0.5).clusters or ())
@@ -90,7 +90,7 @@ def test_one_questioner_answers_for_a_scan(drive: bevviz.Drive) -> None:
     assert drive.questioner(0.0) is not questioner
 
 
-def test_a_change_is_for_what_is_asked_from_then_on(drive: bevviz.Drive) -> None:
+def test_a_changed_parameter_applies_to_later_questions(drive: bevviz.Drive) -> None:
     before = drive.at(0.5)
     changed = drive.configure("clustering.eps=20 cm", fusion={"min_points": 5})
     assert {key: str(change) for key, change in changed.items()} == {
@@ -108,7 +108,7 @@ def test_a_change_is_for_what_is_asked_from_then_on(drive: bevviz.Drive) -> None
     assert drive.at(0.5) is after
 
 
-def test_parameters_as_a_mapping_or_as_settings(bag: Path, tmp_path: Path) -> None:
+def test_parameters_may_be_a_mapping_or_settings(bag: Path, tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     file.write_text("clustering: {eps: 0.9, min_points: 7}\n")
     stated = {"clustering.eps": 0.6, "detector.classes": ["person", "car"]}
@@ -132,7 +132,7 @@ def test_a_saved_drive_is_that_of_the_command(drive: bevviz.Drive, bag: Path, tm
         assert repr(ours.rows[entity]) == repr(theirs.rows[entity])
 
 
-def test_tables(drive: bevviz.Drive) -> None:
+def test_results_are_exported_as_tables(drive: bevviz.Drive) -> None:
     pytest.importorskip("pandas")
     result = drive.at(0.5)
     assert result.objects is not None and result.clusters is not None
@@ -151,7 +151,7 @@ def test_tables(drive: bevviz.Drive) -> None:
     assert len(last.tracks.to_pandas()) == len(last.tracks)
 
 
-def test_the_synthetic_drive() -> None:
+def test_the_synthetic_drive_can_be_opened() -> None:
     with bevviz.simulate(frames=5, seed=2, set={"voxel.size": 0.2}) as drive:
         assert len(drive) == 5
         assert drive.at(0.3).frame.index == 3
@@ -172,12 +172,12 @@ def test_the_synthetic_drive() -> None:
         ({"frame": -13}, "frame -1: drive.mcap has 12 scans"),
     ],
 )
-def test_what_cannot_be_asked(drive: bevviz.Drive, asked: dict[str, object], message: str) -> None:
+def test_wrong_questions_raise_an_error(drive: bevviz.Drive, asked: dict[str, object], message: str) -> None:
     with pytest.raises(bevviz.UserError, match=message):
         drive.at(**asked)  # type: ignore[call-overload]
 
 
-def test_importing_costs_next_to_nothing() -> None:
+def test_importing_the_package_is_fast() -> None:
     """What is heavy comes with the first drive."""
     code = "import bevviz, sys; print(sorted({'numpy', 'rerun', 'numba', 'cv2'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

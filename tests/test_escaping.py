@@ -66,7 +66,7 @@ def test_markdown_shows_any_text_as_it_is(text: str) -> None:
 
 
 @given(st.lists(st.tuples(ANYTHING, ANYTHING), min_size=1, max_size=4))
-def test_a_table_of_any_text(cells: list[tuple[str, str]]) -> None:
+def test_any_text_stays_in_its_table_cell(cells: list[tuple[str, str]]) -> None:
     rows = [("what", "how many"), *cells]
     tokens = READER.parse(table.markdown(rows))
     assert tokens[0].type == "table_open" and tokens[-1].type == "table_close"
@@ -95,7 +95,7 @@ def test_our_own_sentences_stay_as_they_are(text: str) -> None:
 
 
 @given(ANYTHING)
-def test_nothing_acts_on_a_terminal(text: str) -> None:
+def test_control_characters_do_not_reach_the_terminal(text: str) -> None:
     safe = printable(text)
     assert not re.search(r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]", safe)
     assert printable(safe) == safe
@@ -106,7 +106,7 @@ def test_nothing_acts_on_a_terminal(text: str) -> None:
     assert head.isprintable() and row.isprintable()
 
 
-def test_columns() -> None:
+def test_columns_are_aligned_for_any_text() -> None:
     rows = [("what", "n", "text"), ("a", "10", "x"), ("bcd", "5", "yz")]
     assert list(table.lines(rows)) == ["what   n  text", "a     10     x", "bcd    5    yz"]
     assert list(table.lines(rows, "lrl")) == ["what   n  text", "a     10  x", "bcd    5  yz"]
@@ -148,7 +148,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("calib {bag}", 0),
     ],
 )
-def test_a_hostile_bag_is_shown_and_does_nothing(
+def test_names_in_a_hostile_bag_are_shown_as_text(
     command: str,
     status: int,
     hostile: Path,

@@ -91,7 +91,7 @@ def average_precision(kitti_case: dict[str, Any]) -> dict[tuple[str, float, str,
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("bev", "ap_bev"), ("3d", "ap_3d"), ("image", "ap_bbox")])
-def test_average_precision_is_that_of_kittis_development_kit(
+def test_average_precision_equals_kittis_development_kit(
     kitti_case: dict[str, Any],
     average_precision: dict[tuple[str, float, str, str], float],
     ours: str,
@@ -108,7 +108,7 @@ def test_average_precision_is_that_of_kittis_development_kit(
 # --- tracks ------------------------------------------------------------------------------------
 
 
-def test_hota_mota_and_idf1_are_those_of_trackeval() -> None:
+def test_hota_mota_and_idf1_equal_trackeval() -> None:
     pytest.importorskip("motmetrics", reason="needs the extra 'evaluate'")
     with np.load(REFERENCES / "trackeval.npz") as file:
         case = {name: file[name] for name in file.files}
@@ -194,7 +194,7 @@ def test_a_perfect_result_is_perfect(drive: Path) -> None:
     assert evaluation.metrics["ap_3d_0.7.car"] == pytest.approx(min(few, 40) / 40)
 
 
-def test_a_gate_that_is_kept_and_one_that_is_not(drive: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_the_gate_passes_and_fails_by_its_limits(drive: Path, tmp_path: Path, capsys: Capture) -> None:
     files = ["--json", str(tmp_path / "e.json"), "--junit", str(tmp_path / "e.xml")]
     saved = tmp_path / "e.rrd"
     command = ["evaluate", str(drive), "--model", "demo", *files]
@@ -239,14 +239,14 @@ def test_a_gate_that_is_kept_and_one_that_is_not(drive: Path, tmp_path: Path, ca
         (["--min", "recall=0", "--junit", "none/j.xml"], "--junit none/j.xml: cannot be written"),
     ],
 )
-def test_wrong_calls(drive: Path, arguments: list[str], message: str, capsys: Capture) -> None:
+def test_wrong_calls_are_one_line(drive: Path, arguments: list[str], message: str, capsys: Capture) -> None:
     assert main(["evaluate", str(drive), "--frames", ":1", *arguments]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("bevviz: error: ")
     assert message in said
 
 
-def test_a_bag_without_truth(tmp_path: Path, capsys: Capture) -> None:
+def test_a_bag_without_truth_is_one_line(tmp_path: Path, capsys: Capture) -> None:
     bag = bags.write(tmp_path / "small", bags.small_items())
     assert main(["evaluate", str(bag)]) == 2
     assert "no .../ground_truth in it; give --truth TOPIC" in capsys.readouterr().err
@@ -299,7 +299,7 @@ def test_a_folder_of_kitti_is_read_as_it_is_labelled(made_up: Path) -> None:
         ("velodyne/000000.bin", "abcdefg", "no point in it"),
     ],
 )
-def test_damaged_folders_of_kitti(
+def test_damaged_kitti_folders_are_one_line(
     made_up: Path, file: str, content: str, message: str, capsys: Capture
 ) -> None:
     (made_up / file).write_text(content)
@@ -307,7 +307,7 @@ def test_damaged_folders_of_kitti(
     assert message in capsys.readouterr().err
 
 
-def test_real_frames(shared: Path, capsys: Capture) -> None:
+def test_real_frames_are_evaluated(shared: Path, capsys: Capture) -> None:
     model = str(shared / "models/yolox_nano.onnx")
     assert main(["evaluate", str(shared / "kitti"), "--model", model, "--min", "recall.car=0.8"]) == 0
     said = capsys.readouterr()
@@ -341,7 +341,7 @@ def named(*rows: tuple[str, float, float]) -> Objects:
     )
 
 
-def test_what_is_false_counts_for_the_class_that_it_may_be() -> None:
+def test_false_boxes_count_for_each_class_they_may_be() -> None:
     """Also in frames before the first label of that class."""
     score = ObjectScore()
     score.add(named(("person", 5, 5), ("bench", 7, 7)), labelled(("Cyclist", 30, 0)))
@@ -357,7 +357,7 @@ def test_what_is_false_counts_for_the_class_that_it_may_be() -> None:
     assert dict(score.total) == {"tp": 2, "fp": 3, "fn": 2}
 
 
-def test_average_precision_falls_by_what_is_false_in_any_frame() -> None:
+def test_false_boxes_in_any_frame_lower_the_precision() -> None:
     """A detector's persons, where people have labelled pedestrians and cyclists."""
 
     def averages(*more: Objects) -> dict[str, float]:
@@ -385,7 +385,7 @@ def test_average_precision_falls_by_what_is_false_in_any_frame() -> None:
 # --- many bags ---------------------------------------------------------------------------------
 
 
-def test_a_batch_is_held_to_the_truth(
+def test_a_batch_is_evaluated_against_the_truth(
     drive: Path, evaluated: Evaluation, tmp_path: Path, capsys: Capture
 ) -> None:
     runs, junit = tmp_path / "runs", tmp_path / "ci.xml"

@@ -51,7 +51,7 @@ def texts(explanations: tuple[Explanation, ...]) -> list[str]:
     return [e.text for e in explanations]
 
 
-def test_a_match_and_what_was_refused() -> None:
+def test_matches_and_refusals_are_explained() -> None:
     wall, behind = slab(15, 0, 0, 20, 4), slab(-12, 5, 0, 1, 1)
     points, clusters = clusters_of([wall, PERSON, behind])
     result = run(points, clusters, detections_of([silhouette(PERSON)]), DEFAULT)
@@ -71,7 +71,7 @@ def test_a_match_and_what_was_refused() -> None:
     ]
 
 
-def test_what_the_camera_made_of_clusters() -> None:
+def test_splits_and_merges_by_the_camera_are_explained() -> None:
     points, clusters = clusters_of([slab(15, 0, 0, 20, 4), PERSON, slab(9, 5, 0, 1, 1)])
     result = run(points, clusters, detections_of([silhouette(PERSON)] * 2), DEFAULT)
     i32 = np.int32
@@ -102,7 +102,7 @@ def test_what_the_camera_made_of_clusters() -> None:
     ]
 
 
-def test_detections_that_are_not_kept() -> None:
+def test_dropped_detections_are_explained() -> None:
     points, clusters = clusters_of([slab(8, 4, 0, 1, 1)])
     detections = replace(
         detections_of([silhouette(PERSON)] * 3, [0.83, 0.44, 0.21]),
@@ -150,7 +150,7 @@ def test_points_that_belong_to_no_candidate_are_named() -> None:
         ("fusion.max_depth=7.5", "fusion.max_depth is 7.5 m"),
     ],
 )
-def test_the_rule_that_refused_a_pair(setting: str, rule: str) -> None:
+def test_the_refusing_rule_is_named(setting: str, rule: str) -> None:
     config = load(None, ["detector.model=m", setting])
     points, clusters = clusters_of([PERSON])
     found = explain([run(points, clusters, detections_of([silhouette(PERSON)]), config)], clusters, config)
@@ -162,7 +162,7 @@ def test_the_rule_that_refused_a_pair(setting: str, rule: str) -> None:
     ]
 
 
-def test_what_another_one_took() -> None:
+def test_the_winner_of_a_cluster_is_named() -> None:
     points, clusters = clusters_of([PERSON])
     box = silhouette(PERSON)
     result = run(points, clusters, detections_of([box, box], [0.8, 0.4], "person bicycle"), DEFAULT)
@@ -195,7 +195,7 @@ def test_the_reference_says_that_one_box_names_several() -> None:
     ]
 
 
-def test_several_cameras() -> None:
+def test_several_cameras_are_named() -> None:
     points, clusters = clusters_of([PERSON, slab(-12, 5, 0, 1, 1)])
     left = run(points, clusters, detections_of([silhouette(PERSON)]), DEFAULT, "left")
     right = run(points, clusters, Detections.empty(), DEFAULT, "right")
@@ -208,7 +208,7 @@ def test_several_cameras() -> None:
     assert [e.camera for e in found[1:]] == ["left", "right", ""]
 
 
-def test_what_is_missing_is_said() -> None:
+def test_missing_inputs_are_named() -> None:
     points, clusters = clusters_of([PERSON])
     unseen = CameraResult(camera("left", ("no image within sync.tolerance 0.1 s",), image=False), None, None)
     lost = CameraResult(camera("right", ("no transform",)), detections_of([silhouette(PERSON)]), None)

@@ -115,9 +115,7 @@ def test_images_are_rectified() -> None:
     np.testing.assert_allclose([columns.mean(), rows.mean()], flat, atol=1)
 
 
-def test_a_folder_that_holds_something_is_left_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine").touch()
     with pytest.raises(UserError, match="is there already"):
         KittiExport(tmp_path)
@@ -152,7 +150,7 @@ def test_a_scene_of_nuscenes_has_the_same_frames(exported: tuple[Path, bevviz.Dr
             assert np.abs(np.sin(truth.boxes.yaw - boxes.yaw)).max() < 1e-3  # the road is not level
 
 
-def test_the_tables_of_nuscenes_name_what_there_is(exported: tuple[Path, bevviz.Drive]) -> None:
+def test_the_nuscenes_tables_name_existing_files(exported: tuple[Path, bevviz.Drive]) -> None:
     """As the devkit goes through them: by tokens, from row to row, and from a track to its annotations."""
     root = exported[0].parent / "scenes"
     tables = {name: json.loads((root / VERSION / f"{name}.json").read_text()) for name in TABLES}
@@ -181,7 +179,7 @@ def test_the_tables_of_nuscenes_name_what_there_is(exported: tuple[Path, bevviz.
     assert len(tables["sample_annotation"]) > 3 * len(tables["instance"])  # they are tracks
 
 
-def test_a_track_is_called_what_it_was_called_most(tmp_path: Path) -> None:
+def test_a_track_has_its_most_frequent_class(tmp_path: Path) -> None:
     """A detector may begin with another name; an instance of nuScenes has one for all of its annotations."""
 
     class Beginning(NuScenesExport):

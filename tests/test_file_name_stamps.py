@@ -44,7 +44,9 @@ def date(stamp: int, form: str) -> str:
         (lambda i, t: date(t, "%Y-%m-%dT%H-%M-%S") + f".{t % SECOND // 1000:06}Z", 0, 1000),
     ],
 )
-def test_stamps_as_programs_write_them(name: Callable[[int, int], str], off: int, precision: int) -> None:
+def test_stamps_of_common_programs_are_read(
+    name: Callable[[int, int], str], off: int, precision: int
+) -> None:
     files = [Path(f"{name(i, stamp)}.pcd") for i, stamp in enumerate(STAMPS)]
     told = file_times(sorted(files))
     assert told and not told.frames
@@ -69,7 +71,7 @@ def test_stamps_as_programs_write_them(name: Callable[[int, int], str], off: int
     ],
 )
 @pytest.mark.parametrize("count", [5, 40])
-def test_numbers_of_frames_wherever_they_are(name: str, count: int) -> None:
+def test_frame_numbers_are_found_anywhere_in_names(name: str, count: int) -> None:
     files = [Path(name.format(i=i) + ".pcd") for i in range(count)]
     assert list(group_by_sensor(files)) == [""]
     told = file_times(files)
@@ -87,7 +89,7 @@ def test_numbers_of_frames_wherever_they_are(name: str, count: int) -> None:
         "cam{camera}_1700000{frame:03}_{camera}5",
     ],
 )
-def test_cameras_in_one_folder(name: str) -> None:
+def test_several_cameras_in_one_folder_are_separated(name: str) -> None:
     pairs = [(frame, camera) for frame in range(30) for camera in range(2)]
     names = [name.format(frame=f, camera=c, stamp=STAMPS[f] + 777 * c) for f, c in pairs]
     groups = group_by_sensor([Path(f"{name}.png") for name in names])
@@ -162,7 +164,7 @@ def test_a_camera_that_counts_its_own_frames(tmp_path: Path) -> None:
         (["250000000", "500000000", "750000000"], [0.25, 0.5, 0.75]),
     ],
 )
-def test_stamps_of_a_table(stamps: list[str], seconds: list[float], tmp_path: Path) -> None:
+def test_a_table_states_the_stamps(stamps: list[str], seconds: list[float], tmp_path: Path) -> None:
     rows = ["file,stamp", *(f"top/{name}.bin,{stamp}" for name, stamp in zip("abc", stamps, strict=False))]
     (tmp_path / "stamps.csv").write_text("\n".join(rows), encoding="utf-8-sig")
     names = " ".join(f"{name}.bin" for name in "abc"[: len(stamps)])
@@ -177,7 +179,7 @@ def test_stamps_of_a_table(stamps: list[str], seconds: list[float], tmp_path: Pa
         ("1 0 0 4 0 1 0 5 0 0 1 6\n", "line 1 has 12 numbers, not 8 (stamp x y z qx qy qz qw)"),
     ],
 )
-def test_poses_of_other_programs(line: str, expected: float | str, tmp_path: Path) -> None:
+def test_poses_of_other_programs_are_read(line: str, expected: float | str, tmp_path: Path) -> None:
     """KITTI's twelve numbers were read as a stamp and a quaternion."""
     (tmp_path / "poses.txt").write_text(line)
     if isinstance(expected, str):
@@ -188,7 +190,7 @@ def test_poses_of_other_programs(line: str, expected: float | str, tmp_path: Pat
         assert drive_in(tmp_path, {"top": "1700000001.5.bin"})["tf"] == [expected]
 
 
-def test_lidars_with_other_columns(tmp_path: Path) -> None:
+def test_lidars_may_have_different_columns(tmp_path: Path) -> None:
     """The columns of the largest file were taken for all of them."""
     for name, columns in (("top", 5), ("livox", 4)):
         (tmp_path / name).mkdir()
@@ -203,7 +205,7 @@ def test_lidars_with_other_columns(tmp_path: Path) -> None:
     assert any(line.startswith("nothing says how livox, top are mounted") for line in drive.warnings)
 
 
-def test_what_systems_leave_in_folders_is_no_data(tmp_path: Path) -> None:
+def test_files_of_operating_systems_are_ignored(tmp_path: Path) -> None:
     """Of a drive from a Mac each cloud was there twice, and the second could not be read."""
     files = {"top": "1.bin ._1.bin .hidden.bin", "front": "1.png ._1.png", "__MACOSX": "1.bin 2.bin"}
     assert drive_in(tmp_path, files) == {"top": [1.1], "front": [1.1]}
@@ -274,7 +276,7 @@ def test_many_files_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("size", "told"), [("", True), ("size: [1280, 720], ", False)])
-def test_a_calibration_for_larger_images(size: str, told: bool, tmp_path: Path) -> None:
+def test_a_calibration_for_larger_images_is_scaled(size: str, told: bool, tmp_path: Path) -> None:
     """What was projected fell beside the image, and nothing said why."""
     drive_in(tmp_path, {"top": "1.bin", "front": ""})
     cv2.imwrite(str(tmp_path / "front/1.png"), np.zeros((360, 640, 3), np.uint8))
@@ -288,7 +290,7 @@ def test_a_calibration_for_larger_images(size: str, told: bool, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("rate", ["0", "-1", "fast", ".nan"])
-def test_a_rate_that_is_none(rate: str, tmp_path: Path) -> None:
+def test_an_invalid_rate_is_one_line(rate: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"calibration\.yaml: rate is"):
         drive_in(tmp_path, {"top": "1.bin"}, f"rate: {rate}")
 

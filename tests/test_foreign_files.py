@@ -47,7 +47,7 @@ DATA binary
 
 
 @pytest.mark.parametrize("header", [OLD, COLUMNS, NO_POINTS, NO_WIDTH])
-def test_pcd_of_older_versions_and_with_less_said(header: str, tmp_path: Path) -> None:
+def test_pcd_of_older_versions_is_read(header: str, tmp_path: Path) -> None:
     file = tmp_path / "0001.pcd"
     file.write_text(header + "1 2 3\n4 5 6\n")
     points, announced = read_cloud(file, ())
@@ -73,7 +73,7 @@ POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12
 
 
 @pytest.mark.parametrize("name", ["drive.mcap", "drive.db3", "drive.bag"])
-def test_pointer_of_git_lfs_in_place_of_a_bag(name: str, tmp_path: Path) -> None:
+def test_a_git_lfs_pointer_of_a_bag_is_named(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(POINTER)
     with pytest.raises(UserError, match=f"{name}: a Git LFS pointer, not the file itself: 'git lfs pull'"):
         Recording([tmp_path / name])

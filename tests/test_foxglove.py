@@ -66,11 +66,11 @@ def check(path: Path, expected: Callable[[int], F32] = lambda scan: points(scan)
 
 
 @pytest.mark.parametrize("image", ["png", "raw"])
-def test_protobuf_by_foxgloves_sdk(image: str, tmp_path: Path) -> None:
+def test_protobuf_of_foxgloves_sdk_is_read(image: str, tmp_path: Path) -> None:
     check(write(tmp_path / "drive.mcap", image=image))
 
 
-def test_video_in_protobuf(tmp_path: Path) -> None:
+def test_video_in_protobuf_is_read(tmp_path: Path) -> None:
     with BagSource([write(tmp_path / "drive.mcap", image="video")], load()) as source:
         images = [frame.cameras[0].image for frame in source]
     assert [image is not None and image.media_type for image in images] == ["video/h264"] * SCANS
@@ -82,7 +82,7 @@ def test_a_clouds_own_pose_is_applied(tmp_path: Path) -> None:
     check(path, lambda scan: geometry.apply(offset, points(scan)[:, :3]))
 
 
-def test_json_says_the_same(tmp_path: Path) -> None:
+def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path) -> None:
     """What the SDK wrote as protobuf, by the SDK as JSON."""
     from google.protobuf.json_format import MessageToDict
     from mcap.reader import make_reader
@@ -201,7 +201,7 @@ def test_a_part_cut_out_runs_again(tmp_path: Path) -> None:
             assert frame.cameras[0].camera_from_points is not None
 
 
-def test_what_is_no_message_is_one_line(tmp_path: Path) -> None:
+def test_undecodable_messages_are_one_line(tmp_path: Path) -> None:
     context, path = foxglove.Context(), tmp_path / "drive.mcap"
     good = base64.b64encode(points(0).tobytes()).decode()
     fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate("xyz")]

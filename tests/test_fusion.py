@@ -102,7 +102,7 @@ def test_the_reference_names_everything_near_the_centre() -> None:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_of_two_that_fit_the_near_one_is_taken(order: int) -> None:
+def test_the_nearer_of_two_clusters_is_taken(order: int) -> None:
     near, far = slab(8, 0, -0.5, 0.6, 1.8), slab(16, 0, -1, 1.2, 3.6)
     points, clusters = clusters_of([near, far][::order])
     fusion = run(points, clusters, detections_of([silhouette(near)]))
@@ -120,7 +120,7 @@ def test_a_truck_is_not_the_pedestrian_before_it() -> None:
     assert both.detection_cluster.tolist() == [1, 0]
 
 
-def test_of_two_boxes_on_one_object_the_surer_one_gets_it() -> None:
+def test_the_surer_of_two_boxes_gets_the_cluster() -> None:
     box = silhouette(PERSON)
     points, clusters = clusters_of([PERSON])
     # The weak one fits a little better.
@@ -147,7 +147,7 @@ def test_every_rule_has_its_decision() -> None:
 
 
 @pytest.mark.parametrize("config", [DEFAULT, REFERENCE], ids=["frustum", "centroid"])
-def test_what_is_not_kept_takes_no_part(config: FusionConfig) -> None:
+def test_dropped_detections_take_no_cluster(config: FusionConfig) -> None:
     points, clusters = clusters_of([PERSON, slab(8, 3, 0, 1, 1)], noise=slab(8, -3, 0, 0.1, 0.1))
     box = silhouette(PERSON)
     small = replace(clusters, state=np.array([ClusterState.TOO_SMALL, 0], np.int32))
@@ -185,7 +185,7 @@ def test_a_cluster_cut_by_the_image_border_still_matches() -> None:
 
 
 @pytest.mark.parametrize("config", [DEFAULT, REFERENCE], ids=["frustum", "centroid"])
-def test_nothing_to_fuse(config: FusionConfig) -> None:
+def test_empty_inputs_are_fused(config: FusionConfig) -> None:
     nothing = clusters_of([])
     something = clusters_of([PERSON])
     assert run(*nothing, Detections.empty(), config).cluster_uv.shape == (0, 4)
@@ -238,7 +238,7 @@ def costs(draw: st.DrawFn) -> F64:
 
 @settings(deadline=None)
 @given(costs())
-def test_assignment_is_the_best_of_all(cost: F64) -> None:
+def test_the_assignment_has_the_least_cost(cost: F64) -> None:
     rows, columns = cost.shape
 
     def total(choice: tuple[int, ...]) -> float:

@@ -40,14 +40,14 @@ def test_quaternion_round_trip(q: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("q", [(0, 0, 0, 0), (np.nan, 0, 0, 1)])
-def test_no_rotation(q: tuple[float, ...]) -> None:
+def test_the_zero_quaternion_is_refused(q: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="is no rotation"):
         geometry.transform(np.zeros(3), np.array(q))
 
 
 @settings(deadline=None)
 @given(poses())
-def test_inverse(pose: F64) -> None:
+def test_inverse_undoes_a_transform(pose: F64) -> None:
     np.testing.assert_allclose(geometry.inverse(pose) @ pose, np.eye(4), atol=1e-9)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
 
@@ -67,7 +67,7 @@ def test_interpolation_turns_evenly_on_the_shorter_arc(a: F64, b: F64, t: float)
 
 @settings(deadline=None)
 @given(poses(), st.lists(st.tuples(reals, reals, reals), max_size=20))
-def test_apply(pose: F64, points: list[tuple[float, float, float]]) -> None:
+def test_apply_equals_the_matrix_product(pose: F64, points: list[tuple[float, float, float]]) -> None:
     p = np.array(points, np.float32).reshape(-1, 3)
     moved = geometry.apply(pose, p)
     assert moved.dtype == np.float32
@@ -76,7 +76,7 @@ def test_apply(pose: F64, points: list[tuple[float, float, float]]) -> None:
 
 @settings(deadline=None)
 @given(st.floats(-3.1, 3.1))
-def test_yaw(angle: float) -> None:
+def test_yaw_is_read_from_a_transform(angle: float) -> None:
     pose = geometry.transform(np.zeros(3), np.array([0, 0, np.sin(angle / 2), np.cos(angle / 2)]))
     assert geometry.yaw(pose) == pytest.approx(angle)
 
@@ -93,7 +93,7 @@ def seen_points(camera: Intrinsics, count: int = 500) -> F64:
 
 
 @pytest.mark.parametrize("model", CAMERAS)
-def test_projection_is_opencvs(model: str) -> None:
+def test_projection_equals_opencvs(model: str) -> None:
     camera = CAMERAS[model]
     points = seen_points(camera)
     uv, depth = geometry.project(points.astype(np.float32), camera)
@@ -261,11 +261,11 @@ def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn:
         ((0, 0, 0, 0, 0), (0, 0, 2, 2, 0), 0.0),
     ],
 )
-def test_bev_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
+def test_bev_iou_equals_shapely(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
     assert geometry.bev_iou(upright(a), upright(b))[0, 0] == pytest.approx(expected, abs=1e-5)
 
 
-def test_bev_iou_of_none() -> None:
+def test_bev_iou_of_no_boxes_is_empty() -> None:
     assert geometry.bev_iou(Boxes3D.empty(), upright((0, 0, 1, 1, 0))).shape == (0, 1)
 
 

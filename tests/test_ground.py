@@ -118,11 +118,11 @@ def test_height_of_the_sensor_is_found(sensor: float) -> None:
     assert_true(scan(street, THINGS, sensor=sensor), GroundConfig(sensor_height=sensor), within=20)
 
 
-def test_few_beams() -> None:
+def test_ground_is_found_with_few_beams() -> None:
     assert_true(scan(street, THINGS, beams=16), within=25)
 
 
-def test_reflections_below_the_road() -> None:
+def test_reflections_below_the_road_are_ignored() -> None:
     found = scan(street, THINGS)
     rng = np.random.default_rng(0)
     below = found.points[found.is_ground][rng.integers(0, found.is_ground.sum(), 4000)]
@@ -141,7 +141,7 @@ def test_reflections_below_the_road() -> None:
     assert np.quantile(error, 0.98) < 0.15
 
 
-def test_missing_sectors() -> None:
+def test_missing_sectors_are_bridged() -> None:
     """The wedges that a mast hides near the sensor, and all beyond them but a strip far away."""
     found = scan(street, THINGS)
     turn = np.degrees(np.arctan2(found.points[:, 1], found.points[:, 0]))
@@ -150,7 +150,7 @@ def test_missing_sectors() -> None:
     assert_true(Scan(found.points[~hidden], found.height[~hidden], found.is_ground[~hidden]))
 
 
-def test_kerb_makes_no_cluster() -> None:
+def test_a_kerb_makes_no_cluster() -> None:
     found = scan(street, [])
     near = np.hypot(found.points[:, 0], found.points[:, 1]) < 30
     ground = segment_ground(found.points, GroundConfig())
@@ -162,7 +162,7 @@ coordinates = st.floats(-99, 99, width=32)
 
 @settings(deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=coordinates))
-def test_places_in_the_polar_grid(points: F32) -> None:
+def test_points_fall_into_their_polar_cells(points: F32) -> None:
     rings, sectors = 30, 180
     ring, sector, order, start = _sort_into_bins(points, rings, sectors)
     assert ring.dtype == sector.dtype == np.float32
@@ -178,7 +178,7 @@ def test_places_in_the_polar_grid(points: F32) -> None:
 
 @settings(deadline=None, max_examples=15)
 @given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.5, 3.0))
-def test_any_plane(along: float, across: float, sensor: float) -> None:
+def test_any_plane_is_found(along: float, across: float, sensor: float) -> None:
     found = scan(lambda x, y: along * x + across * y, [(9.0, 2.0, PERSON)], sensor=sensor, beams=32)
     ground = segment_ground(found.points, GroundConfig())
     assert ground.mask[found.is_ground].mean() > 0.995
@@ -187,7 +187,7 @@ def test_any_plane(along: float, across: float, sensor: float) -> None:
 
 @pytest.mark.parametrize("method", ["polar", "plane"])
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
-def test_no_plane_to_start_from(method: str, count: int) -> None:
+def test_too_few_points_have_no_plane(method: str, count: int) -> None:
     line = np.linspace(1, 5, count)[:, None] * np.ones((1, 3))
     ground = segment_ground(line.astype(np.float32), GroundConfig.model_validate({"method": method}))
     assert not ground.mask.any()
@@ -287,7 +287,7 @@ def _beside(angle: float, length: float) -> tuple[Ground, Bool]:
 
 
 @pytest.mark.parametrize("frame", ["000000", "000001"])
-def test_plane_finds_open3ds_plane(shared: Path, frame: str) -> None:
+def test_the_plane_equals_open3ds(shared: Path, frame: str) -> None:
     o3d = load()
     points = kitti(shared, frame)
     ground = segment_ground(points, GroundConfig(method="plane", distance_threshold=0.5, iterations=300))

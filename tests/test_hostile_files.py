@@ -46,13 +46,13 @@ def drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (b"a: &a [x]\nb: [*a, *a]\n", "unknown key 'a'"),
     ],
 )
-def test_configurations(content: bytes, said: str, capsys: Capture) -> None:
+def test_hostile_configurations_are_one_line(content: bytes, said: str, capsys: Capture) -> None:
     Path("my.yaml").write_bytes(content)
     assert said in error_of(capsys, "bag", "drive", "--config", "my.yaml", "--save", "out.rrd")
     assert not Path("out.rrd").exists()
 
 
-def test_a_setting_that_is_too_deep(capsys: Capture) -> None:
+def test_a_setting_that_is_nested_too_deep_is_one_line(capsys: Capture) -> None:
     assert "too deep" in error_of(capsys, "bag", "drive", "--set", f"voxel.size={NESTED}")
 
 
@@ -63,7 +63,7 @@ def test_a_pipe_is_not_waited_for(name: str, capsys: Capture) -> None:
     assert "it is no file" in error_of(capsys, *call)
 
 
-def test_a_name_that_is_no_text(tmp_path: Path) -> None:
+def test_file_names_that_are_no_text_are_shown(tmp_path: Path) -> None:
     (source,) = Path("drive").glob("*.mcap")
     odd = Path(os.fsdecode(b"\xff\xfe\x1b[2J.mcap"))
     shutil.copy(source, odd)
@@ -74,7 +74,7 @@ def test_a_name_that_is_no_text(tmp_path: Path) -> None:
     assert main(["batch", str(odd), "-o", "runs", "--jobs", "1"]) == 0
 
 
-def test_what_may_not_be_read(capsys: Capture) -> None:
+def test_files_without_read_permission_are_one_line(capsys: Capture) -> None:
     if os.geteuid() == 0:
         pytest.skip("root may read everything")
     Path("drive").chmod(0)

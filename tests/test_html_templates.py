@@ -69,7 +69,7 @@ def test_only_addresses_of_recordings_are_linked() -> None:
         page("x", [], [row], [], "")
 
 
-def test_what_a_template_names_must_be_there() -> None:
+def test_a_missing_value_of_a_template_is_an_error() -> None:
     with pytest.raises(UndefinedError, match="bags"):
         render("batch.html", title="x")
 
@@ -79,7 +79,7 @@ def test_a_page_loads_nothing() -> None:
     assert policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
-def test_a_plot() -> None:
+def test_a_plot_draws_its_values() -> None:
     drawn = plot("a < b", {"<x>": [(0.0, 1.0), (1.0, 3.0)], "one": [(0.5, -2.0)]}, 0.5)
     assert drawn is not None
     inside = [(x, y) for line in drawn.lines for x, y in line.points]

@@ -47,7 +47,7 @@ def test_a_bag_is_a_recording_on_standard_output(drive: Path, tmp_path: Path) ->
     assert recording.blueprints == 1
 
 
-def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
+def test_foreign_files_are_declined(drive: Path, tmp_path: Path) -> None:
     other = tmp_path / "picture.png"
     other.touch()
     assert run([str(other)]) == NOT_OURS
@@ -57,7 +57,7 @@ def test_what_is_none_of_ours_is_said_so(drive: Path, tmp_path: Path) -> None:
     assert done.stdout.strip() == "False"
 
 
-def test_a_viewer_that_is_closed_ends_it_without_a_word_of_ours(drive: Path) -> None:
+def test_a_closed_viewer_ends_the_importer_silently(drive: Path) -> None:
     (bag,) = drive.glob("*.db3")
     with subprocess.Popen([*COMMAND, str(bag)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as importing:
         assert importing.stdout is not None and importing.stderr is not None
@@ -76,9 +76,7 @@ def asked(*paths: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, str
     return imported
 
 
-def test_of_a_folder_that_is_opened_each_bag_comes_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_bag_of_an_opened_folder_comes_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "drive"
     folder.mkdir()
     about, first, second = (folder / name for name in ("metadata.yaml", "drive.db3", "drive_1.db3"))

@@ -25,7 +25,7 @@ def write(path: Path, *without: str, form: str = "mcap") -> Path:
 
 
 @pytest.mark.parametrize(("form", "name"), [("mcap", "MCAP"), ("sqlite3", "sqlite3"), ("ros1", "ROS 1 bag")])
-def test_a_whole_bag(tmp_path: Path, form: str, name: str) -> None:
+def test_a_whole_bag_is_described(tmp_path: Path, form: str, name: str) -> None:
     path = write(tmp_path / "drive.bag", form=form)
     info = describe_bag([path], load(settings=["detector.model=demo"]))
     assert info.formats == (name,)
@@ -70,7 +70,7 @@ def test_gaps_are_found_in_the_index(tmp_path: Path) -> None:
         assert "0.60 s at 0.9 s" in render_bag_info(info)
 
 
-def test_what_is_missing_and_the_option_that_gives_it(tmp_path: Path) -> None:
+def test_missing_inputs_name_their_options(tmp_path: Path) -> None:
     path = write(tmp_path / "drive", "/tf_static", "/tf", bags.INFO)
     text = render_bag_info(describe_bag([path], Config()))
     assert "camera 'camera' has no CameraInfo, and there is no topic of that kind: record it" in text
@@ -153,14 +153,14 @@ def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
     assert re.search(r"read \d+ messages, \d+ of them from the incomplete last", " ".join(text.split()))
 
 
-def test_a_bag_that_is_none_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_no_bag_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file or folder"):
         describe_bag([tmp_path / "nowhere"], Config())
     with pytest.raises(UserError, match=r"source\.lidar_topics: there is no topic /x"):
         describe_bag([write(tmp_path / "drive")], load(settings=["source.lidar_topics=[/x]"]))
 
 
-def test_kitti(shared: Path, tmp_path: Path) -> None:
+def test_a_kitti_bag_is_described(shared: Path, tmp_path: Path) -> None:
     info = describe_bag([bags.write(tmp_path / "kitti", bags.kitti_items(shared))], Config())
     text = render_bag_info(info)
     assert "camera: 1242 x 375 image/png, fx 721.5" in text
@@ -168,7 +168,7 @@ def test_kitti(shared: Path, tmp_path: Path) -> None:
     assert "fixed frame of 'velodyne': none" in text
 
 
-def test_networks_that_cannot_be_used_are_missing(tmp_path: Path) -> None:
+def test_unusable_networks_are_listed_as_missing(tmp_path: Path) -> None:
     """The detector's and the objects' alike: not there, no network, another kind of network."""
     path, text = write(tmp_path / "drive"), tmp_path / "text.onnx"
     text.write_text("hello")

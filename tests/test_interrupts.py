@@ -44,7 +44,7 @@ def test_an_interrupt_during_imports_ends_the_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_ends_what_has_nothing_to_end(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_a_command_without_open_files(tmp_path: Path, number: signal.Signals) -> None:
     """At once, by the signal, whatever would have become of an exception; temporary folders go."""
     script = (
         "import os, tempfile; tempfile.tempdir = os.getcwd()\n"
@@ -63,7 +63,7 @@ def test_a_signal_ends_what_has_nothing_to_end(tmp_path: Path, number: signal.Si
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_file_that_is_being_written_gets_its_end(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_open_recording_is_completed_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     script = (
         "import os; from pathlib import Path\n"
         "from bevviz.cli import interrupts\n"
@@ -79,7 +79,7 @@ def test_a_file_that_is_being_written_gets_its_end(tmp_path: Path, number: signa
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_ignored_signal_stays_ignored(tmp_path: Path, number: signal.Signals) -> None:
     """As ``nohup`` does it with SIGHUP, and a shell with Ctrl-C for what is in the background."""
     script = (
         "import os, signal\n"
@@ -93,7 +93,7 @@ def test_what_is_ignored_from_the_start_stays_ignored(tmp_path: Path, number: si
     assert python(script, tmp_path).stdout == "False\n"
 
 
-def test_what_remains_is_forgotten_in_time() -> None:
+def test_deleted_files_are_no_longer_tracked() -> None:
     removed: list[str] = []
     cleanup.register("mine", lambda: removed.append("mine"))
     cleanup.register("other", lambda: removed.append("other"))

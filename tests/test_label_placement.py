@@ -38,7 +38,7 @@ def test_a_longer_name_has_more_room() -> None:
     assert choose_named(at, order, (np.array([8.0, 4.0, 4.0]), 1.0)).tolist() == [True, False, True]
 
 
-def test_who_comes_first_is_named_before_the_nearest() -> None:
+def test_earlier_objects_are_named_before_nearer_ones() -> None:
     places = np.array([[10, 0, 0], [10.5, 0.2, 0], [10, 9, 0]], np.float32)
     assert choose_named_in_3d(places).tolist() == [True, False, True]
     assert choose_named_in_3d(places, np.array([False, True, False])).tolist() == [False, True, True]
@@ -49,7 +49,7 @@ def test_from_above_a_name_is_wide_and_low() -> None:
     assert choose_named_in_bev(places).tolist() == [True, False, True]
 
 
-def test_a_lane_is_there_from_its_first_state_on() -> None:
+def test_a_lane_starts_with_its_first_state() -> None:
     class Lanes(Writer):
         def __init__(self) -> None:
             self.written: list[tuple[str, str]] = []

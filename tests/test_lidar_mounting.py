@@ -135,7 +135,7 @@ def test_walls_and_ceilings_are_no_ground(size: tuple[float, float, float], moun
     assert up is not None and np.degrees(np.arccos(min(1.0, up[2]))) < 5
 
 
-def test_where_only_walls_are_seen_nothing_tells() -> None:
+def test_walls_alone_tell_no_mounting() -> None:
     assert ground_normal(in_a_hall((14.0, 7.0, 8.0), np.linspace(-7, 52, 32))) is None
 
 
@@ -161,7 +161,7 @@ def test_a_robot_on_a_slope_stays_in_its_own_frame(scan: Cloud) -> None:
     assert built(scan, np.eye(4), drive)[0].upright is None
 
 
-def test_all_else_follows(scan: Cloud) -> None:
+def test_points_and_poses_follow_the_mounting(scan: Cloud) -> None:
     """Where points are in the world, and where the LiDAR is among them."""
     mounting = turned(y=25)
     mounting[:3, 3] = 0.3, 0.0, 1.2
@@ -201,14 +201,14 @@ def test_the_robot_gets_boxes_in_its_own_frame(scan: Cloud) -> None:
         assert np.abs(corners - corner).max(axis=1).min() < 1e-2, "one of its corners"
 
 
-def test_where_frame_and_ground_disagree_it_is_said(scan: Cloud) -> None:
+def test_a_conflict_of_frame_and_ground_is_reported(scan: Cloud) -> None:
     _, sync = built(scan, np.eye(4), lambda sync, _: by_base(sync, turned(y=20)))
     (text,) = [text for text in sync.report.warnings() if "ground" in text]
     assert "'rslidar' sees is tilted by 20 degrees against the vertical of 'base_link'" in text
     assert "source.extrinsics" in text
 
 
-def test_where_nothing_tells_it_is_assumed_and_said() -> None:
+def test_an_unknown_mounting_is_assumed_and_reported() -> None:
     points = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32) * 5
     sync = Synchronizer(ROLES, CONFIG)
     for i in range(8):
@@ -218,7 +218,7 @@ def test_where_nothing_tells_it_is_assumed_and_said() -> None:
     assert any("nothing" in t or "no transform, no Imu and no ground" in t for t in sync.report.warnings())
 
 
-def test_what_the_ground_alone_tells_is_said(scan: Cloud) -> None:
+def test_a_mounting_from_the_ground_alone_is_reported(scan: Cloud) -> None:
     _, sync = built(scan, turned(x=180), by_ground)
     (text,) = [text for text in sync.report.warnings() if "does not point up" in text]
     assert re.search(r"it is turned by 1(79|80) degrees, by the ground in its scans", text)
@@ -238,7 +238,7 @@ def test_a_least_turn_points_up(direction: F64) -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-16, 1e-9, 1e-7])
-def test_what_is_upside_down_but_for_rounding_stays_ahead(tilt: float) -> None:
+def test_a_nearly_inverted_lidar_still_faces_ahead(tilt: float) -> None:
     for up in ([tilt, 0.0, -1.0], [-tilt, tilt, -1.0]):
         assert _least_turn(LIDAR, np.array(up)) == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-6)
 

@@ -62,7 +62,7 @@ def test_a_hesai_scan_by_its_layout(name: str) -> None:
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_a_bag_of_packets(tmp_path: Path, ros1: bool) -> None:
+def test_a_bag_of_packets_gives_clouds(tmp_path: Path, ros1: bool) -> None:
     made, model = messages(ros1), BY_NAME["PandarXT16"]
     stamps = [bags.START + i * bags.PERIOD for i in range(3)]
     scans = [
@@ -80,7 +80,7 @@ def test_a_bag_of_packets(tmp_path: Path, ros1: bool) -> None:
         assert len(frame.points) == 4 * 8 * 15
 
 
-def test_of_two_returns_the_same_is_one_point() -> None:
+def test_equal_dual_returns_are_one_point() -> None:
     model = BY_NAME["PandarXT32"]
     cloud = decoded([packet(model, 0, mode=0x39)])
     # Blocks go two by two, and only odd channels differ between them.
@@ -88,7 +88,7 @@ def test_of_two_returns_the_same_is_one_point() -> None:
     assert cloud.dropped == 4
 
 
-def test_the_sensors_own_angles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_angles_of_the_sensor_are_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made, model = messages(), BY_NAME["PandarXT16"]
     item = bags.Item("/pandar", SCAN, bags.START, scan(made, bags.START, [packet(model, 0)]))
     path = bags.write(tmp_path / "bag", [item], made)
@@ -146,7 +146,7 @@ def test_a_report_brings_the_sensors_own_angles(tmp_path: Path, monkeypatch: pyt
             np.testing.assert_array_equal(next(iter(source)).points, points)
 
 
-def test_what_cannot_be_decoded_says_why() -> None:
+def test_undecodable_packets_state_the_reason() -> None:
     model = BY_NAME["PandarXT32"]
     cut = decoded([packet(model, n) for n in range(4)], cut=1600)  # into the second to last
     assert (len(cut.xyz), cut.dropped) == (2 * 8 * 31, 2 * 8 + 2 * 8 * 32)
@@ -174,7 +174,7 @@ def test_what_cannot_be_decoded_says_why() -> None:
             LiveMessage("/packets", SCAN, 0, b"\0\1\0\0" + bytes(range(end))).decode()
 
 
-def test_a_velodyne_scan() -> None:
+def test_a_velodyne_scan_equals_its_manual() -> None:
     pytest.importorskip("velodyne_decoder")
     blocks = b""
     for block in range(12):

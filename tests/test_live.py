@@ -440,7 +440,7 @@ def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
     verify(Path("out.rrd"))
 
 
-def test_lightening(frames: list[Frame], drive: SyntheticSource) -> None:
+def test_thinning_reduces_frames_and_data(frames: list[Frame], drive: SyntheticSource) -> None:
     clock = Clock()
 
     class Scans(Replay):
@@ -575,7 +575,7 @@ def test_the_flight_recorder_is_bounded_in_memory(results: list[FrameResult], dr
     assert 500_000 < max(sizes) <= 1_000_000 < sum(len(packet.data) for packet in packets)
 
 
-def test_nothing_to_save(run: Run) -> None:
+def test_saving_without_frames_is_refused(run: Run) -> None:
     def during(live: Live) -> None:
         with pytest.raises(UserError, match="flight_time is 0"):
             live.flight.save()
@@ -583,7 +583,7 @@ def test_nothing_to_save(run: Run) -> None:
     run(["live.flight_time=0"], total=10, during=during)
 
 
-def test_nothing_to_write_is_no_bytes(frames: list[Frame], drive: SyntheticSource) -> None:
+def test_an_empty_buffer_writes_no_bytes(frames: list[Frame], drive: SyntheticSource) -> None:
     config = load()
     with closing(Encoder(config, drive.scene, "live")) as encoder:
         first = encoder.encode(FrameResult.unprocessed(frames[0], config), drive.scene, {}, [])
@@ -646,9 +646,7 @@ def triggers(*settings: str) -> Callable[[FrameResult], str | None]:
     return lambda r: watch.check(replace(r, anomalies=detector.update(r, config.anomalies)))
 
 
-def test_trigger_of_a_detection_without_a_cluster(
-    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unmatched_detection_triggers(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     watch = triggers("live.triggers=[one_sensor]", "anomalies.alone_frames=3")
     alone, matched = result_of(frames[0], Decision.NO_CLUSTER), result_of(frames[0], Decision.MATCHED)
     monkeypatch.setattr("bevviz.anomalies.detector._seen_through", lambda *_: True)
@@ -656,13 +654,13 @@ def test_trigger_of_a_detection_without_a_cluster(
     assert said == [None] * 5 + ["zed: pedestrian 1.00, for 3 frames", None]
 
 
-def test_trigger_of_a_slow_stage(frames: list[Frame]) -> None:
+def test_a_slow_stage_triggers(frames: list[Frame]) -> None:
     watch = triggers("live.triggers=[stage]", "anomalies.stage_time=100 ms")
     assert watch(result_of(frames[0], total=0.09)) is None
     assert watch(result_of(frames[0], total=0.15)) == "total took 150 ms"
 
 
-def test_trigger_of_a_lost_transform(frames: list[Frame]) -> None:
+def test_a_lost_transform_triggers(frames: list[Frame]) -> None:
     watch = triggers("live.triggers=[tf]")
     (camera,) = frames[0].cameras
     lost = replace(frames[0], cameras=(replace(camera, camera_from_points=None),))
@@ -670,7 +668,7 @@ def test_trigger_of_a_lost_transform(frames: list[Frame]) -> None:
     assert said == [None, None, "the transform of zed is lost", None, None]
 
 
-def test_trigger_of_the_sync_error(frames: list[Frame]) -> None:
+def test_a_large_sync_error_triggers(frames: list[Frame]) -> None:
     watch = triggers("live.triggers=[sync]")
     (camera,) = frames[0].cameras
     late = replace(frames[0], cameras=(replace(camera, sync_error=-0.06),))
@@ -683,7 +681,7 @@ def test_only_what_was_asked_for_triggers(frames: list[Frame]) -> None:
     assert watch(result_of(frames[0])) is None
 
 
-def test_triggers_pause(frames: list[Frame]) -> None:
+def test_a_trigger_pauses_after_it_fired(frames: list[Frame]) -> None:
     watch = triggers(
         "live.triggers=[stage]", "live.trigger_pause=1000", "anomalies.stage_time=1 ms", "anomalies.hold=0"
     )
@@ -692,7 +690,7 @@ def test_triggers_pause(frames: list[Frame]) -> None:
     assert [bool(watch(r)) for r in results] == [True, False, False]
 
 
-def test_a_trigger_saves(run: Run) -> None:
+def test_a_trigger_saves_the_last_seconds(run: Run) -> None:
     asked = ["live.triggers=[stage]", "anomalies.stage_time=1 us", "live.flight_folder=flights"]
     outcome = run(asked, total=20)
     assert len(outcome.told("not saved")) == 1  # no such folder: said, and everything goes on
@@ -797,7 +795,7 @@ def test_what_was_written_before_the_disk_was_full_is_readable(
     assert numbers(path) == [0, 1, 2]
 
 
-def test_a_name_that_is_no_recording(run: Run) -> None:
+def test_an_output_that_is_no_recording_is_refused(run: Run) -> None:
     with pytest.raises(UserError, match="expected a file name that ends in"):
         run(save=Path("drive.mcap"))
 
@@ -834,7 +832,7 @@ def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
     assert any("clustering.eps 0.5 -> 0.75" in line for line in log)
 
 
-def test_settings_from_outside(run: Run) -> None:
+def test_parameters_can_be_set_during_a_run(run: Run) -> None:
     def during(live: Live) -> None:
         live.update(["range_x=12", "voxel_size=20 cm", "live.nice=1"])
         assert (live.config.bev.range_x, live.config.voxel.size) == (12, 0.2)
@@ -858,7 +856,7 @@ def test_settings_from_outside(run: Run) -> None:
     assert "range_x: 12.0" in Recording(Path("out.rrd")).static["/config"]["TextDocument:text"][0]
 
 
-def test_a_sensor_that_comes_late(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+def test_a_late_sensor_is_used(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
     class Late(Paced):
         def __iter__(self) -> Iterator[Frame]:
             for frame in super().__iter__():
@@ -982,7 +980,7 @@ def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     assert recording.blueprints == 1
 
 
-def test_nobody_listens_where_a_viewer_should_be(run: Run) -> None:
+def test_an_absent_viewer_is_reported(run: Run) -> None:
     with pytest.raises(UserError, match="no viewer answers"):
         run(connect=[f"rerun+http://127.0.0.1:{a_port()}/proxy"])
 
@@ -1003,7 +1001,7 @@ def test_a_source_that_fails_leaves_a_readable_recording(
     assert numbers(Path("out.rrd")) == list(range(10))
 
 
-def test_stamps_that_jump(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
+def test_jumping_stamps_end_no_run(run: Run, frames: list[Frame], drive: SyntheticSource) -> None:
     class Jumping(Paced):
         def __iter__(self) -> Iterator[Frame]:
             for frame in super().__iter__():
@@ -1085,7 +1083,7 @@ def test_a_run_never_writes_over_files_of_an_earlier_one(tmp_path: Path) -> None
     assert unused_names(tmp_path / "null.rrd") == [tmp_path / "null.rrd"]
 
 
-def test_a_link_is_no_place_for_a_recording(drive: SyntheticSource, tmp_path: Path) -> None:
+def test_a_recording_is_not_written_through_a_link(drive: SyntheticSource, tmp_path: Path) -> None:
     bag, link = tmp_path / "bag.mcap", tmp_path / "drive.rrd"
     bag.write_text("the bag")
     link.symlink_to(bag)
@@ -1100,7 +1098,7 @@ def is_large(path: Path) -> bool:
     return path.exists() and path.stat().st_size > 3_000_000
 
 
-def test_killed_twice_and_started_again_nothing_is_lost(tmp_path: Path) -> None:
+def test_a_run_killed_twice_loses_nothing(tmp_path: Path) -> None:
     """Start the same command again after each kill, as systemd does with Restart=always."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     environment |= alone(tmp_path)

@@ -236,7 +236,7 @@ def test_who_publishes_a_type_is_asked_what_it_is_made_of(
     assert text is not None and "geometry_msgs/PoseStamped[] poses" in text
 
 
-def test_what_is_not_known_is_said(packages: None, tmp_path: Path) -> None:
+def test_an_unknown_type_is_reported(packages: None, tmp_path: Path) -> None:
     said: list[str] = []
     with Node(name="robot") as robot:
         robot.start()

@@ -138,7 +138,7 @@ class Digests(Observer[FrameResult]):
 
 
 @pytest.mark.parametrize("bag", ["snap.mcap", "all.mcap"])
-def test_the_messages_give_the_same_results_in_every_bit(flight: Flight, bag: str) -> None:
+def test_the_saved_messages_give_identical_results(flight: Flight, bag: str) -> None:
     config = load(settings=WAIT)
     again = Digests()
     with BagSource([flight.folder / bag], config) as source:
@@ -196,7 +196,7 @@ def test_a_recording_stands_for_the_bag_beside_it(flight: Flight, tmp_path: Path
         describe_bag([alone], load())
 
 
-def test_what_is_held_is_bounded_and_shown(flight: Flight) -> None:
+def test_the_buffer_is_bounded_and_shown(flight: Flight) -> None:
     assert max(seconds for _, seconds in flight.sizes) <= SECONDS + 3.2
     assert max(size for size, _ in flight.sizes) < 500e6
     (saved,) = [text for text in flight.said if text.startswith("flight recorder saved")]
@@ -270,7 +270,7 @@ def both_are_large(recording: Path, bag: Path) -> bool:
     return waiting > 9_000_000 and recording.stat().st_size > 2_500_000
 
 
-def test_killed_twice_and_started_again_each_bag_is_whole(tmp_path: Path) -> None:
+def test_bags_of_runs_killed_twice_are_whole(tmp_path: Path) -> None:
     """Start the same command again after each kill, as systemd does with Restart=always."""
     command = [sys.executable, "-m", "bevviz.cli", "live", "--save", "drive.rrd", "--save", "drive.mcap"]
     stems = ["drive", "drive-2", "drive-3"]

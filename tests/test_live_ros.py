@@ -114,7 +114,7 @@ def test_frames_are_those_of_the_drive(robot: str) -> None:
         assert 0 < time.time_ns() - frame.received < PATIENCE * 1e9
 
 
-def test_newest_frame_wins(robot: str) -> None:
+def test_the_newest_frame_wins(robot: str) -> None:
     with LiveSource(load()) as source:
         live = frames(source)
         before, dropped = next(live).index, source.dropped
@@ -173,7 +173,7 @@ def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
     assert any(text.startswith("/slow/boxes comes when its frame has gone on") for text in said)
 
 
-def test_remap_of_a_stated_topic(robot: str) -> None:
+def test_a_stated_topic_can_be_remapped(robot: str) -> None:
     config = load(settings=["source.lidar_topics=[/points]"])
     with LiveSource(config, arguments=["-r", f"/points:={LIDAR_TOPIC}"]) as source:
         next(frames(source))
@@ -346,9 +346,7 @@ def test_info_shows_the_graph(robot: str) -> None:
     assert "zed: 640 x 360 uncompressed" in text
 
 
-def test_what_cannot_be_received_is_told_and_not_waited_for(
-    robot: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_topics_that_cannot_be_received_are_reported(robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_vision_msgs(name: str) -> Any:
         if name.startswith("vision_msgs"):
             raise UserError("vision_msgs is not installed")
@@ -369,7 +367,7 @@ def test_what_helps_against_losses_depends_on_the_size() -> None:
     assert "segment" not in remedy(300) and "queue" in remedy(300)
 
 
-def test_refused_arguments() -> None:
+def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(UserError, match="ROS does not start"):
         LiveSource(load(), arguments=["-r", "no rule"])
 
@@ -422,7 +420,7 @@ def pair() -> Iterator[tuple[Node, Node]]:
         yield one, two
 
 
-def test_made_types_meet_compiled_ones(pair: tuple[Node, Node]) -> None:
+def test_generated_types_match_compiled_ones(pair: tuple[Node, Node]) -> None:
     from sensor_msgs.msg import CameraInfo
 
     kind = "sensor_msgs/msg/CameraInfo"
@@ -475,12 +473,12 @@ def test_made_types_meet_compiled_ones(pair: tuple[Node, Node]) -> None:
         ),
     ],
 )
-def test_hashes_are_those_of_the_packages(name: str, generated: str) -> None:
+def test_type_hashes_equal_those_of_the_packages(name: str, generated: str) -> None:
     """By rosidl's own generator, from the .msg files that Jazzy ships."""
     assert typestore().hash_rihs01(name) == f"RIHS01_{generated}"
 
 
-def test_unknown_type_without_its_package() -> None:
+def test_a_type_without_its_package_is_reported() -> None:
     with pytest.raises(UserError, match="AMENT_PREFIX_PATH: source the workspace that has it"):
         typesupport.message_type("no_such_msgs/msg/Thing")
 
@@ -513,7 +511,7 @@ def result() -> FrameResult:
     return replace(made, cameras=(camera,), objects=objects, tracks=tracks)
 
 
-def test_results_are_published_for_others_but_not_for_us(result: FrameResult) -> None:
+def test_published_results_are_not_read_back(result: FrameResult) -> None:
     heard: dict[str, Any] = {}
     kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
     kinds |= {DETECTIONS: "Detection2DArray", TRACKS: "Detection3DArray", MARKERS: "MarkerArray"}
@@ -665,7 +663,7 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
     assert (answer.success, answer.message) == (False, "no space left in /tmp")
 
 
-def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
+def test_the_command_runs_beside_a_robot(robot: str, tmp_path: Path) -> None:
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
@@ -721,7 +719,7 @@ def test_the_command_beside_a_robot(robot: str, tmp_path: Path) -> None:
         assert "range_x" in str(configs)
 
 
-def test_orders_while_a_robot_is_waited_for(tmp_path: Path) -> None:
+def test_commands_work_before_the_robot_starts(tmp_path: Path) -> None:
     """SIGUSR1 and snap are answered, parameters are taken, and a wrong one ends the command at once."""
     environment = os.environ | alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli", "live", "--observe"]

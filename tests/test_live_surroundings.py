@@ -260,7 +260,7 @@ def test_the_robots_diagnostics_have_lanes_and_lines(flight: Flight) -> None:
     assert texts.count("diagnostics: lidar/fan: warning, is slow") == 1
 
 
-def test_ours_against_the_robots(flight: Flight) -> None:
+def test_our_results_are_compared_with_the_robots(flight: Flight) -> None:
     against = flight.live.against
     assert against is not None and against.topic == "/detection/fused_3d"
     assert against.frames > 3 and against.differing == against.frames
@@ -274,7 +274,7 @@ def test_ours_against_the_robots(flight: Flight) -> None:
     assert "1.00 m apart" in told and told.startswith("flight recorder saved in flight_")
 
 
-def test_what_bevviz_says_of_itself(flight: Flight) -> None:
+def test_bevviz_publishes_its_own_diagnostics(flight: Flight) -> None:
     by_name = {status.name: status for status in flight.heard}
     assert set(by_name) == {f"bevviz: {part}" for part in PARTS}
     assert int(by_name["bevviz: sources"].level) == 1
@@ -292,7 +292,7 @@ def test_a_plan_is_shown_where_it_is(flight: Flight) -> None:
     assert placed and placed[-1].frame_id == "map"
 
 
-def test_the_bag_tells_the_same(flight: Flight) -> None:
+def test_a_bag_gives_the_same_surroundings(flight: Flight) -> None:
     with BagSource([flight.folder / "snap.mcap"], load()) as source:
         frames = list(source)
         assert source.roles.notes["/plan"] == "shown: around perception"

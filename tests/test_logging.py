@@ -130,14 +130,14 @@ def test_late_results_of_the_robot_are_at_their_own_stamp(tmp_path: Path) -> Non
         assert found.cleared(f"/robot{topic}") == {31}  # three seconds later nobody may think that it is new
 
 
-def test_times(record: Callable[..., Recording]) -> None:
+def test_every_timeline_has_its_times(record: Callable[..., Recording]) -> None:
     found = record([make(0), make(3)])
     assert set(found.times) == {"frame", "stamp", "received"}
     assert found.times["stamp"] == {0: START, 3: START + 300_000_000}
     assert found.times["received"][3] == START + 330_000_000
 
 
-def test_cloud(record: Callable[..., Recording]) -> None:
+def test_a_cloud_is_logged_with_its_fields(record: Callable[..., Recording]) -> None:
     result = make()
     found = record([result])
     raw = found.at["/world/lidar/points"]
@@ -162,7 +162,7 @@ def test_voxelised_points_move_by_an_eighth_of_a_voxel_at_most(size: float, seed
     np.testing.assert_array_equal(np.round(moved / step), moved / step)
 
 
-def test_poses_and_calibration(record: Callable[..., Recording]) -> None:
+def test_poses_and_calibration_are_logged(record: Callable[..., Recording]) -> None:
     found = record([make()])
     for entity, pose in (
         ("/world/lidar", WORLD_FROM_LIDAR),
@@ -178,7 +178,7 @@ def test_poses_and_calibration(record: Callable[..., Recording]) -> None:
     assert found.static["/world"]["ViewCoordinates:xyz"] == [[5, 4, 1]]  # forward, left, up
 
 
-def test_clusters(record: Callable[..., Recording]) -> None:
+def test_clusters_are_logged_with_boxes(record: Callable[..., Recording]) -> None:
     result = make()
     found = record([result])
     seen = found.at["/world/lidar/clusters"]
@@ -210,7 +210,7 @@ def test_clusters_outside_the_limits_are_set_aside(record: Callable[..., Recordi
     assert found.at["/health/count/clusters"]["Scalars:scalars"][0] == [1]
 
 
-def test_camera(record: Callable[..., Recording]) -> None:
+def test_images_and_detections_are_logged(record: Callable[..., Recording]) -> None:
     result = make()
     (camera,) = result.cameras
     found = record([result])
@@ -254,7 +254,7 @@ def test_an_image_that_came_raw_is_compressed_and_logged_once(record: Callable[.
     np.testing.assert_allclose(shown, image.bgr, atol=4)
 
 
-def test_fused_boxes_say_why(record: Callable[..., Recording]) -> None:
+def test_fused_boxes_have_their_reason(record: Callable[..., Recording]) -> None:
     found = record([make()])
     fused = found.at["/world/fused"]
     assert fused["Boxes3D:labels"][0] == ["person 0.90"]
@@ -265,7 +265,7 @@ def test_fused_boxes_say_why(record: Callable[..., Recording]) -> None:
     assert "matched" in reason
 
 
-def test_what_was_seen_is_beside_the_whole_box(record: Callable[..., Recording]) -> None:
+def test_the_seen_part_is_logged_beside_the_whole_box(record: Callable[..., Recording]) -> None:
     plain = make()
     assert plain.objects is not None
     seen = plain.objects.boxes
@@ -326,7 +326,7 @@ def test_reference_image_is_stored_without_loss(record: Callable[..., Recording]
     np.testing.assert_array_equal(cv2.imdecode(blob, cv2.IMREAD_COLOR), result.bev.image)
 
 
-def test_channels_where_they_are_asked_for(record: Callable[..., Recording]) -> None:
+def test_channels_are_logged_on_request(record: Callable[..., Recording]) -> None:
     config = load(settings=["bev.channels=[density, height, intensity, occupancy]"])
     result = make(config=config)
     found = record([result], config)
@@ -338,7 +338,7 @@ def test_channels_where_they_are_asked_for(record: Callable[..., Recording]) -> 
         np.testing.assert_array_equal(np.frombuffer(buffer, grid.dtype).reshape(grid.shape), grid)
 
 
-def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
+def test_truth_and_results_of_the_robot_are_logged(record: Callable[..., Recording]) -> None:
     result = make()
     boxes = Boxes3D(f32([2, 1, 0], [60, 0, 0]), f32([4, 2, 1.5], [4, 2, 1.5]), f32(0.5, 0))
     stated = LabelledBoxes3D(
@@ -363,7 +363,7 @@ def test_truth_and_the_robots_own(record: Callable[..., Recording]) -> None:
     assert found.at["/bev/overlay/robot/detection/fused_3d"]["LineStrips2D:labels"][0] == ["car"]
 
 
-def test_names_of_others_take_nobodys_place(record: Callable[..., Recording]) -> None:
+def test_foreign_names_do_not_overwrite_entities(record: Callable[..., Recording]) -> None:
     """A topic called like an entity of ours, and one and a class that are no good parts of a path."""
     result = make()
     boxes = Boxes3D(f32([2, 1, 0]), f32([4, 2, 1.5]), f32(0.5))
@@ -404,7 +404,7 @@ def test_several_lidars_keep_their_own_frames(record: Callable[..., Recording]) 
 # --- decisions and health ----------------------------------------------------------------------
 
 
-def test_explanations_in_words_and_as_states(record: Callable[..., Recording]) -> None:
+def test_explanations_are_logged_as_text_and_states(record: Callable[..., Recording]) -> None:
     result = make()
     found = record([result, make(1)])
     (page,) = found.at["/explain"]["TextDocument:text"][0]
@@ -440,7 +440,7 @@ def test_rates_are_counted_over_a_second() -> None:
     assert dict(slow) == {"sensor": 0.5}
 
 
-def test_health(record: Callable[..., Recording]) -> None:
+def test_the_health_of_a_run_is_logged(record: Callable[..., Recording]) -> None:
     found = record([make(0), make(3)])
     value = {
         entity: scalars["Scalars:scalars"]
@@ -468,7 +468,7 @@ def test_health(record: Callable[..., Recording]) -> None:
     }
 
 
-def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
+def test_batched_numbers_are_logged_unchanged(tmp_path: Path) -> None:
     """Also across a frame without a time of receipt, and where the run ends with an error."""
     results = [make(0), make(1), nothing(2, received=0), make(3), make(4)]
     found = []
@@ -495,7 +495,7 @@ def test_numbers_that_wait_for_others_are_the_same(tmp_path: Path) -> None:
     assert received[1:4] == [START + 130_000_000, None, START + 330_000_000]
 
 
-def test_what_a_frame_lacks_is_cleared(record: Callable[..., Recording]) -> None:
+def test_entities_that_a_frame_lacks_are_cleared(record: Callable[..., Recording]) -> None:
     found = record([make(0), nothing(1), make(2)])
     for entity in (
         "/world/lidar/points",
@@ -574,7 +574,7 @@ def tracked(results: Iterable[FrameResult]) -> list[FrameResult]:
     return found
 
 
-def test_tracks(record: Callable[..., Recording]) -> None:
+def test_tracks_are_logged_with_their_trails(record: Callable[..., Recording]) -> None:
     results = tracked(make(i) for i in range(4))
     results[3] = dataclasses.replace(results[3], objects=None)
     last = results[3].tracks
@@ -684,7 +684,7 @@ def test_suppressed_detections_are_counted() -> None:
     assert text.count("suppressed") == 1
 
 
-def test_anomalies(record: Callable[..., Recording]) -> None:
+def test_anomalies_are_logged(record: Callable[..., Recording]) -> None:
     stamps = [make(i).frame.stamp for i in range(4)]
     late = Anomaly("sync", "zed", "zed is +60 ms off the cloud", since=stamps[1])
     lost = [Anomaly("tf", name, f"{name} is lost", "ERROR", since=stamps[2]) for name in ("zed", "lidar")]
@@ -708,7 +708,7 @@ def test_anomalies(record: Callable[..., Recording]) -> None:
 # --- sinks -------------------------------------------------------------------------------------
 
 
-def test_several_outputs_at_once(tmp_path: Path) -> None:
+def test_several_outputs_get_the_same_data(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -780,7 +780,7 @@ def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
         ({"blueprint": "debgu"}, "did you mean 'debug'"),
     ],
 )
-def test_outputs_that_cannot_be_opened(where: dict[str, Any], message: str) -> None:
+def test_outputs_that_cannot_be_opened_are_one_line(where: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message) as caught, open_recording(SCENE, load(), **where):
         pass
     assert "\n" not in str(caught.value)

@@ -217,7 +217,7 @@ def test_a_kitti_scan_through_ros_is_the_scan(shared: Path, ros: str) -> None:
     np.testing.assert_array_equal(cloud.fields["intensity"], scan[:, 3])
 
 
-def test_what_rclpy_delivers_is_read_too() -> None:
+def test_messages_of_rclpy_are_read() -> None:
     msg = cloud_message(random_points(50))
     msg.data = array.array("B", msg.data)
     np.testing.assert_array_equal(clouds.decode_cloud(msg, "/p", 0).xyz[:, 0], random_points(50)["x"])
@@ -246,7 +246,7 @@ def test_whole_points_of_cut_data_are_kept_and_others_counted(padding: int, whol
 
 
 @pytest.mark.parametrize("size", [0, 1, 15, 16, 17])
-def test_cut_to_almost_nothing(size: int) -> None:
+def test_data_cut_to_a_few_bytes_are_survived(size: int) -> None:
     for padding in (0, 8):
         msg = cloud_message(random_points(100), height=4, row_padding=padding)
         msg.data = msg.data[:size]
@@ -336,7 +336,7 @@ ORDERS = {"bgr8": (0, 1, 2), "rgb8": (2, 1, 0), "bgra8": (0, 1, 2), "rgba8": (2,
 
 @pytest.mark.parametrize("encoding", [*ORDERS, "8UC4", "mono8", "8UC1"])
 @given(height=st.integers(1, 9), width=st.integers(1, 9), padding=st.integers(0, 5))
-def test_8_bit_images(encoding: str, height: int, width: int, padding: int) -> None:
+def test_8_bit_images_are_decoded(encoding: str, height: int, width: int, padding: int) -> None:
     channels = 4 if "a8" in encoding or encoding == "8UC4" else 1 if encoding in ("mono8", "8UC1") else 3
     pixels = random_pixels(height, width, channels)
     image = images.decode_image(image_message(pixels, encoding, padding), "/image", 3)
@@ -385,7 +385,7 @@ def bt601(y: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:
 
 
 @pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
-def test_yuv422_images(encoding: str, luma: int) -> None:
+def test_yuv422_images_are_decoded(encoding: str, luma: int) -> None:
     pixels = random_pixels(6, 8, 2)
     chroma = pixels[..., 1 - luma]
     expected = bt601(pixels[..., luma], np.repeat(chroma[:, ::2], 2, 1), np.repeat(chroma[:, 1::2], 2, 1))
@@ -394,7 +394,7 @@ def test_yuv422_images(encoding: str, luma: int) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "u"), [("nv12", 0), ("nv21", 1)])
-def test_yuv420_images(encoding: str, u: int) -> None:
+def test_yuv420_images_are_decoded(encoding: str, u: int) -> None:
     planes = random_pixels(9, 8)
     chroma = planes[6:].reshape(3, 4, 2).repeat(2, 0).repeat(2, 1)
     expected = bt601(planes[:6], chroma[..., u], chroma[..., 1 - u])
@@ -561,7 +561,7 @@ def test_a_rectified_camera_without_p_keeps_k() -> None:
         ("", 5, "plumb_bob"),
     ],
 )
-def test_distortion_models(given_model: str, coefficients: int, model: str) -> None:
+def test_every_distortion_model_is_decoded(given_model: str, coefficients: int, model: str) -> None:
     d = np.linspace(0.01, 0.02, coefficients)
     intrinsics = camera_info.decode_camera_info(info_message(given_model, d), rectified=False)
     assert intrinsics.distortion_model == model
@@ -584,7 +584,7 @@ def test_an_equidistant_lens_without_coefficients_is_no_pinhole() -> None:
     assert not camera_info.decode_camera_info(info_message("equidistant", np.zeros(4)), True).distortion_model
 
 
-def test_region_of_interest_and_binning() -> None:
+def test_region_of_interest_and_binning_are_applied() -> None:
     roi = Message(x_offset=100, y_offset=60, width=320, height=200, do_rectify=False)
     msg = info_message(binning_x=2, binning_y=4, roi=roi)
     intrinsics = camera_info.decode_camera_info(msg, rectified=False)
@@ -623,7 +623,7 @@ def transform_message(parent: str, child: str, xyz: Any = (1, 2, 3), xyzw: Any =
 
 
 @pytest.mark.parametrize("ros", STORES)
-def test_transforms(ros: str) -> None:
+def test_transforms_are_decoded(ros: str) -> None:
     msg = Message(transforms=[transform_message("/map", "base"), transform_message("base", "lidar")])
     first, second = transforms.decode_transforms(through(STORES[ros], "tf2_msgs/msg/TFMessage", msg))
     assert (first.stamp, first.parent, first.child) == (STAMP, "map", "base")
@@ -647,7 +647,7 @@ def test_bad_transforms_are_named_and_spare_the_good_ones(bad: Message, text: st
     assert [t.child for t in transforms.decode_transforms(Message(transforms=[bad, good]))] == ["lidar"]
 
 
-def test_odometry() -> None:
+def test_odometry_is_decoded() -> None:
     pose = Message(position=Message(x=1, y=2, z=3), orientation=Message(x=0, y=0, z=1, w=1))
     msg = Message(header=header("odom"), child_frame_id="base_link", pose=Message(pose=pose))
     moved = transforms.decode_odometry(msg)
@@ -696,7 +696,7 @@ def array_of(*detections: Message) -> Message:
     return Message(header=header("rslidar"), detections=list(detections))
 
 
-def test_2d_detections_through_ros() -> None:
+def test_2d_detections_are_decoded() -> None:
     msg = array_of(
         detection_2d(100, 50, 20, 10, result("person", 0.5)),
         detection_2d(100, 50, 20, 10, theta=math.pi / 2),
@@ -713,7 +713,7 @@ def test_2d_detections_through_ros() -> None:
     )
 
 
-def test_3d_detections_through_ros() -> None:
+def test_3d_detections_are_decoded() -> None:
     half = math.radians(15)
     msg = array_of(
         detection_3d((1, 2, 3), (4, 5, 6), result("car", 0.75), xyzw=(0, 0, math.sin(half), math.cos(half))),
@@ -736,7 +736,7 @@ def test_the_class_counts_more_than_the_name_of_the_cluster() -> None:
     assert found.labels == ("person",) and found.scores[0] == np.float32(0.8)
 
 
-def test_older_versions_of_vision_msgs() -> None:
+def test_older_versions_of_vision_msgs_are_decoded() -> None:
     flat = Message(id=3, score=0.5, pose=POSE)
     box = Message(center=Message(x=100, y=50, theta=0), size_x=20, size_y=10)
     boxes = detections.decode_detections_2d(array_of(Message(results=[flat], bbox=box)), "/boxes", 0)
@@ -805,7 +805,7 @@ def test_an_image_of_gigabytes_is_refused_by_its_header(monkeypatch: pytest.Monk
     assert large.bgr.shape == (3000, 4000, 3)
 
 
-def test_a_png_whose_parts_are_longer_than_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_png_with_overlong_chunks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     png = encoded(".png", random_pixels(24, 32, 3))
     at = png.index(b"IDAT") - 4
     monkeypatch.setattr(cv2, "imdecode", None)  # which would take four gigabytes

@@ -117,7 +117,7 @@ def test_rows_are_those_of_the_run_that_is_shown(drive: Drive) -> None:
     drive.configure("clustering.min_cluster_points=10")
 
 
-def test_what_cannot_be_asked_about_is_said(drive: Drive) -> None:
+def test_an_invalid_selection_is_explained(drive: Drive) -> None:
     click(drive, "/health/time_ms/total")
     assert drive.selected is not None
     assert drive.selected.pick is None

@@ -47,7 +47,7 @@ def boxes(path: Path, *settings: str) -> LabelledBoxes3D:
 
 @pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
 @pytest.mark.parametrize("kind", ["Detected", "Tracked", "Predicted"])
-def test_objects_of_autoware(tmp_path: Path, package: str, kind: str) -> None:
+def test_objects_of_autoware_are_decoded(tmp_path: Path, package: str, kind: str) -> None:
     m = made(package, AUTOWARE)
     found = boxes(bag(tmp_path, m, f"{package}/msg/{kind}Objects", autoware(m, package, kind)))
     assert_is_box(found)
@@ -68,7 +68,7 @@ def test_a_polygon_of_autoware_is_the_box_around_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.boxes.center, [[10 + c, 2 + s, 0.5]], rtol=1e-6)
 
 
-def test_tracks_of_a_radar(tmp_path: Path) -> None:
+def test_tracks_of_a_radar_are_decoded(tmp_path: Path) -> None:
     m = made("radar_msgs", RADAR)
     found = boxes(bag(tmp_path, m, "radar_msgs/msg/RadarTracks", radar(m)))
     assert_is_box(found, yaw=0.0)
@@ -78,7 +78,7 @@ def test_tracks_of_a_radar(tmp_path: Path) -> None:
 MAPPED = "source.boxes={topic: /my/objects, center: pose.position, size: dimensions, label: class_name%s}"
 
 
-def test_a_message_of_ones_own_by_its_fields(tmp_path: Path) -> None:
+def test_a_private_message_is_mapped_by_its_fields(tmp_path: Path) -> None:
     m = made("my_msgs", PRIVATE)
     path = bag(tmp_path, m, "my_msgs/msg/Things", private(m))
     found = boxes(path, MAPPED % "")
@@ -90,7 +90,7 @@ def test_a_message_of_ones_own_by_its_fields(tmp_path: Path) -> None:
     assert (found.scores.tolist(), found.ids) == ([0.5], ("12",))
 
 
-def test_it_is_the_truth_that_evaluate_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mapped_boxes_serve_as_ground_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     m = made("my_msgs", PRIVATE)
     path = str(bag(tmp_path, m, "my_msgs/msg/Things", private(m)))
     assert main(["evaluate", path, "--truth", "/my/objects", "--set", MAPPED % ""]) == 0
@@ -107,7 +107,7 @@ def test_it_is_the_truth_that_evaluate_asks_for(tmp_path: Path, capsys: pytest.C
         ("topic: /my/objects, objects: stuff", "no field stuff (of stuff); there are header, things"),
     ],
 )
-def test_what_is_wrong_with_a_mapping(
+def test_a_wrong_mapping_is_one_line(
     tmp_path: Path, setting: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     m = made("my_msgs", PRIVATE)
@@ -117,7 +117,7 @@ def test_what_is_wrong_with_a_mapping(
     assert message.lower() in " ".join((said.out + said.err).split()).lower()
 
 
-def test_markers_by_the_documented_rule(tmp_path: Path) -> None:
+def test_markers_follow_the_documented_rule(tmp_path: Path) -> None:
     m = bags.Messages()
 
     def marker(number: int, kind: int, action: int = 0, text: str = "", ns: str = "cars") -> Any:

@@ -64,7 +64,9 @@ def test_a_missing_library_is_told_once_and_the_cpu_is_used(
         providers.open_session(DEMO_MODEL, "CUDA", ort.SessionOptions())
 
 
-def test_a_gpu_that_does_not_start(gpu_package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_does_not_start_is_replaced_by_the_cpu(
+    gpu_package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All libraries are there, the driver is not."""
     libraries(monkeypatch, "")
     said: list[str] = []

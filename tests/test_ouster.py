@@ -19,7 +19,7 @@ PROFILES = ("LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG19_RFL8_SIG16_NIR16_DUAL", "
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_scans_by_the_manual(tmp_path: Path, profile: str) -> None:
+def test_scans_follow_the_manual(tmp_path: Path, profile: str) -> None:
     form = "ros1" if profile == "LEGACY" else "mcap"
     path = bag(
         tmp_path / ("bag.bag" if form == "ros1" else "bag"),
@@ -48,7 +48,7 @@ def test_scans_by_the_manual(tmp_path: Path, profile: str) -> None:
     np.testing.assert_array_equal(again.points, frames[2].points)
 
 
-def test_lost_and_overtaken_packets_and_a_clock_from_its_start(tmp_path: Path) -> None:
+def test_lost_and_reordered_packets_are_handled(tmp_path: Path) -> None:
     told = metadata("RNG15_RFL8_NIR8")
     # The second packet is lost, and the last one of the second scan comes after the third has begun.
     path = bag(tmp_path / "bag", told=told, clock=5_000_000_000, order=(0, 2, 3, 4, 5, 6, 8, 7, 9, 10, 11))
@@ -93,7 +93,7 @@ def test_metadata_may_be_a_file_and_are_asked_for(tmp_path: Path, capsys: pytest
     assert f"{LIDAR}: LiDAR, by type and name" in capsys.readouterr().out
 
 
-def test_other_jsons_are_no_metadata() -> None:
+def test_other_json_messages_are_no_metadata() -> None:
     for text in ("", "[]", '"a"', '{"beam_intrinsics": 5}', metadata("LEGACY").replace("64", "0")):
         with pytest.raises(UserError, match="here: is not the metadata"):
             ouster.read_sensor(text, "here")

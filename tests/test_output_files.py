@@ -46,7 +46,7 @@ def test_a_file_gets_its_name_at_the_end() -> None:
     assert target.read_text() == "new" and not given.path.exists()
 
 
-def test_an_error_leaves_the_old_and_says_where_the_new_is() -> None:
+def test_an_error_keeps_the_old_file_and_names_the_new() -> None:
     target = Path("a.rrd")
     target.write_text("old")
     half = r"^no more; what was made until then is in a\.partial-[0-9a-f]{8}\.rrd$"
@@ -65,7 +65,7 @@ def test_an_error_leaves_the_old_and_says_where_the_new_is() -> None:
     assert not unfinished_files(target)
 
 
-def test_one_process_at_a_time() -> None:
+def test_only_one_process_writes_a_file() -> None:
     with atomic_write(Path("a.rrd"), "recording") as given:
         given.path.write_text("first")
         with (
@@ -76,7 +76,7 @@ def test_one_process_at_a_time() -> None:
     assert Path("a.rrd").read_text() == "first"
 
 
-def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
+def test_two_runs_cannot_write_one_recording(tmp_path: Path, capsys: Capture) -> None:
     """The second ends at once, the first is what it would have been."""
     bags.write(Path("drive"), bags.small_items(scans=3))
     command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "12", "--save", "out.rrd"]
@@ -94,7 +94,7 @@ def test_two_runs_into_one_recording(tmp_path: Path, capsys: Capture) -> None:
     assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 12
 
 
-def test_a_link_and_what_is_no_file() -> None:
+def test_a_link_is_followed_and_a_pipe_refused() -> None:
     Path("real").mkdir()
     Path("latest.rrd").symlink_to("real/a.rrd")
     with atomic_write(Path("latest.rrd"), "recording") as given:
@@ -105,7 +105,7 @@ def test_a_link_and_what_is_no_file() -> None:
         pass
 
 
-def test_a_text_is_whole_or_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_text_file_is_replaced_atomically(monkeypatch: pytest.MonkeyPatch) -> None:
     target = Path("a.csv")
     save_text(target, "old\r\n", "--csv")
     assert target.read_bytes() == b"old\r\n"
@@ -129,7 +129,7 @@ def test_a_text_is_whole_or_the_old_one(monkeypatch: pytest.MonkeyPatch) -> None
         save_text(Path("folder"), "x", "--csv")
 
 
-def test_a_text_goes_into_a_pipe(capfd: Capture) -> None:
+def test_a_text_can_be_written_to_a_pipe(capfd: Capture) -> None:
     save_text(Path("/dev/stdout"), "a,b\n", "--csv")
     assert capfd.readouterr().out == "a,b\n"
 
@@ -171,7 +171,7 @@ def test_outputs_get_their_names_when_they_are_complete(
 # --- never over what is read -------------------------------------------------------------------
 
 
-def test_no_output_is_an_input(capsys: Capture) -> None:
+def test_an_input_is_never_overwritten(capsys: Capture) -> None:
     bags.write(Path("drive"), bags.small_items(scans=2))
     (bag,) = Path("drive").glob("*.mcap")
     before = bag.read_bytes()
@@ -191,7 +191,7 @@ def test_no_output_is_an_input(capsys: Capture) -> None:
     assert bag.read_bytes() == before and Path("my.yaml").read_text().startswith("voxel")
 
 
-def test_a_link_to_another_bag(capsys: Capture) -> None:
+def test_a_link_to_another_bag_is_not_followed(capsys: Capture) -> None:
     bags.write(Path("drive"), bags.small_items(scans=2))
     Path("other.mcap").write_text("another bag")
     Path("link.rrd").symlink_to("other.mcap")
@@ -363,7 +363,7 @@ def test_a_link_to_a_file_of_another_kind_is_refused() -> None:
     assert bag.read_text() == "the bag"
 
 
-def test_of_two_that_begin_together_one_goes_on() -> None:
+def test_one_of_two_simultaneous_runs_goes_on() -> None:
     script = (
         "import sys, time; from pathlib import Path; from bevviz.support.files import claim_target\n"
         "from bevviz.errors import UserError\n"

@@ -22,7 +22,7 @@ keys = hnp.arrays(np.int64, st.integers(1, 300), elements=st.integers(0, 2**40) 
 
 @settings(deadline=None)
 @given(near, st.sampled_from([0.3, 1.0, 20.0]), st.sampled_from([0.0, 0.5]), st.integers(0, 2))
-def test_keys_tell_cells_and_their_neighbours(points: F32, size: float, shift: float, reach: int) -> None:
+def test_keys_identify_cells_and_neighbours(points: F32, size: float, shift: float, reach: int) -> None:
     packed, strides = cell_keys(points, size, shift, reach)
     low = points.min(axis=0).astype(np.float64)
     cells = np.floor((points - (low - shift * size)) / size).astype(np.int64)
@@ -53,7 +53,7 @@ def test_the_longest_axis_is_the_slowest(extent: tuple[int, int, int]) -> None:
 
 @settings(deadline=None)
 @given(keys)
-def test_sorted_by_key(keys: I64) -> None:
+def test_points_are_sorted_by_key(keys: I64) -> None:
     order, start = sort_by_key(keys)
     np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
     values, counts = np.unique(keys, return_counts=True)
@@ -63,7 +63,7 @@ def test_sorted_by_key(keys: I64) -> None:
 
 @settings(deadline=None)
 @given(keys)
-def test_grouped_in_order_of_appearance(keys: I64) -> None:
+def test_groups_are_in_order_of_appearance(keys: I64) -> None:
     number, first = group(keys)
     np.testing.assert_array_equal(keys[first][number], keys)
     assert first.tolist() == sorted(first.tolist())

@@ -51,7 +51,7 @@ def test_the_pipeline_is_deterministic(frame: Frame) -> None:
     np.testing.assert_array_equal(a.clusters.labels, b.clusters.labels)
 
 
-def test_without_points_the_image_is_still_searched(frame: Frame) -> None:
+def test_without_points_the_detector_still_runs(frame: Frame) -> None:
     empty = replace(frame, points=np.zeros((0, 3), np.float32), fields={})
     session = Session(load(settings=["detector.model=demo"]))
     result = session.run(empty)
@@ -61,7 +61,7 @@ def test_without_points_the_image_is_still_searched(frame: Frame) -> None:
     assert result.clusters is None
 
 
-def test_without_a_place_for_the_camera_the_rest_is_made(frame: Frame) -> None:
+def test_an_uncalibrated_camera_does_not_stop_other_stages(frame: Frame) -> None:
     lost = replace(frame.cameras[0], camera_from_points=None, problems=("no transform",))
     session = Session(load(settings=["detector.model=demo"]))
     result = session.run(replace(frame, cameras=(lost,)))

@@ -194,7 +194,7 @@ def test_a_cloud_outside_the_range_has_no_objects(tmp_path: Path) -> None:
     assert len(boxes) == len(score) == len(names) == 0
 
 
-def test_thresholds_are_of_each_class(tmp_path: Path) -> None:
+def test_each_class_has_its_threshold(tmp_path: Path) -> None:
     reference = Reference("mmdetection3d_anchors")
     changed = {"score_threshold": 1.0, "score_thresholds": {"Car": 0.3}, "max_objects": 500}
     _, score, names = reference.network(tmp_path / "net.onnx", **changed)(CLOUD)
@@ -205,7 +205,7 @@ def test_thresholds_are_of_each_class(tmp_path: Path) -> None:
 # --- two files ---------------------------------------------------------------------------------
 
 
-def test_two_files_of_autoware(tmp_path: Path) -> None:
+def test_networks_of_two_files_are_supported(tmp_path: Path) -> None:
     found = network(load(settings=stated(autoware(tmp_path))))
     boxes, score, names = found(CLOUD)  # of which the encoder takes the first 40 pillars alone
 
@@ -309,7 +309,7 @@ def test_a_network_is_loaded_once_for_equal_settings(tmp_path: Path) -> None:
         ("mmdetection3d_centers", {"groups": []}, "output bbox_pred0 should be [1, 6 or 8, 32 / s, 48 / s]"),
     ],
 )
-def test_what_does_not_fit_is_one_clear_line(
+def test_mismatched_parameters_are_one_line(
     name: str, changed: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as caught:
@@ -318,7 +318,7 @@ def test_what_does_not_fit_is_one_clear_line(
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_are_none_and_pairs_that_do_not_fit(tmp_path: Path) -> None:
+def test_unusable_files_and_pairs_are_one_line(tmp_path: Path) -> None:
     good = autoware(tmp_path)
     for changed, words in (
         ({"method": str(tmp_path / "none.onnx")}, "no such file"),

@@ -63,7 +63,7 @@ def test_the_box_names_two_clusters_in_the_reference() -> None:
     assert fusion.cluster_detection[own] == fusion.cluster_detection[behind]
 
 
-def test_the_rest_of_the_drive_is_as_without() -> None:
+def test_faults_leave_the_rest_of_the_drive_unchanged() -> None:
     plain, changed = SyntheticSource(frames=75).world, drive().world
     there = {(a.s, a.lateral) for a in changed.actors}
     gone = [a for a in plain.actors if (a.s, a.lateral) not in there]
@@ -83,7 +83,7 @@ def test_the_rest_of_the_drive_is_as_without() -> None:
         ("flat_car", 20, "it is seen after 3 s and the drive has 1.9 s; give it more frames"),
     ],
 )
-def test_a_fault_that_cannot_be_planted(name: str, frames: int, message: str) -> None:
+def test_an_impossible_fault_is_one_line(name: str, frames: int, message: str) -> None:
     with pytest.raises(UserError, match=message):
         SyntheticSource(frames, plant=[name])
 

@@ -39,7 +39,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_it_is_found_above_and_files_are_named_from_it() -> None:
+def test_a_project_file_in_a_parent_folder_is_found() -> None:
     config = load(layers=read_project_layers(Path.cwd(), {}))
     assert config.detector.model == "../../nets/yolo.onnx"
     assert config.preset == "reference"
@@ -47,14 +47,14 @@ def test_it_is_found_above_and_files_are_named_from_it() -> None:
     assert (config.clustering.eps, config.clustering.min_points, config.voxel.size) == (0.6, 7, 0.03)
 
 
-def test_the_nearest_one_is_taken(project: Path) -> None:
+def test_the_nearest_project_file_is_used(project: Path) -> None:
     (project.parent / "runs" / "bevviz.toml").write_text("[clustering]\neps = 0.8\n")
     config = load(layers=read_project_layers(Path.cwd(), {}))
     assert (config.clustering.eps, config.detector.model, config.preset) == (0.8, "", "default")
 
 
 @pytest.mark.parametrize("model", ["demo", "mine:Detector", "topic:/detections", ""])
-def test_what_is_no_file_is_named_as_it_is(project: Path, model: str) -> None:
+def test_values_that_are_no_paths_stay_unchanged(project: Path, model: str) -> None:
     project.write_text(f'model = "{model}"\n')
     if "mine" not in model:  # which is code, and asks for trust
         assert load(layers=read_project_layers(Path.cwd(), {})).detector.model == model
@@ -62,7 +62,7 @@ def test_what_is_no_file_is_named_as_it_is(project: Path, model: str) -> None:
     assert layer.values.get("detector.model", "") == model
 
 
-def test_who_wins(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_override_project_and_environment(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Command line, environment, project file, preset."""
 
     def model(*more: str) -> str:
@@ -102,13 +102,13 @@ def test_a_wrong_project_is_one_clear_line(project: Path, capsys: Capture, text:
     assert said in line
 
 
-def test_a_file_that_it_names_and_that_is_not_there(project: Path) -> None:
+def test_a_missing_file_of_a_project_is_one_line(project: Path) -> None:
     project.write_text('config = ["robot.yaml", "absent.yaml"]')
     with pytest.raises(UserError, match=r"\.\./\.\./absent\.yaml: cannot read"):
         read_project_layers(Path.cwd(), {})
 
 
-def test_where_values_come_from_is_said_and_is_no_difference(project: Path) -> None:
+def test_the_origin_of_values_is_shown(project: Path) -> None:
     config = load(settings=["fusion.min_iou=0.2"], layers=read_project_layers(Path.cwd(), {}))
     assert stated_lines(config, folders=False) == [
         "bevviz.toml: clustering.eps, voxel.size, source.lidar_topics, preset, detector.model",
@@ -119,7 +119,7 @@ def test_where_values_come_from_is_said_and_is_no_difference(project: Path) -> N
     assert load(base=config).stated == config.stated
 
 
-def test_info_and_a_recording_say_it(tmp_path: Path, project: Path, capsys: Capture) -> None:
+def test_info_and_recordings_name_the_project(tmp_path: Path, project: Path, capsys: Capture) -> None:
     project.write_text("[clustering]\neps = 0.6\n")
     bags.write(Path("drive"), bags.small_items(scans=3))
     assert main(["info", "drive"]) == 0

@@ -103,7 +103,7 @@ def test_files_are_told_apart_by_content(tmp_path: Path) -> None:
     )
 
 
-def test_a_stage_of_the_users_own_fits_in() -> None:
+def test_a_user_stage_is_listed() -> None:
     """A module has a version, a file and its hash: stored, read back and compared like the others."""
     then = Provenance({"my_pkg.ground:segment": Dependency("1.2", "ab" * 32, "ground.py")})
     now = Provenance({"my_pkg.ground:segment": Dependency("1.3", "cd" * 32, "ground.py")})
@@ -120,7 +120,7 @@ dependencies = st.dictionaries(text, st.builds(Dependency, text, text, text), ma
 
 
 @given(dependencies, st.dictionaries(text, text, max_size=4))
-def test_what_is_stored_comes_back(some: dict[str, Dependency], here: dict[str, str]) -> None:
+def test_stored_provenance_is_read_back(some: dict[str, Dependency], here: dict[str, str]) -> None:
     made_with = Provenance(some, here)
     assert STORED.validate_json(json.dumps(asdict(made_with)), strict=True) == made_with
     assert not list(differences(made_with, made_with))
@@ -130,12 +130,12 @@ def test_what_is_stored_comes_back(some: dict[str, Dependency], here: dict[str, 
 @pytest.mark.parametrize(
     "values", [{}, {"dependencies": 1, "machine": {}}, {"dependencies": {"a": 1}, "machine": {}}]
 )
-def test_what_is_no_provenance(values: dict[str, object]) -> None:
+def test_invalid_provenance_is_refused(values: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="validation error"):
         STORED.validate_json(json.dumps(values), strict=True)
 
 
-def test_the_machine() -> None:
+def test_the_machine_is_described() -> None:
     assert {"processor", "cores", "memory", "system"} <= set(machine())
     assert "network" not in machine()
     assert machine("CPU")["network"] == "CPU"

@@ -60,7 +60,7 @@ def gone(made: Path) -> Iterator[Callable[[str], None]]:
         path.with_name(f"{path.name}.hidden").rename(path)
 
 
-def test_it_holds_where_it_came_from(made: Path) -> None:
+def test_a_recording_names_its_bag(made: Path) -> None:
     how, origin = read_origin(made / "run.rrd")
     assert f"eps: {EPS}" in how
     assert origin is not None
@@ -71,7 +71,7 @@ def test_it_holds_where_it_came_from(made: Path) -> None:
     assert not origin.redacted
 
 
-def test_beside_it_comes_first_then_the_stored_path(folder: Path, made: Path) -> None:
+def test_the_bag_is_sought_beside_it_then_at_its_path(folder: Path, made: Path) -> None:
     assert find_source(folder / "run.rrd").paths == (folder / "demo.mcap",)
     (folder / "demo.mcap").unlink()
     assert find_source(folder / "run.rrd").paths == (made / "demo.mcap",)
@@ -89,7 +89,7 @@ def test_roles_and_configuration_are_those_of_the_recording(folder: Path) -> Non
     assert replace(found, notes={}) == replace(stated, notes={})
 
 
-def test_options_say_otherwise(folder: Path) -> None:
+def test_options_override_the_recorded_settings(folder: Path) -> None:
     recorded = find_source(folder / "run.rrd")
     assert recorded.load(settings=["clustering.eps=0.9"]).clustering.eps == 0.9
     assert recorded.load(preset="reference").clustering.eps == load(preset="reference").clustering.eps
@@ -101,7 +101,7 @@ def test_options_say_otherwise(folder: Path) -> None:
     assert own.source == recorded.load().source
 
 
-def test_what_is_not_found_is_said_with_every_place(
+def test_a_missing_bag_names_every_searched_place(
     folder: Path, gone: Callable[[str], None], made: Path
 ) -> None:
     gone("demo.mcap")
@@ -115,7 +115,7 @@ def test_what_is_not_found_is_said_with_every_place(
         find_source(folder / "run.rrd")
 
 
-def test_a_bag_that_is_given_is_taken(folder: Path) -> None:
+def test_a_stated_bag_is_used(folder: Path) -> None:
     moved = (folder / "demo.mcap").rename(folder / "moved.mcap")
     recorded = find_source(folder / "run.rrd", [moved])
     assert (recorded.paths, recorded.warnings) == ((moved,), ())
@@ -130,7 +130,7 @@ def test_a_bag_that_is_given_is_taken(folder: Path) -> None:
         find_source(folder / "run.rrd", [folder / "nowhere.mcap"])
 
 
-def test_a_detector_that_is_gone_is_asked_for(folder: Path, gone: Callable[[str], None]) -> None:
+def test_a_missing_detector_is_asked_for(folder: Path, gone: Callable[[str], None]) -> None:
     gone("net.onnx")
     (folder / "net.onnx").unlink()
     with pytest.raises(UserError, match=r"net\.onnx; there is none at .*: give --model FILE"):
@@ -138,7 +138,7 @@ def test_a_detector_that_is_gone_is_asked_for(folder: Path, gone: Callable[[str]
     assert find_source(folder / "run.rrd", settings=["detector.model=demo"]).load().clustering.eps == EPS
 
 
-def test_what_stands_for_no_bag_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_without_a_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo, other = tmp_path / "demo.rrd", tmp_path / "other.rrd"
     assert main(["demo", "--frames", "1", "--save", str(demo)]) == 0
     assert main(["why", str(demo), "--at", "0"]) == 2
@@ -173,7 +173,7 @@ def test_commands_take_a_recording_for_its_bag(folder: Path, capsys: pytest.Capt
         assert len(drive) == 3
 
 
-def test_what_keeps_less_is_asked_and_checked_all_the_same(
+def test_reduced_recordings_can_be_asked_and_checked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag, model, bug = str(folder / "demo.mcap"), str(folder / "net.onnx"), folder / "bug.rrd"

@@ -38,7 +38,7 @@ TENTH = 100_000_000  # nanoseconds
     around=st.integers(0, 10),
     share=st.sampled_from((0.0, 0.1, 1.0)),
 )
-def test_raw_clouds_are_those_around_what_is_strange(
+def test_raw_clouds_are_kept_around_anomalies(
     steps: list[int], strange: set[int], asked_for: set[int], every: int, around: int, share: float
 ) -> None:
     """Check which raw clouds are kept, each once: every n-th, and those near a strange or requested frame.
@@ -78,7 +78,7 @@ def pictures(count: int, height: int = 95, width: int = 121) -> list[U8]:
     return [cv2.circle(slope.copy(), (10 + 4 * i, 40), 9, (0, 200, 255), -1) for i in range(count)]
 
 
-def test_a_picture_at_any_time_is_right() -> None:
+def test_each_kept_picture_shows_its_frame() -> None:
     encoder, shown = VideoEncoder(), pictures(25)
     samples = [encoder(picture, i * TENTH) for i, picture in enumerate(shown)]
     keys = [i for i, sample in enumerate(samples) if sample.key]
@@ -91,7 +91,7 @@ def test_a_picture_at_any_time_is_right() -> None:
         assert cv2.PSNR(found[:95, :121], shown[i]) > 30
 
 
-def test_key_frames_where_nothing_before_helps() -> None:
+def test_gaps_begin_with_key_frames() -> None:
     encoder = VideoEncoder()
     small, large = pictures(2), pictures(2, 120, 160)
     given = [
@@ -214,7 +214,7 @@ def samples(recording: Recording) -> dict[int, Any]:
     return recording.at[path]["VideoStream:sample"]
 
 
-def test_a_browser_is_told_what_it_cannot_hold(tmp_path: Path) -> None:
+def test_a_recording_too_large_for_a_browser_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "drive.rrd"
     assert too_large_for_web(path, 2_000_000_000) == ""
     said = too_large_for_web(path, 10_600_000_000)

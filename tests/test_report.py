@@ -112,7 +112,7 @@ def changed_bag(path: Path, change: Callable[[Bag, RawMessage], Any]) -> None:
 # --- what is written ---------------------------------------------------------------------------
 
 
-def test_the_recording(small: Path) -> None:
+def test_the_report_contains_a_recording(small: Path) -> None:
     verify(small)
     found = Recording(small)
     assert found.blueprints == 1
@@ -126,7 +126,7 @@ def test_the_recording(small: Path) -> None:
     assert f"note: {NOTE}" in [row["TextLog:text"][0] for row in found.rows["/explain/log"]]
 
 
-def test_the_page_stands_on_its_own(small: Path) -> None:
+def test_the_page_needs_no_other_files(small: Path) -> None:
     text = small.with_suffix(".html").read_text()
     page = Page(text)
     assert all(link.startswith("data:image/jpeg;base64,") for link in page.links)
@@ -141,14 +141,14 @@ def test_the_page_stands_on_its_own(small: Path) -> None:
     assert len(text) < 5e6
 
 
-def test_nothing_says_where_it_was_made(small: Path) -> None:
+def test_no_path_of_the_machine_is_in_a_report(small: Path) -> None:
     found = Recording(small)
     text = small.with_suffix(".html").read_text() + str(found.static) + str(found.rows["/explain/log"])
     assert "secret_name" not in text
     assert str(Path.home()) + "/" not in text
 
 
-def test_the_model_without_its_folder(tmp_path: Path, small: Path, capsys: Capture) -> None:
+def test_the_model_is_named_without_its_folder(tmp_path: Path, small: Path, capsys: Capture) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
     model = tmp_path / "secret" / "net.onnx"
     model.parent.mkdir()
@@ -279,7 +279,7 @@ def test_whatever_may_be_the_reason_is_named(tmp_path: Path, capsys: Capture) ->
     assert "not as it was: detector.names was names.txt (SHA-256" in capsys.readouterr().out
 
 
-def test_where_nothing_is_another_the_check_says_so(
+def test_a_difference_without_a_cause_is_stated(
     small: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     perceive = Session.perceive
@@ -293,13 +293,13 @@ def test_where_nothing_is_another_the_check_says_so(
     assert last == "bag, model, configuration, versions and machine are as they were"
 
 
-def test_no_frame_is_no_proof() -> None:
+def test_a_check_without_frames_proves_nothing() -> None:
     nothing = CheckResult()
     assert not nothing.same
     assert list(nothing.lines()) == ["no frame, then or now: there is nothing to compare"]
 
 
-def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_a_folder_without_a_report_is_one_line(small: Path, tmp_path: Path, capsys: Capture) -> None:
     assert "no such file" in error_of(capsys, "report", "--check", "absent.rrd")
     Path("text.rrd").write_text("no recording")
     assert "cannot be read as a report" in error_of(capsys, "report", "--check", "text.rrd")
@@ -321,7 +321,7 @@ def test_what_is_no_report(small: Path, tmp_path: Path, capsys: Capture) -> None
 # --- wrong calls and interruptions -------------------------------------------------------------
 
 
-def test_wrong_calls(tmp_path: Path, capsys: Capture) -> None:
+def test_wrong_calls_are_one_line(tmp_path: Path, capsys: Capture) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
     assert "--at TIME is missing" in error_of(capsys, "report", bag)
     assert "outside the recording" in error_of(capsys, "report", bag, "--at", "99")
@@ -387,7 +387,9 @@ def stages(**arrays: Any) -> tuple[StageDigest, ...]:
         ({"a": np.zeros(20000)}, {"a": np.zeros(20001)}, "20000 rows became 20001", False),
     ],
 )
-def test_differences_in_words(then: dict[str, Any], now: dict[str, Any], text: str, rounding: bool) -> None:
+def test_differences_are_described_in_words(
+    then: dict[str, Any], now: dict[str, Any], text: str, rounding: bool
+) -> None:
     from bevviz.report.fingerprints import ROUNDING
 
     found = compare(stages(**then), stages(**now))
@@ -396,7 +398,7 @@ def test_differences_in_words(then: dict[str, Any], now: dict[str, Any], text: s
     assert compare(stages(**then), stages(**then)) is None
 
 
-def test_a_stage_that_only_one_run_has() -> None:
+def test_a_stage_of_one_run_alone_is_named() -> None:
     found = compare(stages(a=[1]), ())
     assert found is not None and found.text == "only the report has results of it"
 
@@ -443,5 +445,5 @@ def test_ticks_enclose_what_they_measure(low: float, span: float, count: int) ->
     assert found[-1] >= low + span - 1e-6 * step - 1e-9
 
 
-def test_spans() -> None:
+def test_report_windows_are_parsed() -> None:
     assert spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"

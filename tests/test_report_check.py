@@ -65,7 +65,7 @@ def instead(name: str, make: Callable[[str], object]) -> None:
     make(name)
 
 
-def test_a_sound_one(capsys: Capture) -> None:
+def test_a_sound_report_passes(capsys: Capture) -> None:
     assert main(["report", "--check", "bug.rrd"]) == 0
     assert "the recording is, byte for byte, the file" in capsys.readouterr().out
     Path("bug.html").unlink()
@@ -74,7 +74,7 @@ def test_a_sound_one(capsys: Capture) -> None:
 
 
 @pytest.mark.parametrize("name", ["bug.rrd", "bug.mcap"])
-def test_no_byte_of_what_it_vouches_for_can_be_changed(name: str, capsys: Capture) -> None:
+def test_every_changed_byte_is_detected(name: str, capsys: Capture) -> None:
     sound, rng = Path(name).read_bytes(), random.Random(0)
     for at in [0, len(sound) - 1, *(rng.randrange(len(sound)) for _ in range(4))]:
         changed = bytearray(sound)
@@ -86,7 +86,7 @@ def test_no_byte_of_what_it_vouches_for_can_be_changed(name: str, capsys: Captur
         assert told and "Traceback" not in said and "bevviz itself" not in said, (at, out, said)
 
 
-def test_damage_that_no_page_tells_of(capsys: Capture) -> None:
+def test_damage_without_a_page_is_detected(capsys: Capture) -> None:
     """Among 600 kB some bytes are only shown: what is compared is found, and nothing breaks."""
     Path("bug.html").unlink()
     sound, rng = Path("bug.rrd").read_bytes(), random.Random(1)
@@ -123,7 +123,9 @@ def damage_that_breaks_the_reader(recording: Path) -> None:
     ],
     ids=lambda command: str(command[0]),
 )
-def test_damage_on_which_the_reader_breaks(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+def test_damage_that_breaks_the_reader_is_one_line(
+    command: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
     """A panic in a thread of Rerun's reader would end the process that reads."""
     Path("bug.html").unlink()
     shutil.copy("bug.rrd", "sound.rrd")
@@ -195,20 +197,20 @@ FORGED: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", FORGED)
-def test_one_clear_line(name: str, made: Path, capsys: Capture) -> None:
+def test_malicious_reports_are_one_line(name: str, made: Path, capsys: Capture) -> None:
     make, said = FORGED[name]
     make(made)
     assert said in error_of(capsys, "report", "--check", "bug.rrd")
 
 
-def test_no_frames_are_no_proof(made: Path, capsys: Capture) -> None:
+def test_a_report_without_frames_is_not_confirmed(made: Path, capsys: Capture) -> None:
     info = about(made)
     forge(json.dumps({**info, "interrupted": True}), config_yaml(Config()))
     assert main(["report", "--check", "bug.rrd"]) == 1
     assert "the same" not in capsys.readouterr().out
 
 
-def test_two_recordings_that_are_compared(capsys: Capture) -> None:
+def test_two_recordings_are_compared(capsys: Capture) -> None:
     shutil.copy("bug.rrd", "old.rrd")
     Path("new.rrd").write_bytes(Path("bug.rrd").read_bytes()[:9000])
     assert "new.rrd: " in error_of(capsys, "compare", "old.rrd", "new.rrd", "--save", "c.rrd")

@@ -89,7 +89,7 @@ def is_hidden(bgr: U8, noise: int = 3) -> bool:
     return int(np.count_nonzero(rows)) <= CELLS
 
 
-def test_images_of_the_bag(drive: Path, report: Path) -> None:
+def test_people_are_hidden_in_images_of_the_bag(drive: Path, report: Path) -> None:
     before, after = unfold(drive), unfold(report.with_suffix(".mcap"))
     assert after.keys() == before.keys() == {PNG, RAW, JPEG}
     assert not is_hidden(before[RAW][0])
@@ -121,7 +121,7 @@ def test_everything_else_of_the_bag_is_untouched(drive: Path, report: Path, caps
         assert reason in told
 
 
-def test_images_of_the_recording_and_the_page(drive: Path, report: Path) -> None:
+def test_people_are_hidden_in_recording_and_page(drive: Path, report: Path) -> None:
     verify(report)
     redacted, whole = unfold(report.with_suffix(".mcap"))[PNG][0], unfold(drive)[PNG][0]
     blobs = Recording(report).column("/world/camera/image", "EncodedImage:blob")
@@ -160,7 +160,7 @@ def test_a_check_still_sees_a_change(report: Path, capsys: Capture) -> None:
     assert "in 'fusion camera'" in capsys.readouterr().out
 
 
-def test_it_needs_a_detector_of_people_and_vehicles(drive: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_redaction_needs_a_detector_of_people(drive: Path, tmp_path: Path, capsys: Capture) -> None:
     output = str(tmp_path / "bug.rrd")
     call = ["report", str(drive), "--at", "0", "-o", output, "--redact"]
     assert "--redact needs a detector" in error_of(capsys, *call)
@@ -171,7 +171,7 @@ def test_it_needs_a_detector_of_people_and_vehicles(drive: Path, tmp_path: Path,
     assert [p.name for p in tmp_path.iterdir()] == ["names.txt"]
 
 
-def test_a_narrow_configuration_does_not_count(drive: Path, shared: Path) -> None:
+def test_class_filters_do_not_limit_redaction(drive: Path, shared: Path) -> None:
     """Neither a high threshold nor a choice of classes keeps anybody visible."""
     config = DetectorConfig(
         model=str(shared / "models" / "yolox_nano.onnx"),
@@ -215,7 +215,7 @@ def test_every_candidate_is_redacted_whatever_is_configured(
     assert len(found) == PEOPLE
 
 
-def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
+def test_boxes_outside_the_image_hide_nobody_in_it(tmp_path: Path) -> None:
     """A stronger box that nobody sees would suppress one that somebody does."""
     pytest.importorskip("onnx", reason="the test networks are built with onnx")
     from tests.support.onnx_networks import H, W, constant, head
@@ -231,7 +231,7 @@ def test_what_lies_outside_the_image_hides_nobody_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", [".jpg", ".png", ".webp"])
-def test_what_was_changed_keeps_its_form(form: str) -> None:
+def test_redacted_images_keep_their_encoding(form: str) -> None:
     magic = cv2.imencode(form, np.zeros((8, 8, 3), np.uint8))[1].tobytes()[:8]
     grey = np.full((16, 16, 3), 77, np.uint8)
     data = _encoded(grey, magic)
@@ -323,7 +323,7 @@ def contents(bag: Path) -> dict[str, list[bytes]]:
     return found
 
 
-def test_pictures_inside_other_messages(crowded: Path, tmp_path: Path) -> None:
+def test_pictures_inside_other_messages_are_redacted(crowded: Path, tmp_path: Path) -> None:
     report = redacted_report(crowded, tmp_path / "bug.rrd")
     before, after = contents(crowded), contents(report.with_suffix(".mcap"))
     assert all(any(SECRET in m for m in before[topic]) for topic in ("/crops", "/snapshot", "/bytes"))
@@ -364,7 +364,7 @@ def test_an_image_of_the_synthetic_drive_is_hidden(crowded: Path, tmp_path: Path
     assert not changed.any()
 
 
-def test_what_is_asked_for_is_kept_and_said(crowded: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_topics_kept_on_request_are_named(crowded: Path, tmp_path: Path, capsys: Capture) -> None:
     report = redacted_report(crowded, tmp_path / "bug.rrd", "--unredacted", "/s*", "/bytes")
     capsys.readouterr()
     before, after = contents(crowded), contents(report.with_suffix(".mcap"))
@@ -382,7 +382,7 @@ def test_what_is_asked_for_is_kept_and_said(crowded: Path, tmp_path: Path, capsy
     ("text", "reason"),
     [("sensor_msgs/Absent part", "nobody knows what a"), ("Loop[] again", "nobody knows what a")],
 )
-def test_definitions_that_lead_nowhere(text: str, reason: str) -> None:
+def test_broken_definitions_end_redaction(text: str, reason: str) -> None:
     types = get_types_from_msg(text, "robot_msgs/msg/Loop")
     with pytest.raises(MessageError, match=reason):
         ImageFinder("robot_msgs/msg/Loop", types)

@@ -69,7 +69,7 @@ def digests(path: Path, config: Config, window: ReportWindow) -> list[tuple[Stag
 @pytest.mark.parametrize(
     ("form", "compression"), [("mcap", "storage"), ("sqlite3", "message"), ("ros1", "bz2"), ("sqlite3", "")]
 )
-def test_raw_messages_and_the_same_results(form: str, compression: str, tmp_path: Path) -> None:
+def test_raw_messages_give_the_same_results(form: str, compression: str, tmp_path: Path) -> None:
     messages = bags.Messages(form == "ros1")
     items = bags.small_items(messages, scans=60)
     path = bags.write(
@@ -97,7 +97,7 @@ def test_raw_messages_and_the_same_results(form: str, compression: str, tmp_path
     assert [compare(a, b) for a, b in zip(then, now, strict=True)] == [None] * 11
 
 
-def test_of_a_bag_whose_end_is_missing(tmp_path: Path) -> None:
+def test_a_window_of_a_cut_bag_is_written(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "drive", bags.small_items(scans=60, points=2000), compression="storage")
     whole = next(path.glob("*.mcap")).read_bytes()
     torn = tmp_path / "torn.mcap"
@@ -110,7 +110,7 @@ def test_of_a_bag_whose_end_is_missing(tmp_path: Path) -> None:
     assert then and [compare(a, b) for a, b in zip(then, now, strict=True)] == [None] * len(then)
 
 
-def test_other_readers_understand_it(tmp_path: Path) -> None:
+def test_other_readers_read_the_window(tmp_path: Path) -> None:
     qos: list[Qos] = [_qos(latched=True)]
     messages = bags.Messages()
     with Writer(tmp_path / "drive", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -151,7 +151,7 @@ def test_silent_topics_say_what_held(tmp_path: Path) -> None:
     assert (seconds["/early"], seconds["/late"], seconds["/now"]) == ([1], [9], [5])
 
 
-def test_what_is_damaged_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_damaged_messages_are_dropped_and_counted(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "drive", bags.small_items(), form="sqlite3", compression="message")
     with closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
         images = "topic_id = (SELECT id FROM topics WHERE name = ?)"

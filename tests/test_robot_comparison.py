@@ -98,7 +98,7 @@ def texts(result: FrameResult, objects: Objects, found: Opinions) -> list[Explan
 # --- on a drive whose objects are known --------------------------------------------------------
 
 
-def test_what_both_have_is_confirmed_and_nothing_is_missed() -> None:
+def test_common_objects_are_confirmed_and_none_is_missed() -> None:
     result = ours()
     fused = result.objects
     assert fused is not None and len(fused) >= 3
@@ -161,7 +161,7 @@ def test_a_box_where_nothing_is_is_contradicted() -> None:
         ((12, 0, 1.5), (0.1, 0.1, 0.1), "car", Opinion.TOO_SMALL),
     ],
 )
-def test_what_no_camera_can_see_is_not_contradicted(
+def test_boxes_outside_every_image_are_not_contradicted(
     center: tuple[float, ...], size: tuple[float, ...], label: str, opinion: Opinion
 ) -> None:
     box = box_at(center, size)
@@ -244,7 +244,7 @@ def test_what_a_cluster_confirms_beside_the_image_has_its_words() -> None:
     assert len(texts(away, objects, found)) == 1 + len(fused)
 
 
-def test_what_is_behind_something_is_hidden() -> None:
+def test_objects_behind_others_are_hidden() -> None:
     """Of a car, the place behind it on the same ray."""
     result = ours()
     fused = result.objects
@@ -258,7 +258,7 @@ def test_what_is_behind_something_is_hidden() -> None:
     assert found.opinion.tolist() == [Opinion.HIDDEN] and found.visible[0] < 0.5
 
 
-def test_without_detections_nobody_is_asked() -> None:
+def test_without_detections_no_camera_is_asked() -> None:
     result = ours()
     fused = result.objects
     assert fused is not None
@@ -392,12 +392,12 @@ def test_distance_of_a_detection_is_that_of_its_cluster(kitti: Drive) -> None:
     assert counted >= 5
 
 
-def test_of_no_box_everything_of_ours_is_missed(kitti: Drive) -> None:
+def test_without_robot_boxes_all_our_objects_are_missed(kitti: Drive) -> None:
     counts, missed, ours = counted(kitti, None)
     assert not counts and missed == ours
 
 
-def test_what_is_hidden_is_what_people_have_labelled_so(kitti: Drive) -> None:
+def test_occlusion_agrees_with_the_labels_of_kitti(kitti: Drive) -> None:
     """KITTI's occlusion, which people have judged in the image: 0 seen whole, 2 largely hidden."""
     shares: list[float] = []
     occluded: list[int] = []
@@ -575,7 +575,7 @@ def test_a_click_on_either_box_asks_about_it() -> None:
         assert found == Pick("detection", int(fused.detection[j]), fused.camera[j])
 
 
-def test_the_list_has_what_is_in_doubt() -> None:
+def test_the_list_contains_doubtful_objects() -> None:
     """Without the truth, which speaks for itself; each asks about what it is."""
     result = without_truth(foreign())
     assert result.opinions is not None and result.objects is not None
@@ -593,7 +593,7 @@ def test_the_list_has_what_is_in_doubt() -> None:
     assert not [find for find in find_findings(ours(), None) if find.what in ("contradicted", "lost")]
 
 
-def test_what_other_limits_do_is_counted() -> None:
+def test_effects_of_other_limits_are_counted() -> None:
     """In a sweep, and in the page's panel, where they are controls."""
     result = foreign()
     assert result.objects is not None and result.opinions is not None
@@ -615,9 +615,7 @@ def test_what_other_limits_do_is_counted() -> None:
     assert (height["unit"], height["low"], height["value"]) == ("pixels", 0, 500.0)
 
 
-def test_a_stage_that_is_somebody_elses_brings_its_own_controls(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_user_stage_brings_its_own_controls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the values of the function, whatever is tried of it; they go with it."""
     model = "class Params(BaseModel):\n    cell: float = 1.0\n    axes: tuple = (1, 2)\n"
     text = f"from pydantic import BaseModel\n{model}\ndef detect(points, params):\n    return [], [], []\n"
@@ -634,7 +632,7 @@ def test_a_stage_that_is_somebody_elses_brings_its_own_controls(
     json.dumps(found)
 
 
-def test_a_network_file_is_somebody_elses() -> None:
+def test_a_network_file_counts_as_a_foreign_method() -> None:
     """Its objects are not made of our clusters, and sentences name its file."""
     config = load()
     theirs = config.objects.model_copy(update={"method": "/models/pillars.onnx"})

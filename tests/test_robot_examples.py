@@ -41,7 +41,7 @@ def settings_of(arguments: list[str]) -> ReloadableConfig:
     )
 
 
-def test_the_unit(tmp_path: Path) -> None:
+def test_the_systemd_unit_is_valid(tmp_path: Path) -> None:
     service = unit()["Service"]
     program, *arguments = shlex.split(service["ExecStart"])
     live = settings_of(arguments).config.live
@@ -57,7 +57,7 @@ def test_the_unit(tmp_path: Path) -> None:
         assert [line for line in done.stderr.splitlines() if "bevviz.service" in line] == []
 
 
-def test_the_unit_s_command_runs_and_ends(tmp_path: Path) -> None:
+def test_the_command_of_the_unit_runs_and_ends(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
     _, *arguments = shlex.split(unit()["Service"]["ExecStart"])
     places = {"/etc/bevviz/robot.yaml": str(CONFIG), "live.flight_folder=/var/lib/bevviz": "live.every=1"}
@@ -76,7 +76,7 @@ def test_the_unit_s_command_runs_and_ends(tmp_path: Path) -> None:
             assert run.wait(PATIENCE) >= 0 and "Traceback" not in rest
 
 
-def test_the_launch_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_launch_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
     made = described(monkeypatch)
     (process,) = [args for kind, args in made if kind == "ExecuteProcess"]
     defaults = {args["name"]: args["default_value"] for kind, args in made if kind == "DeclareLaunchArgument"}

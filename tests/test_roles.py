@@ -60,7 +60,7 @@ def cameras(roles: Roles) -> dict[str, str]:
     return {camera.name: camera.topic for camera in roles.cameras}
 
 
-def test_the_tutorial_robot() -> None:
+def test_roles_of_the_tutorial_robot_are_recognized() -> None:
     roles = find_roles(TUTORIAL, DEFAULT)
     assert roles.lidars == ("/rslidar_points",) and roles.lidar_names == ("rslidar",)
     (camera,) = roles.cameras
@@ -193,7 +193,7 @@ def test_a_compressed_image_plays_where_it_is_the_only_one() -> None:
         ("/images/front", "/calibration/front", "front_optical"),
     ],
 )
-def test_where_the_camera_info_of_an_image_may_be(image: str, info: str, info_frame: str) -> None:
+def test_camera_info_is_found_beside_its_image(image: str, info: str, info_frame: str) -> None:
     topics = [
         Topic(image, IMAGE, 5, "front_optical"),
         Topic("/other/camera_info", INFO, 5, "other_optical"),
@@ -287,7 +287,7 @@ def test_points_in_another_form_have_a_remedy_that_works(kind: str, helps: str) 
         (Topic("/cam", IMAGE, 0), "there are no messages on /cam"),
     ],
 )
-def test_why_there_is_no_camera(topic: Topic, said: str) -> None:
+def test_a_missing_camera_has_a_reason(topic: Topic, said: str) -> None:
     roles = find_roles([Topic("/lidar", CLOUD, 9), topic], DEFAULT)
     assert roles.cameras == () and re.search(f"^no camera.*{said}", roles.no_camera)
     if "camera_topics" in said:  # the remedy works
@@ -347,12 +347,12 @@ def test_stated_topics_are_taken_as_they_are() -> None:
         ),
     ],
 )
-def test_a_stated_topic_that_is_not_there(stated: dict[str, object], sentence: str) -> None:
+def test_an_unknown_stated_topic_is_reported(stated: dict[str, object], sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
         find_roles(TUTORIAL, SourceConfig.model_validate(stated))
 
 
-def test_a_stated_topic_where_there_is_none_of_its_type() -> None:
+def test_a_stated_topic_of_another_type_is_reported() -> None:
     with pytest.raises(UserError, match="there is no topic /points; there is no PointCloud2 topic"):
         find_roles([], SourceConfig(lidar_topics=("/points",)))
 
@@ -371,7 +371,7 @@ def test_a_stated_topic_where_there_is_none_of_its_type() -> None:
         ("/image_raw", "", "camera"),
     ],
 )
-def test_entity_names(topic: str, frame: str, name: str) -> None:
+def test_sensors_have_readable_entity_names(topic: str, frame: str, name: str) -> None:
     assert entity_name(topic, frame) == name
 
 

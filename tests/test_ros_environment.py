@@ -22,23 +22,21 @@ def _install(folder: Path, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
 
 
-def test_no_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_rclpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     with pytest.raises(UserError, match=r"not installed; pip install 'bevviz\[ros\]'"):
         load_rclpy()
 
 
-def test_numpy_of_a_sourced_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numpy_of_a_sourced_ros_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
     monkeypatch.setattr(np, "__version__", "1.26.4")
     with pytest.raises(UserError, match=r"numpy 1\.26\.4 of the sourced ROS in /opt/ros/jazzy is too old"):
         load_rclpy()
 
 
-def test_wheels_under_the_python_of_another_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wheels_of_another_environment_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _install(tmp_path, "raise ImportError('librcl.so: cannot open shared object file')", monkeypatch)
     monkeypatch.setenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1")
     with pytest.raises(UserError, match="start bevviz in a new shell"):
@@ -53,7 +51,7 @@ def test_wheels_under_the_python_of_another_environment(
         "import rclpy._of_another_python",
     ],
 )
-def test_rclpy_of_a_sourced_ros_for_another_python(
+def test_rclpy_for_another_python_is_named(
     failure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _install(tmp_path, failure, monkeypatch)

@@ -100,7 +100,7 @@ def test_every_observer_sees_every_result_in_order() -> None:
     assert not [t for t in threading.enumerate() if t.name.startswith(("run", "stages", "network"))]
 
 
-def test_what_comes_before_a_cut_is_seen() -> None:
+def test_results_before_a_cut_are_observed() -> None:
     seen = Seen()
     with pytest.raises(ValueError, match="cut"):
         run(Numbers(fails_at=4), Squares(), [seen])
@@ -141,7 +141,7 @@ def test_an_error_of_the_work_comes_in_its_turn() -> None:
     assert seen.seen == [1, 2]
 
 
-def test_a_signal_ends_it_after_the_result_at_hand() -> None:
+def test_a_signal_during_work_ends_the_run_after_it() -> None:
     class Interrupting(Seen):
         def see(self, result: int) -> None:
             if len(self.seen) == 3:
@@ -210,7 +210,7 @@ def test_an_interrupt_that_became_another_error_is_one() -> None:
     assert run(Numbers(), Kernel(), [seen]) == RunEnd(2, interrupted=True)
 
 
-def test_it_ends_when_it_is_told_to() -> None:
+def test_a_run_can_be_stopped() -> None:
     stop = threading.Event()
 
     class Stopping(Seen):
@@ -250,7 +250,7 @@ def test_slow_work_takes_the_newest() -> None:
     assert dropping.dropped["incoming"] == 40 - len(seen.seen)
 
 
-def test_who_is_slow_beside_holds_nobody_up() -> None:
+def test_a_slow_background_observer_delays_nobody() -> None:
     dropping, fast, slow = DropPolicy(), Seen(), Seen(pause=0.1, beside=2)
     run(Numbers(30, pause=0.01), Squares(), [slow, fast], dropping=dropping)
     assert len(fast.seen) == 30
@@ -260,7 +260,7 @@ def test_who_is_slow_beside_holds_nobody_up() -> None:
     assert slow.threads.isdisjoint(fast.threads)
 
 
-def test_an_error_beside_ends_the_run() -> None:
+def test_an_error_of_a_background_observer_ends_the_run() -> None:
     with pytest.raises(RuntimeError, match="full"):
         run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, beside=1)], dropping=DropPolicy())
 
@@ -293,11 +293,11 @@ def test_a_source_that_waits_for_good_can_be_ended() -> None:
 # --- drawn by the caller -----------------------------------------------------------------------
 
 
-def test_results_can_be_drawn() -> None:
+def test_results_can_be_iterated() -> None:
     assert list(iterate_results(Numbers(20), Squares())) == finished(20)
 
 
-def test_closing_ends_the_threads_and_draws_no_more() -> None:
+def test_closing_ends_the_threads() -> None:
     numbers = Numbers(10_000)
     drawn = iterate_results(numbers, Squares())
     assert next(drawn) == 1
@@ -306,7 +306,7 @@ def test_closing_ends_the_threads_and_draws_no_more() -> None:
     assert not [t for t in threading.enumerate() if t.name.startswith(("stages", "network"))]
 
 
-def test_what_is_made_comes_in_order_from_another_thread() -> None:
+def test_prefetched_items_come_in_order() -> None:
     made = list(map_ahead(range(100), lambda i: (i * i, threading.get_ident()), 2))
     assert [square for square, _ in made] == [i * i for i in range(100)]
     assert threading.get_ident() not in {thread for _, thread in made}
@@ -321,7 +321,7 @@ def test_a_cut_source_gives_what_preceded_the_cut(depth: int) -> None:
     assert got == ["0", "1"]
 
 
-def test_the_work_goes_on_while_the_next_is_made() -> None:
+def test_work_and_prefetching_overlap() -> None:
     """The second item is only made once the first is worked on: taking turns would wait for ever."""
     begun = threading.Event()
 

@@ -203,7 +203,7 @@ def test_networks_take_custom_operators_from_no_file() -> None:
     assert not [path for path in package.rglob("*.py") if "register_custom_ops" in path.read_text()]
 
 
-def test_what_the_page_says_of_trust(folder: Path) -> None:
+def test_the_page_is_right_about_trust(folder: Path) -> None:
     """Where it is kept and for whom, what takes it away, and that links lead to what is meant."""
     _project(True)
     assert (folder / "ran").exists()
@@ -215,7 +215,7 @@ def test_what_the_page_says_of_trust(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("function", ["pickle:loads", "os:system", "numpy:load"])
-def test_what_the_page_names_as_no_stage_is_none(function: str) -> None:
+def test_functions_named_as_no_stages_are_refused(function: str) -> None:
     assert f"`{function}`" in PAGE.read_text()
     with pytest.raises(UserError, match="is no stage"):
         load(settings=[f"clustering.method={function}"])

@@ -134,13 +134,13 @@ def test_bind_opens_it_at_one_address() -> None:
         assert all(is_listening(OTHER, p) and not is_listening("127.0.0.1", p) for p in found)
 
 
-def test_an_address_of_another_machine() -> None:
+def test_an_address_of_another_machine_is_refused() -> None:
     with pytest.raises(UserError, match=r"--bind 203\.0\.113\.7: no address of this machine"):
         own_address("203.0.113.7")
     assert own_address("localhost") in ("127.0.0.1", "::1")
 
 
-def test_which_pages_may_have_the_data() -> None:
+def test_only_local_pages_may_read_the_data() -> None:
     """A page of somebody else that happens to use the same port is none of them."""
     assert allowed_origins("127.0.0.1", 9090) == []
     assert allowed_origins("192.0.2.1", 9090) == ["http://192.0.2.1:9090"]

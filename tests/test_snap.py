@@ -122,7 +122,9 @@ def test_a_link_to_elsewhere_is_not_followed(runtime: Path) -> None:
 
 
 @pytest.mark.parametrize("odd", ["", "relative", "/proc/none", "/dev/null", "/tmp/" + 120 * "x"])
-def test_odd_runtime_folders(odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snap_works_with_odd_runtime_folders(
+    odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", odd)
     with Control(saved, never):
@@ -173,7 +175,7 @@ def test_saving_may_take_longer_than_the_answer(monkeypatch: pytest.MonkeyPatch)
         assert snap() == Path("/slow.rrd")
 
 
-def test_two_at_once_are_served_one_after_the_other() -> None:
+def test_simultaneous_requests_are_served_in_turn() -> None:
     busy: list[int] = []
 
     def save(path: Path | None) -> Path:
@@ -191,7 +193,7 @@ def test_two_at_once_are_served_one_after_the_other() -> None:
     assert len(found) == 3
 
 
-def test_its_client_is_light() -> None:
+def test_the_client_imports_little() -> None:
     heavy = "{'numpy', 'rerun', 'numba', 'cv2'}"
     code = f"import bevviz.live.control, sys; print(sorted({heavy} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -133,7 +133,7 @@ def test_a_marker_is_where_its_pose_says() -> None:
     assert sphere.solids is not None and sphere.solids.round
 
 
-def test_statuses_and_what_a_topic_tells() -> None:
+def test_diagnostics_and_topic_statistics_are_decoded() -> None:
     status = make(
         "diagnostic_msgs/msg/DiagnosticStatus", level=9, name="fan", message="odd", hardware_id="", values=[]
     )
@@ -147,7 +147,7 @@ def test_statuses_and_what_a_topic_tells() -> None:
     assert {topic: surroundings_kind(*topic) for topic in kinds} == kinds
 
 
-def test_what_is_kept_is_bounded_and_marks_are_for_one_frame() -> None:
+def test_memory_is_bounded_and_marks_last_one_frame() -> None:
     around = SurroundingsBuffer()
     assert around.take(lambda name: np.eye(4)) is None
     around.add_mark("here")
@@ -208,7 +208,7 @@ URDF = """<robot name="van">
 </robot>"""
 
 
-def test_the_links_of_a_robots_description() -> None:
+def test_links_of_a_robot_description_are_placed() -> None:
     description = make("std_msgs/msg/String", data=URDF)
     base, mast, wheel = decode_shapes(description, "String", "/robot_description")
     assert [shape.frame_id for shape in (base, mast, wheel)] == ["base_link", "mast", "wheel"]
@@ -306,7 +306,7 @@ def test_a_height_map_lies_where_it_is_measured(start: tuple[int, int]) -> None:
     assert np.abs(edges[..., :2]).max() == 0.5, "of neighbours alone"
 
 
-def test_what_is_no_height_is_a_coloured_plane() -> None:
+def test_a_layer_without_heights_is_a_coloured_plane() -> None:
     values = np.arange(4, dtype=np.float32).reshape(2, 2)
     (shape,) = decode_shapes(height_map(values, layers=["cost"]), "GridMap", "/costs")
     assert shape.surface is not None
@@ -326,7 +326,7 @@ def test_what_is_no_height_is_a_coloured_plane() -> None:
           data_offset=0), data=np.zeros(3, np.float32))]}, "3 values in no cells"),
     ],
 )  # fmt: skip
-def test_a_height_map_that_contradicts_itself(more: dict[str, Any], why: str) -> None:
+def test_an_inconsistent_height_map_is_refused(more: dict[str, Any], why: str) -> None:
     with pytest.raises(MessageError, match=why):
         decode_shapes(height_map(np.zeros((2, 2)), **more), "GridMap", "/heights")
 
@@ -343,9 +343,7 @@ endsolid s
 """
 
 
-def test_meshes_that_are_here_are_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frame: Frame
-) -> None:
+def test_local_meshes_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frame: Frame) -> None:
     roof = tmp_path / "prefix/share/van/roof.stl"
     roof.parent.mkdir(parents=True)
     roof.write_bytes(STL)

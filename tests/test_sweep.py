@@ -57,7 +57,7 @@ def frame() -> Frame:
         ("ground.method=polar,plane", ("polar", "plane")),
     ],
 )
-def test_values(text: str, values: tuple[str, ...]) -> None:
+def test_ranges_of_values_are_parsed(text: str, values: tuple[str, ...]) -> None:
     ((parameter,), constant) = parse([text, "detector.classes=[person, car]"])
     assert parameter == Parameter(text.split("=")[0], values)
     assert constant == ["detector.classes=[person, car]"]
@@ -74,7 +74,7 @@ def test_values(text: str, values: tuple[str, ...]) -> None:
         (["clustering.eps=1:30:1", "voxel.size=1:30:1"], "900 combinations are more than 500"),
     ],
 )
-def test_no_range(settings: list[str], message: str) -> None:
+def test_an_invalid_range_is_one_line(settings: list[str], message: str) -> None:
     with pytest.raises(UserError, match=message):
         parse(settings)
 
@@ -88,7 +88,7 @@ def test_two_parameters_make_a_grid() -> None:
     assert {config.voxel.size for config in configs.values()} == {0.2}
 
 
-def test_what_frames_are_made_of_is_not_swept() -> None:
+def test_source_parameters_cannot_be_swept() -> None:
     with pytest.raises(UserError, match=r"differ in sync\.tolerance"):
         combine([Parameter("sync.tolerance", ("0.1", "0.2"))], lambda more: load(settings=more))
 
@@ -137,7 +137,7 @@ def test_planted_errors_are_counted() -> None:
     assert score.errors == pytest.approx([0.5, 0.1])
 
 
-def test_nothing_found_and_nothing_there() -> None:
+def test_empty_results_and_empty_truth_are_counted() -> None:
     score = ObjectScore()
     score.add(objects(), truth())
     assert np.isnan([score.precision, score.recall, score.f1]).all()
@@ -145,14 +145,14 @@ def test_nothing_found_and_nothing_there() -> None:
     assert score.recall == 0
 
 
-def test_the_nearest_free_one_is_taken() -> None:
+def test_the_nearest_unmatched_object_is_matched() -> None:
     distance = np.array([[1.0, 0.2], [0.3, 0.1], [0.5, 9]], np.float32)
     partner, free = pair_in_order(distance, 2.0)
     assert partner.tolist() == [1, 0, -1]
     assert not free.any()
 
 
-def test_what_must_be_found_in_the_synthetic_drive() -> None:
+def test_required_objects_of_the_synthetic_drive_are_known() -> None:
     """In range, in the image, and hit: as the simulator knows it itself."""
     shot = source().snapshot(10)
     stated = shot.frame.truth
@@ -188,7 +188,7 @@ def test_kitti_labels_are_where_the_points_are(shared: Path, name: str) -> None:
     assert (length > width).all()
 
 
-def test_kitti_heading(shared: Path) -> None:
+def test_headings_of_kitti_labels_are_right(shared: Path) -> None:
     """The car and the truck of 000001 stand along the road, the pedestrian of 000000 across."""
     along = read_labels(shared / "kitti/label_2/000001.txt")
     assert np.abs(np.sin(along.boxes.yaw)).max() < 0.05
@@ -196,7 +196,7 @@ def test_kitti_heading(shared: Path) -> None:
     assert abs(np.sin(across.boxes.yaw[0])) > 0.99
 
 
-def test_no_labels(tmp_path: Path) -> None:
+def test_unusable_labels_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no label file there"):
         label_files(tmp_path)
     (tmp_path / "label_2").mkdir()
@@ -269,7 +269,7 @@ def test_a_grid_is_a_heat_map(drive: str) -> None:
     assert frame[:-1].mean(axis=0) == pytest.approx([WIDTH / 2, HEIGHT / 2])
 
 
-def test_kitti_as_truth(shared: Path, capsys: Capture) -> None:
+def test_kitti_labels_serve_as_truth(shared: Path, capsys: Capture) -> None:
     bag = bags.write(Path("kitti"), bags.kitti_items(shared))
     arguments = ["--model", str(shared / "models/yolox_nano.onnx"), "--frames", ":1"]
     for name in ("label_2/000000.txt", "label_2/000001.txt", "calib/000000.txt", "calib/000001.txt"):
@@ -287,7 +287,7 @@ def test_kitti_as_truth(shared: Path, capsys: Capture) -> None:
     assert said in capsys.readouterr().err
 
 
-def test_another_topic_as_truth() -> None:
+def test_another_topic_serves_as_truth() -> None:
     """The frame's own truth under a topic of the robot is the same truth."""
     own = frame().truth
     assert own is not None
@@ -340,7 +340,7 @@ def test_an_interrupted_sweep_tells_what_it_has(
         (["--set", "clustering.eps=1,2", "--csv", "none/s.csv"], "--csv none/s.csv: there is no folder none"),
     ],
 )
-def test_wrong_calls(arguments: list[str], message: str, drive: str, capsys: Capture) -> None:
+def test_wrong_calls_are_one_line(arguments: list[str], message: str, drive: str, capsys: Capture) -> None:
     assert main(["sweep", drive, "--frames", ":1", *arguments]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("bevviz: error: ")

@@ -234,7 +234,7 @@ def test_topics_without_a_publisher_are_not_waited_for() -> None:
     assert frame.stamp == ns(0.1)
 
 
-def test_transforms_that_end_too_early() -> None:
+def test_transforms_that_end_too_early_are_reported() -> None:
     feed = Feed()
     feed.calibration()
     feed.info()
@@ -293,7 +293,7 @@ def test_wrong_extrinsics_are_one_clear_line(names: str) -> None:
         Feed(ONE, f"source.extrinsics={value}")
 
 
-def test_without_camera_info() -> None:
+def test_a_missing_camera_info_is_reported() -> None:
     feed = Feed()
     feed.calibration()
     feed.sync.add_cloud(cloud(0.0))
@@ -343,7 +343,7 @@ def test_camera_info_follows_the_image_size_and_later_changes() -> None:
     assert changed is not None and changed.K[0, 0] == 640
 
 
-def test_order_duplicates_and_late_clouds() -> None:
+def test_duplicates_and_late_clouds_are_dropped() -> None:
     feed = Feed()
     feed.calibration()
     feed.info()
@@ -378,7 +378,7 @@ def test_frames_come_in_order_and_every_cloud_is_accounted_for(milliseconds: lis
     assert report.frames + report.late + report.duplicates == report.clouds == len(milliseconds)
 
 
-def test_jumping_stamps() -> None:
+def test_a_jump_back_of_stamps_resets_poses() -> None:
     feed = Feed(replace(ONE, cameras=()))
     feed.sync.add_transform(edge("base_link", "rslidar", pose(0.3)), static=True)
     feed.odometry(turning, 99.0, 104.0)
@@ -500,7 +500,7 @@ def test_two_lidars_are_merged_in_the_base_frame() -> None:
     assert frame.problems == ()
 
 
-def test_base_frame_is_awaited() -> None:
+def test_the_base_frame_is_awaited() -> None:
     feed = Feed(Roles(lidars=("/front", "/back"), lidar_names=("front", "back")))
     for topic in ("/front", "/back"):
         feed.sync.add_cloud(cloud(0.0, topic, topic[1:]))
@@ -522,7 +522,7 @@ def test_lidars_that_do_not_fit_together_are_told() -> None:
     assert frame.problems[1] == "no cloud of LiDAR /back within 0.10 s: nearest is 0.30 s later"
 
 
-def test_only_the_second_lidar_delivers() -> None:
+def test_frames_are_made_if_only_the_second_lidar_delivers() -> None:
     feed = two_lidars()
     feed.sync.add_cloud(cloud(0.0, "/back", "back"))
     assert list(feed.sync.flush()) == []
@@ -733,14 +733,14 @@ def test_a_clock_that_is_off_is_named_and_can_be_set_right(offset: float) -> Non
     assert len(errors) >= len(frames) - 1 and max(errors) < 0.11
 
 
-def test_times_of_receipt_instead_of_stamps() -> None:
+def test_times_of_receipt_can_replace_stamps() -> None:
     frames, sync = of_clocks(1.5, "sync.by=received")
     assert not [text for text in sync.report.warnings() if "clock" in text]
     assert [f.stamp for f in frames[:2]] == [ns(0.1), ns(0.2)]
     assert all(f.cameras[0].image is not None for f in frames[:-1])
 
 
-def test_a_slow_way_is_no_wrong_clock() -> None:
+def test_a_slow_connection_is_no_wrong_clock() -> None:
     for offset in (0.3, -0.09):
         _, sync = of_clocks(offset)
         assert not [text for text in sync.report.warnings() if "clock" in text]
@@ -753,7 +753,7 @@ def test_a_slow_way_is_no_wrong_clock() -> None:
         (-37.0, "37 s ahead of that of /rslidar_points, as TAI is of UTC; --set sync.offsets"),
     ],
 )
-def test_other_epochs_are_told_by_name(offset: float, words: str) -> None:
+def test_other_epochs_are_named(offset: float, words: str) -> None:
     clocks = Clocks({}, "stamp")
     for i in range(5):
         clocks.stamp("/rslidar_points", ns(i), ns(i + 0.1))
@@ -820,7 +820,7 @@ def test_a_camera_without_a_frame_is_not_at_the_lidar() -> None:
     assert "a message states no frame_id; its driver must" in " ".join(frame.cameras[0].problems)
 
 
-def test_a_static_transform_that_was_sent_once_on_tf() -> None:
+def test_a_static_transform_sent_once_on_tf_holds() -> None:
     feed = Feed()
     feed.info()
     feed.sync.add_transform(edge("base_link", "rslidar", pose(0.3, 0, 1.2)), static=True)
@@ -832,7 +832,7 @@ def test_a_static_transform_that_was_sent_once_on_tf() -> None:
     assert "5.00 s before the asked stamp (it was sent once, as if it were static: sync.tf_tolerance" in text
 
 
-def test_the_second_camera_of_a_stereo_pair() -> None:
+def test_the_baseline_of_a_stereo_pair_is_used() -> None:
     """In the frame of the first one it is a baseline beside it; in a frame of its own it is where TF says."""
     right = CameraRole("right", "/right/image", "/right/camera_info", True, "Image")
     roles = Roles(lidars=ONE.lidars, lidar_names=ONE.lidar_names, cameras=(LEFT, right))

@@ -89,7 +89,7 @@ def test_a_frame_depends_on_nothing_but_what_came_before_it() -> None:
 
 
 @pytest.mark.parametrize("more", [{}, {"weave": True}, {"plant": ["merged_people"]}])
-def test_nor_does_the_last_frame(more: dict[str, Any]) -> None:
+def test_frames_do_not_depend_on_the_length_of_the_drive(more: dict[str, Any]) -> None:
     """Where the street of a short drive ends, that of a longer one goes on: nobody sees as far."""
     short, long = SyntheticSource(60, 4, **more), SyntheticSource(150, 4, **more)
     for index in (0, 59):

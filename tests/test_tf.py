@@ -103,7 +103,7 @@ def test_a_repeated_pose_holds_until_the_next_pose() -> None:
         buffer.lookup("base_link", "camera", 20 * SECOND, 0.2)
 
 
-def test_what_is_not_connected_is_told(robot: TransformBuffer) -> None:
+def test_unconnected_frames_are_reported(robot: TransformBuffer) -> None:
     with pytest.raises(TransformError, match="from 'velodyne' to 'odom': frame 'velodyne' is unknown"):
         robot.lookup("odom", "velodyne", 0, 0.2)
     robot.add(sample("dock", "beacon", 0, pose()), static=True)
@@ -145,7 +145,7 @@ def test_newer_parent_wins_and_is_told(robot: TransformBuffer) -> None:
     assert robot.tree()["base_link"] == "odom"
 
 
-def test_cycle_is_refused(robot: TransformBuffer) -> None:
+def test_a_cycle_is_refused(robot: TransformBuffer) -> None:
     before = dict(robot.tree())
     robot.add(sample("optical", "map", 3, pose()))
     robot.add(sample("zed", "zed", 3, pose()))
@@ -154,7 +154,7 @@ def test_cycle_is_refused(robot: TransformBuffer) -> None:
     assert robot.lookup("map", "optical", SECOND, 0.0).age == 0.0
 
 
-def test_who_says_it_decides() -> None:
+def test_the_authority_of_a_transform_decides() -> None:
     buffer = TransformBuffer()
     buffer.add(sample("odom", "base_link", 0, pose(1)), origin=Origin.ODOMETRY)
     buffer.add(sample("base_link", "odom", 0, pose(2)))  # /tf has the same edge the other way round

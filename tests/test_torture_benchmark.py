@@ -23,7 +23,7 @@ from tests.support.foreign_readers import judges, taken
 SHORT = ("mcap, no checksums", "mcap, zstd", "mcap, flat", "mcap.zstd", "sqlite3, with a log", "ros1, lz4")
 
 
-def test_damaged_bags() -> None:
+def test_damaged_bags_are_read_as_well_as_by_others() -> None:
     total = Tally()
     for _, tally in damage.run(seed=1, bags=len(SHORT) * len(DAMAGES), names=SHORT):
         total += tally
@@ -34,7 +34,7 @@ def test_damaged_bags() -> None:
     assert total.wrong <= total.their_wrong * 1.2
 
 
-def test_fuzzed_messages() -> None:
+def test_fuzzed_messages_are_refused_in_one_line() -> None:
     (total,) = fuzz.run(seed=1, messages=120)
     assert total.messages >= 120 and total.refused > 40
     assert not (total.tracebacks or total.broken or total.hangs), total.examples
@@ -42,13 +42,13 @@ def test_fuzzed_messages() -> None:
     assert total.memory < 400
 
 
-def test_signals_at_any_time() -> None:
+def test_signals_at_any_time_leave_readable_files() -> None:
     for _, tally in kill.run(seed=1, count=4, names=("bag", "batch")):
         assert tally.signals == 2
         assert tally.well, tally.examples
 
 
-def test_what_counts_as_false_or_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_false_and_unreadable_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag, check = kill.COMMANDS["bag"], kill.COMMANDS["report --check"]
     assert kill._falsehood(tmp_path, bag, 0, "") == "and not all that it should be"
     assert kill._falsehood(tmp_path, check, 0, f"{kill.SCANS} frames: the same in every bit") == ""
@@ -77,7 +77,7 @@ def test_the_other_readers_read_a_sound_bag(tmp_path: Path, name: str) -> None:
     assert sum(count == 161 for count in best.values()) >= 2 or "with a log" in name, best
 
 
-def test_what_counts_as_a_failure(tmp_path: Path) -> None:
+def test_failures_are_counted(tmp_path: Path) -> None:
     path = FORMATS["ros1"](tmp_path)
     written = [(topic, time, data) for topic, _, time, data in items(ros1=True)]
     whole = Counter(written)
@@ -97,7 +97,7 @@ def test_a_worker_that_hangs_is_replaced(tmp_path: Path, monkeypatch: pytest.Mon
         assert worker.read(tmp_path / "nothing.bag").said
 
 
-def test_the_command_says_which_parts_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_knows_its_parts_and_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     from benchmarks.torture.__main__ import PARTS, damaged_bags
 
     options = argparse.Namespace(seed=2, bags=10, format="ros1, bz2", messages=1, signals=1)
@@ -117,7 +117,7 @@ def test_strange_folders_end_well_or_in_one_line() -> None:
     assert total.well, total.examples
 
 
-def test_what_counts_as_a_failure_of_a_command() -> None:
+def test_failures_of_commands_are_counted() -> None:
     assert folders._wrong(0, "bevviz: warning: a scan is cut") == ""
     assert folders._wrong(2, "bevviz: error: no such file") == ""
     assert folders._wrong(3, "bevviz: error of bevviz itself: KeyError")
@@ -134,7 +134,7 @@ def test_changed_onnx_files_are_read_or_refused_in_a_line() -> None:
 SHORT_KINDS = ("Livox CustomMsg", "CompressedPointCloud2, zstd", "RadarTracks", "foxglove.SceneUpdate, json")
 
 
-def test_messages_of_other_kinds() -> None:
+def test_messages_of_other_kinds_are_refused_in_one_line() -> None:
     total = messages.Tally()
     for _, tally in messages.run(seed=1, each=60, names=SHORT_KINDS):
         total += tally
@@ -178,5 +178,5 @@ def test_a_case_that_goes_wrong_is_named(tmp_path: Path) -> None:
         (Outcome(traceback="the process ended (-9)"), "tracebacks"),
     ],
 )
-def test_what_is_wrong_with_the_reading_of_a_drive(outcome: Outcome, expected: str) -> None:
+def test_failures_of_reading_a_drive_are_counted(outcome: Outcome, expected: str) -> None:
     assert messages.fault(outcome) == expected

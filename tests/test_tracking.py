@@ -97,7 +97,7 @@ def test_a_fast_car_is_tracked_from_its_second_frame_on() -> None:
     np.testing.assert_allclose(tracks.velocity[0], [-14, 0, 0], atol=0.2)
 
 
-def test_birth_takes_sightings_and_an_end_takes_time() -> None:
+def test_tracks_need_sightings_and_end_after_a_time() -> None:
     tracker = Tracker()
     shown = [bool(step(tracker, i, [(5, 0, 0)], PERSON, ("person",)).confirmed[0]) for i in range(4)]
     assert shown == [False, False, True, True]
@@ -107,7 +107,7 @@ def test_birth_takes_sightings_and_an_end_takes_time() -> None:
     assert gone[0].cluster.tolist() == [-1]
 
 
-def test_what_was_seen_once_or_twice_ends_with_the_first_miss() -> None:
+def test_young_tracks_end_with_the_first_miss() -> None:
     tracker = Tracker()
     step(tracker, 0, [(5, 0, 0)])
     assert len(step(tracker, 1, [])) == 0
@@ -157,7 +157,7 @@ def test_a_rectangle_turned_by_a_quarter_is_the_same_car() -> None:
     assert np.cos(turn) < 0, "it comes: its front is the side towards the robot"
 
 
-def test_what_was_whole_once_stays_so() -> None:
+def test_a_track_keeps_its_largest_size() -> None:
     """A car of which only the rear is seen: named with all of its length, then not named any more."""
     tracker = Tracker()
     for i in range(12):
@@ -259,7 +259,7 @@ def test_whatever_comes_ids_are_unique_and_numbers_finite(drive: Drive, lost: bo
         known |= set(tracks.id.tolist())
 
 
-def test_figures_of_a_known_mix_up() -> None:
+def test_metrics_of_a_known_id_switch_are_right() -> None:
     """Two objects, 14 frames; in the last four their tracks are swapped, and a third track is false."""
     tally = TrackTally()
     truth = Truth(np.array([[0, 0, 0], [8, 0, 0]], np.float32), np.zeros((2, 3)),
@@ -309,7 +309,7 @@ def drive() -> list[Frame]:
     return list(SyntheticSource(frames=4))
 
 
-def test_in_the_pipeline(drive: list[Frame]) -> None:
+def test_the_pipeline_runs_the_tracker(drive: list[Frame]) -> None:
     session = Session(load(settings=["detector.model=demo"]))
     results = [session.run(frame) for frame in drive]
     last = results[-1]

@@ -498,7 +498,7 @@ def names_in(path: Path) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
 
 
-def test_only_few_places_speak_for_the_user() -> None:
+def test_trust_is_granted_in_few_places_only() -> None:
     """Few modules grant trust, and a layer without a stated origin is not trusted."""
     assert Layer("somewhere", {}).trust is RECEIVED and not RECEIVED.granted
     users = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if "USER" in names_in(path)}

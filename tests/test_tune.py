@@ -88,7 +88,7 @@ class Tuned:
             self.versions.get(timeout=0.5)
 
 
-def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_save_is_a_new_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inferred: list[int] = []
     infer = detector.Detector.infer
 
@@ -130,7 +130,7 @@ def test_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {row["version"] for row in recording.rows["/explain/log"]} <= {0, 1, 2}
 
 
-def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path: Path) -> None:
     with Tuned(tmp_path) as tuned:
         assert tuned.version().number == 0
         for text, message in (
@@ -150,7 +150,7 @@ def test_what_is_no_configuration_is_not_taken(tmp_path: Path) -> None:
         tuned.silence()
 
 
-def test_a_file_is_made_once(tmp_path: Path) -> None:
+def test_a_missing_file_is_created_once(tmp_path: Path) -> None:
     file = tmp_path / "my.yaml"
     config = load(settings=["clustering.eps=0.7"], preset="reference")
     assert create_config_file(file, config_yaml(config))
@@ -161,7 +161,7 @@ def test_a_file_is_made_once(tmp_path: Path) -> None:
         create_config_file(tmp_path / "none" / "my.yaml", "")
 
 
-def test_as_a_user_runs_it(tmp_path: Path) -> None:
+def test_the_command_shows_each_saved_version(tmp_path: Path) -> None:
     messages = bags.Messages()
     bags.write(tmp_path / "drive", bags.small_items(messages, scans=3), messages)
     command = [sys.executable, "-m", "bevviz.cli", "tune", "drive", "--at", "0.1", "--save", "t.rrd"]
@@ -196,7 +196,7 @@ def test_as_a_user_runs_it(tmp_path: Path) -> None:
     assert len(Recording(tmp_path / "t.rrd").rows["/tune"]) == 2
 
 
-def test_wrong_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_wrong_calls_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.chdir(tmp_path)
     messages = bags.Messages()
     bags.write(tmp_path / "drive", bags.small_items(messages, scans=2), messages)

@@ -143,7 +143,7 @@ def configured(*settings: str) -> Config:
 # --- what they make ----------------------------------------------------------------------------
 
 
-def test_somebodys_ground_and_clusters(here: Path, frame: Frame) -> None:
+def test_ground_and_clusters_of_the_user_are_used(here: Path, frame: Frame) -> None:
     config = configured("ground.method=mine.stages:ground", "clustering.method=mine.stages:cells")
     result = Session(config).run(frame)
     assert result.failures == ()
@@ -163,7 +163,7 @@ def test_somebodys_ground_and_clusters(here: Path, frame: Frame) -> None:
     assert (small == (clusters.state == ClusterState.TOO_SMALL)).all() and small.any() and not small.all()
 
 
-def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
+def test_heights_are_measured_above_nearby_ground(frame: Frame) -> None:
     """On the drive's own ground, known exactly, they are close to what our own stage tells."""
     ours = Session(load()).run(frame)
     assert ours.voxels is not None and ours.ground is not None
@@ -177,7 +177,7 @@ def test_heights_are_those_above_the_ground_around(frame: Frame) -> None:
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(1, 50), st.just(3)), elements=st.floats(-300, 300, width=32))
 )
-def test_heights_of_any_points(points: Any) -> None:
+def test_heights_are_finite_for_any_points(points: Any) -> None:
     everywhere = user_stages.heights_above_ground(points, np.ones(len(points), bool))
     assert np.isfinite(everywhere).all()
     lowest = user_stages.heights_above_ground(points, points[:, 2] == points[:, 2].min())
@@ -185,7 +185,7 @@ def test_heights_of_any_points(points: Any) -> None:
     assert np.isnan(user_stages.heights_above_ground(points, np.zeros(len(points), bool))).all()
 
 
-def test_nobody_changes_the_points_of_a_frame(here: Path, frame: Frame) -> None:
+def test_stages_cannot_change_the_points_of_a_frame(here: Path, frame: Frame) -> None:
     before = frame.points.copy()
     result = Session(configured("clustering.method=mine.stages:everything")).run(frame)
     assert result.clusters is not None and len(result.clusters) == 1
@@ -193,7 +193,7 @@ def test_nobody_changes_the_points_of_a_frame(here: Path, frame: Frame) -> None:
     np.testing.assert_array_equal(frame.points, before)
 
 
-def test_somebodys_detector_is_made_once_and_fused(here: Path, frame: Frame) -> None:
+def test_a_user_detector_is_built_once_and_fused(here: Path, frame: Frame) -> None:
     config = configured("detector.model=mine.stages:Detector", "detector.params.score=0.7")
     session = Session(config)
     for _ in range(2):
@@ -211,7 +211,7 @@ def test_somebodys_detector_is_made_once_and_fused(here: Path, frame: Frame) -> 
     assert [e.state for e in result.explanations if e.subject == "detection"][1] == "below_threshold"
 
 
-def test_somebodys_objects_have_the_clusters_in_their_boxes(here: Path, frame: Frame) -> None:
+def test_user_objects_have_the_clusters_in_their_boxes(here: Path, frame: Frame) -> None:
     result = Session(configured("objects.method=mine.stages:pillars")).run(frame)
     objects, clusters = result.objects, result.clusters
     assert result.failures == () and objects is not None and clusters is not None
@@ -228,7 +228,7 @@ def test_somebodys_objects_have_the_clusters_in_their_boxes(here: Path, frame: F
     assert placed.cluster[0] == np.bincount(kept).argmax()
 
 
-def test_a_registered_name(here: Path, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_registered_name_is_a_stage(here: Path, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a package's entry point in the group ``bevviz.stages`` does."""
     metadata = here / "mine-1.0.dist-info"
     metadata.mkdir()
@@ -293,7 +293,7 @@ def test_parameters_become_part_of_the_section(here: Path, monkeypatch: pytest.M
         (["detector.model=none.onnx"], "detector.model none.onnx: no such file"),
     ],
 )
-def test_what_cannot_be_had_is_one_clear_line(here: Path, settings: list[str], message: str) -> None:
+def test_an_unusable_stage_is_one_line(here: Path, settings: list[str], message: str) -> None:
     (here / "broken.py").write_text("import sys\n1 / 0\n")
     with pytest.raises(UserError) as caught:
         Session(configured("clustering.method=mine.stages:cells", *settings))
@@ -439,7 +439,7 @@ def results_of(bag: Path, *settings: str) -> list[FrameResult]:
         return [session.run(frame) for frame in source]
 
 
-def test_the_robots_own_stages(robot: Path) -> None:
+def test_topics_of_the_robot_replace_stages(robot: Path) -> None:
     ours = results_of(robot, "detector.model=demo", "fusion.split=false")
     taken = results_of(
         robot,
@@ -479,7 +479,7 @@ def test_image_boxes_of_an_unknown_camera_go_to_no_camera() -> None:
             detect(replace(alone, cameras=(front, rear)), camera, "/boxes")
 
 
-def test_the_robots_objects_and_what_it_did_not_publish(robot: Path) -> None:
+def test_a_topic_of_the_robot_replaces_objects(robot: Path) -> None:
     ours = results_of(robot, "detector.model=demo", "fusion.split=false")
     taken = results_of(robot, "objects.method=topic:/robot/objects")
     for mine, theirs in zip(ours, taken, strict=True):
@@ -497,7 +497,7 @@ def test_the_robots_objects_and_what_it_did_not_publish(robot: Path) -> None:
         results_of(robot, "detector.model=topic:/robot/objects")
 
 
-def test_a_scan_that_the_robot_says_nothing_of(frame: Frame) -> None:
+def test_a_scan_without_robot_results_is_a_reason(frame: Frame) -> None:
     result = Session(load(settings=["clustering.method=topic:/clusters"])).run(frame)
     (failure,) = result.failures
     assert failure.reason == "the robot published no boxes on /clusters at the time of this scan"
@@ -510,9 +510,7 @@ def test_a_scan_that_the_robot_says_nothing_of(frame: Frame) -> None:
 # --- as a user runs it -------------------------------------------------------------------------
 
 
-def test_a_whole_run_with_somebodys_stages(
-    here: Path, robot: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_whole_run_uses_user_stages(here: Path, robot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive, own = str(robot), ["--set", "clustering.method=mine.stages:cells"]
     assert main(["bag", drive, *own, "--save", "x.rrd"]) == 0
     assert main(["sweep", drive, *own, "--set", "clustering.cell=0.5:1.5:0.5"]) == 0

@@ -174,7 +174,7 @@ def test_damaged_packets_and_other_codecs_are_one_line(tmp_path: Path) -> None:
         assert any("codec 'mjpeg2000' is not supported" in warning for warning in source.warnings)
 
 
-def test_h264_says_itself_how_many_pictures_are_missing() -> None:
+def test_h264_states_how_many_pictures_are_missing() -> None:
     packets = encode(numbered(30), group=30)
     follows = Continuity()
     assert [follows.missing(packet) for packet in packets] == [0] * 30

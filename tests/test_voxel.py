@@ -56,7 +56,7 @@ def test_averages_equal_open3d_where_indices_exceed_64_bits() -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(clouds, st.sampled_from([0.05, 0.3, 1.0, 7.0]))
-def test_first_points_in_the_order_of_the_cloud(points: F32, size: float) -> None:
+def test_the_first_point_of_each_voxel_is_kept_in_order(points: F32, size: float) -> None:
     voxels = voxel_grid(points, VoxelConfig(size=size))
     _, first = np.unique(voxels.inverse, return_index=True)
     assert np.all(np.diff(first) > 0)
@@ -64,7 +64,7 @@ def test_first_points_in_the_order_of_the_cloud(points: F32, size: float) -> Non
     assert np.all(np.abs(points - voxels.points[voxels.inverse]) <= size * (1 + 1e-5))
 
 
-def test_averages_are_over_the_points_of_inverse() -> None:
+def test_inverse_names_the_averaged_points() -> None:
     points = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
     voxels = voxel_grid(points, VoxelConfig(size=0.5, average=True))
     for k in (0, 1, len(voxels.points) - 1):
@@ -78,12 +78,12 @@ def test_size_zero_keeps_the_points_untouched(points: F32) -> None:
     np.testing.assert_array_equal(voxels.inverse, np.arange(len(points)))
 
 
-def test_no_points() -> None:
+def test_an_empty_cloud_stays_empty() -> None:
     voxels = voxel_grid(np.zeros((0, 3), np.float32), VoxelConfig(size=0.1))
     assert voxels.points.shape == (0, 3)
     assert voxels.inverse.shape == (0,)
 
 
-def test_points_at_the_ends_of_float32() -> None:
+def test_points_at_the_limits_of_float32_are_averaged() -> None:
     points = np.array([[3e38, 0, 0], [-3e38, 0, 0], [0, 1e-30, 0], [0, 0, 0]], np.float32)
     np.testing.assert_array_equal(voxel_grid(points, VoxelConfig(size=0.1)).inverse, [0, 1, 2, 2])

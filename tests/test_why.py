@@ -66,7 +66,7 @@ def numbers(answer: Answer, stage: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_a_hidden_person(preset: str) -> None:
+def test_a_hidden_person_is_explained(preset: str) -> None:
     (row,) = planted("hidden_person", "person", 16.3)
     answer = of_truth(asked("hidden_person", preset, "person"), row)
     assert answer.verdict.reason is Reason.HIDDEN and not answer.verdict.reported
@@ -80,7 +80,7 @@ def test_a_hidden_person(preset: str) -> None:
     assert np.mean(van == at("hidden_person").truth_object[car]) > 0.9
 
 
-def test_a_flat_car_taken_for_ground() -> None:
+def test_a_flat_car_removed_as_ground_is_explained() -> None:
     (row,) = planted("flat_car", "car", 10.0)
     assert of_truth(asked("flat_car", "default", "car"), row).verdict.reason is Reason.REPORTED
     answer = about("flat_car", "reference", row)
@@ -106,7 +106,7 @@ def merged_people(preset: str) -> FrameResult:
 
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_two_people_in_one_cluster(preset: str) -> None:
+def test_two_people_in_one_cluster_are_explained(preset: str) -> None:
     asked_of = why(merged_people(preset), Selection(label="person"), CLASSES, hints=0)
     answers = [of_truth(asked_of, r) for r in planted("merged_people", "person", 9.9)]
     assert [a.verdict.reason for a in answers] == [Reason.MERGED] * 2
@@ -119,7 +119,7 @@ def test_two_people_in_one_cluster(preset: str) -> None:
     assert "clustering.eps is 0.5 m" in lost.verdict.text
 
 
-def test_two_people_whom_the_camera_parts() -> None:
+def test_two_people_split_by_the_camera_are_explained() -> None:
     answers = asked("merged_people", "default", "person")
     both = [of_truth(answers, row) for row in planted("merged_people", "person", 9.9)]
     assert [a.verdict.reason for a in both] == [Reason.REPORTED] * 2
@@ -128,7 +128,7 @@ def test_two_people_whom_the_camera_parts() -> None:
     assert any(re.search(r"which split it off (a )?cluster", a.verdict.text) for a in both)
 
 
-def test_the_hint_that_parts_two_people_is_proved() -> None:
+def test_the_hint_that_splits_two_people_is_proved() -> None:
     result = merged_people("default")
     answers = why(result, Selection(label="person"), CLASSES, hints=1)
     lost = next(a for a in answers if a.verdict.reason is Reason.MERGED and not a.verdict.reported)
@@ -143,7 +143,7 @@ def test_the_hint_that_parts_two_people_is_proved() -> None:
     )
 
 
-def test_two_people_without_ground_truth() -> None:
+def test_two_people_are_explained_without_truth() -> None:
     result = merged_people("default")
     blind = replace(result, frame=replace(result.frame, truth=None))
     answers = why(blind, Selection(label="person"), CLASSES, hints=0)
@@ -152,7 +152,7 @@ def test_two_people_without_ground_truth() -> None:
     assert any("was not reported because cluster" in a.verdict.text for a in merged)
 
 
-def test_a_box_that_names_two_clusters() -> None:
+def test_a_box_that_names_two_clusters_is_explained() -> None:
     (row,) = planted("shared_box", "person", 8.7)
     assert of_truth(asked("shared_box", "default", "person"), row).verdict.reason is Reason.REPORTED
     answer = about("shared_box", "reference", row)
@@ -208,7 +208,7 @@ def test_a_pixel_is_the_detection_there() -> None:
     assert sky.verdict.reason is Reason.NO_POINTS
 
 
-def test_the_fates_add_up() -> None:
+def test_the_outcomes_of_all_points_add_up() -> None:
     """Every raw point at the place has one fate, and nothing else has any but what hides it."""
     shot = at("merged_people")
     for answer in asked("merged_people", "default", "person"):
@@ -240,7 +240,7 @@ def test_a_pixel_lists_its_objects_with_the_visible_one_first() -> None:
     assert asked_for >= 4
 
 
-def test_an_empty_place_says_what_is_there() -> None:
+def test_an_empty_place_is_described() -> None:
     questioner = FrameExplainer(run("flat_car", "default"), classes=CLASSES)
     (road,) = questioner.ask(Selection(point=(-5.0, 1.0, -1.9)))
     assert road.verdict.text.startswith("There is only ground at -5, 1, -1.9 m: ")
@@ -293,7 +293,7 @@ def test_a_track_is_its_cluster_or_its_expected_place() -> None:
         FrameExplainer(session.alone(source.frame(6))).ask(Selection(track=1))
 
 
-def test_a_row_is_what_the_result_has_there() -> None:
+def test_a_row_number_selects_that_row_of_the_result() -> None:
     result = run("merged_people", "default")
     questioner = FrameExplainer(result, classes=CLASSES)
     assert result.objects is not None and result.clusters is not None
@@ -369,7 +369,7 @@ def test_a_camera_without_a_place_compares_nothing() -> None:
     assert "zed could not be compared with clusters: no transform to zed" in clustered[0].verdict.text
 
 
-def test_what_is_too_weak_was_not_suppressed() -> None:
+def test_weak_detections_are_not_called_suppressed() -> None:
     """A rival is not to blame for what would have been dropped without it."""
     result = Session(config_of("default", "detector.conf_threshold=0.5")).run(at("merged_people").frame)
     questioner, detections = FrameExplainer(result, classes=CLASSES), result.cameras[0].detections
@@ -383,7 +383,7 @@ def test_what_is_too_weak_was_not_suppressed() -> None:
         assert answer.verdict.reason is right
 
 
-def test_a_hint_says_what_else_it_changes() -> None:
+def test_a_hint_names_its_side_effects() -> None:
     (row,) = planted("flat_car", "car", 10.0)
     answer = about("flat_car", "reference", row)
     effects = answer.hints[0].effects
@@ -409,13 +409,13 @@ def test_a_hint_says_what_else_it_changes() -> None:
         (Selection(camera="left"), "--camera left: there is none"),
     ],
 )
-def test_what_cannot_be_asked(selection: Selection, message: str) -> None:
+def test_wrong_subjects_are_one_line(selection: Selection, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         why(run("merged_people", "default"), selection, CLASSES, hints=0)
     assert "\n" not in str(caught.value)
 
 
-def test_several_cameras_and_none() -> None:
+def test_the_camera_is_chosen_or_reported_missing() -> None:
     result = run("merged_people", "default")
     other = replace(result.cameras[0], camera=replace(result.cameras[0].camera, name="left"))
     both = replace(result, cameras=(*result.cameras, other))
@@ -540,7 +540,7 @@ def test_the_command_answers_and_draws(bag: Path, tmp_path: Path, capsys: Captur
     assert recording.column("/bev/overlay/why", "LineStrips2D:strips")
 
 
-def test_the_command_for_machines(bag: Path, capsys: Capture) -> None:
+def test_the_command_prints_json(bag: Path, capsys: Capture) -> None:
     command = ["why", str(bag), "--at", "0", "--model", "demo", "--json", "--point", "10,-2.7,-1.6"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
@@ -571,7 +571,7 @@ def test_frames_are_chosen_by_negative_or_scan_numbers(bag: Path, capsys: Captur
     assert "frame 99: " in capsys.readouterr().err
 
 
-def test_what_else_lies_at_a_place_is_listed(bag: Path, capsys: Capture) -> None:
+def test_other_objects_at_a_place_are_listed(bag: Path, capsys: Capture) -> None:
     assert main(["why", str(bag), "--model", "demo", "--at-frame", "0", "--point", "10,-2.7,-1.6"]) == 0
     said = capsys.readouterr().out
     assert "also there:\n- The car at 10.1 m was reported" in said
@@ -587,7 +587,7 @@ def test_what_else_lies_at_a_place_is_listed(bag: Path, capsys: Capture) -> None
         (["--at-frame", "0", "--cluster", "999"], "there is no cluster 999 in this frame: it has "),
     ],
 )
-def test_wrong_questions(bag: Path, capsys: Capture, arguments: list[str], message: str) -> None:
+def test_wrong_questions_are_one_line(bag: Path, capsys: Capture, arguments: list[str], message: str) -> None:
     assert main(["why", str(bag), *arguments]) == 2
     said = capsys.readouterr().err
     assert said.count("bevviz: error: ") == 1 and message in said
@@ -597,7 +597,7 @@ def test_wrong_questions(bag: Path, capsys: Capture, arguments: list[str], messa
     "arguments",
     [["--box", "1,2,3"], ["--point", "a,b,c"], ["--radius", "-1"], ["--class", "a", "--box", "1,2"]],
 )
-def test_wrong_numbers(bag: Path, capsys: Capture, arguments: list[str]) -> None:
+def test_numbers_out_of_range_are_refused(bag: Path, capsys: Capture, arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["why", str(bag), "--at", "0", *arguments])
     assert ended.value.code == 2

@@ -113,7 +113,9 @@ def _as_hint(settings: tuple[str, ...]) -> Hint:
         (HintSearch((), 0), "."),
     ],
 )
-def test_the_sentence(search: HintSearch, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sentence_names_the_change(
+    search: HintSearch, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = questioner("reference")
     answer = asked.missed()[0]
     monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: search)
@@ -121,7 +123,7 @@ def test_the_sentence(search: HintSearch, said: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("eps", [0.5, 19.0])
-def test_no_value_is_tried_that_nobody_may_set(eps: float) -> None:
+def test_only_valid_values_are_tried(eps: float) -> None:
     """Of parts whose distance is not known, too, and where a larger value is beyond the limit."""
     config = load(settings=["detector.model=demo", f"clustering.eps={eps}"])
     asked = FrameExplainer(Session(config).run(at("flat_car").frame), classes=CLASSES)
@@ -133,7 +135,7 @@ def test_no_value_is_tried_that_nobody_may_set(eps: float) -> None:
     assert all("nan" not in setting for hint in search.hints for setting in hint.settings)
 
 
-def test_what_was_tried_once_is_not_run_again() -> None:
+def test_values_are_not_tried_twice() -> None:
     """Answers of a frame share their runs; the second question is answered alike."""
     answer = next(a for a in near("reference") if a.hints)
     asked = questioner("reference")

@@ -90,7 +90,7 @@ def parameters_in(answer: Answer, *sections: str) -> list[str]:
 # --- somebody's functions ----------------------------------------------------------------------
 
 
-def test_what_somebodys_clustering_lost_is_said_with_its_name(here: Path) -> None:
+def test_losses_of_a_user_clustering_name_it(here: Path) -> None:
     result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
     assert result.failures == ()
     lost = of(ask(result), Reason.NO_CLUSTER)
@@ -100,7 +100,7 @@ def test_what_somebodys_clustering_lost_is_said_with_its_name(here: Path) -> Non
         assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
 
 
-def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
+def test_a_hint_may_be_a_parameter_of_a_user_stage(here: Path) -> None:
     """Of ours only those that still have a say."""
     theirs = ("clustering.method=somebody:cells", "clustering.cell=0.3")
     result = Session(load(settings=["detector.model=demo", *theirs])).run(frame())
@@ -111,7 +111,7 @@ def test_a_hint_may_be_a_parameter_of_somebodys_function(here: Path) -> None:
     assert not keys & {"clustering.eps", "clustering.min_points"}
 
 
-def test_somebodys_ground_and_detector_are_named(here: Path) -> None:
+def test_user_ground_and_detector_are_named(here: Path) -> None:
     flat = Session(load(settings=["detector.model=demo", "ground.method=somebody:flat"])).run(frame())
     ground = of(ask(flat), Reason.GROUND)
     assert ground and all("(by somebody:flat)" in a.verdict.text for a in ground)

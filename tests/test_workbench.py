@@ -170,7 +170,7 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     return pick, (left, (top + bottom) / 2), entities.image(camera.name)
 
 
-def test_missed_objects_are_listed_and_sought(browser: Browser, address: str) -> None:
+def test_missed_objects_are_listed_and_opened(browser: Browser, address: str) -> None:
     """A row of the list moves the viewer to its time and is answered; the address opens the same again."""
     with opened(browser, address) as page:
         until(lambda: f"{FRAMES} frames" in page.inner_text("#run"))
@@ -346,7 +346,7 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
     assert again["name"] == other["name"]
 
 
-def test_a_hint_does_what_it_says(talk: Talk) -> None:
+def test_a_hint_has_the_promised_effect(talk: Talk) -> None:
     """What it was said to do to the frame is what the panel says when it is pressed, name by name."""
     stamp, pick, hint = helped(talk)
     tried = talk.asked("tried", type="try", time=stamp, set=hint["settings"], pick=pick)
@@ -435,7 +435,7 @@ def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, b
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
 
 
-def test_the_command_s_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None:
+def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None:
     copy = tmp_path / "drive.mcap"
     copy.hardlink_to(bag)
     with bevviz.open(copy) as drive:
@@ -495,7 +495,7 @@ def answered(url: str, **headers: str) -> int:
         return error.code
 
 
-def test_only_who_has_the_token_is_let_in(address: str) -> None:
+def test_only_clients_with_the_token_are_admitted(address: str) -> None:
     parts = urlsplit(address)
     site = f"http://{parts.netloc}"
     token = parse_qs(parts.query)["token"][0]
@@ -538,7 +538,7 @@ def test_channels_are_guarded(address: str, path: str) -> None:
         assert refused.value.response.status_code == 403
 
 
-def test_messages_that_are_none_are_answered(address: str) -> None:
+def test_invalid_messages_are_answered(address: str) -> None:
     from websockets.sync.client import connect
     from websockets.typing import Origin
 
@@ -606,7 +606,7 @@ def test_a_token_outlives_a_server_that_was_killed_alone(
         assert again == first
 
 
-def test_a_bag_that_is_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"no bag")
     assert main(["open", str(broken), "--no-browser"]) == 2
@@ -661,7 +661,7 @@ def test_picks_stand_in_an_address(one: Pick) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "car", "truth//", "truth//nan", "pixel/zed/1", "point//1,2", "x//1"])
-def test_what_is_no_pick_is_said(text: str) -> None:
+def test_an_invalid_pick_is_one_line(text: str) -> None:
     with pytest.raises(UserError, match="nothing that can be asked"):
         Pick.parse(text)
 
@@ -669,7 +669,7 @@ def test_what_is_no_pick_is_said(text: str) -> None:
 # --- what is worth a look -----------------------------------------------------------------------
 
 
-def test_what_the_truth_misses_is_what_is_listed(result: FrameResult) -> None:
+def test_objects_missed_against_the_truth_are_listed(result: FrameResult) -> None:
     """Every object that has to be found is found by an object of its class within 2 m, or is listed."""
     frame: Frame = result.frame
     assert frame.truth is not None
@@ -689,7 +689,7 @@ def test_what_the_truth_misses_is_what_is_listed(result: FrameResult) -> None:
             assert any(near)
 
 
-def test_without_truth_it_is_what_nothing_explains(result: FrameResult) -> None:
+def test_without_truth_unexplained_objects_are_listed(result: FrameResult) -> None:
     few = changed_config(
         result.config, ["detector.conf_threshold=0.6"]
     )  # so that not every near cluster has a name
@@ -791,7 +791,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
 # --- parts --------------------------------------------------------------------------------------
 
 
-def test_pieces_come_back_as_they_were() -> None:
+def test_pieces_of_a_recording_are_read_back_unchanged() -> None:
     told = []
     with RecordingBuffer() as film:
         end = film.listen(lambda: told.append(len(film)))

@@ -113,7 +113,7 @@ def test_panel_and_viewer_are_at_the_same_time(
         (["--viewer"], "no display"),
     ],
 )
-def test_what_cannot_be_is_said(
+def test_impossible_viewers_are_one_line(
     bag: Path,
     given: list[str],
     said: str,
