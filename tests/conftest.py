@@ -20,23 +20,14 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 # What a shell starts in the background ignores interrupts, and so would every process that a test interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-# Processes under nohup ignore hangups, and a test sends some.
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # They run a robot, a viewer or a browser beside the clock on the wall.
 REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_snap")
 
 # The longest files, so that no worker is left alone with one at the end; a browser not beside a robot.
 FIRST = (
-    *(
-        "test_workbench",
-        "test_calib",
-        "test_example_notebooks",
-        "test_torture_benchmark",
-        "test_workbench_native",
-    ),
-    *("test_damaged_bags", "test_live_ros", "test_live"),
+    *("test_workbench", "test_calib", "test_example_notebooks", "test_torture_benchmark"),
+    *("test_workbench_native", "test_damaged_bags", "test_live_ros", "test_live"),
 )
 
 
