@@ -72,7 +72,7 @@ def test_bags_and_live_decode_livox_alike(tmp_path: Path) -> None:
 def test_bags_and_live_decode_hesai_packets_alike(tmp_path: Path) -> None:
     made, data = (
         lidar_packets.messages(),
-        lidar_packets.packet(lidar_packets.BY_NAME["PandarXT16"], 0),
+        lidar_packets.packet(lidar_packets.MODELS_BY_NAME["PandarXT16"], 0),
     )
     item = bags.Item("/p", lidar_packets.SCAN, 1, lidar_packets.scan(made, bags.START, [data]))
     in_bag, live = both(tmp_path / "bag", item, made)
@@ -100,7 +100,7 @@ def test_bags_and_live_decode_ouster_scans_alike(tmp_path: Path) -> None:
     path = ouster_packets.bag(tmp_path / "bag", told=text, scans=1)
     ousters, live = Ousters(), list[Any]()
     ousters.look([Topic(ouster_packets.LIDAR, kind)], {})
-    ousters.add_metadata(ouster_packets.TOLD, text)
+    ousters.add_metadata(ouster_packets.METADATA, text)
     sensor = ousters.sensor(ouster_packets.LIDAR)
     with Recording([path]) as recording:
         for message in recording.messages([ouster_packets.LIDAR]):

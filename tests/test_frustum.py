@@ -30,9 +30,9 @@ from tests.support.fusion_scenes import (
     CAMERA,
     CAMERA_FROM_LIDAR,
     CLUSTERING,
-    claimed,
+    claim,
     detections_of,
-    looked,
+    project_to_camera,
     silhouette,
     slab,
 )
@@ -40,7 +40,9 @@ from tests.support.kitti_accuracy import Case, Tally, measure
 
 
 def outcome(points: F32, detections: Detections) -> tuple[Clusters, Claims, Splits]:
-    clusters, (claims,), splits = claimed(points, cluster(points, CLUSTERING), looked(points, detections))
+    clusters, (claims,), splits = claim(
+        points, cluster(points, CLUSTERING), project_to_camera(points, detections)
+    )
     assert claims is not None
     return clusters, claims, splits
 
@@ -125,9 +127,9 @@ def test_what_cannot_be_a_person_is_refused_with_the_reason() -> None:
     box = silhouette(slab(10, 0, -0.7, 0.6, 1.75))
     detections = detections_of([box])
     points = wall
-    found = looked(points, detections)
+    found = project_to_camera(points, detections)
     before = cluster(points, CLUSTERING)
-    after, (claims,), splits = claimed(points, before, found)
+    after, (claims,), splits = claim(points, before, found)
     assert claims is not None and claims.cluster[0] == -1 and len(splits) == 0
     assert 0 < claims.fit[0] < FusionConfig().min_rating
     assert after is before
@@ -152,9 +154,12 @@ def test_the_second_camera_finds_what_the_first_has_split() -> None:
     aside[0, 3] = 0.4
     uv, _ = project(apply(aside, person), CAMERA)
     other = detections_of([np.concatenate([uv.min(axis=0) - 2, uv.max(axis=0) + 2])])
-    views = looked(points, detections_of([silhouette(person)])), looked(points, other, aside, "left")
+    views = (
+        project_to_camera(points, detections_of([silhouette(person)])),
+        project_to_camera(points, other, aside, "left"),
+    )
     before = cluster(points, CLUSTERING)
-    after, (first, second), splits = claimed(points, before, *views)
+    after, (first, second), splits = claim(points, before, *views)
     assert first is not None and second is not None
     assert first.cluster[0] == second.cluster[0] >= 0
     assert set(splits.camera) == {"front"}
@@ -174,16 +179,18 @@ def test_clusters_set_aside_stay_so() -> None:
     person = slab(8, 0, -0.7, 0.5, 1.7)
     before = cluster(person, ClusteringConfig(min_cluster_points=1000))
     assert before.state.tolist() == [ClusterState.TOO_SMALL]
-    after, (claims,), _ = claimed(person, before, looked(person, detections_of([silhouette(person)])))
+    after, (claims,), _ = claim(
+        person, before, project_to_camera(person, detections_of([silhouette(person)]))
+    )
     assert after is before and claims is not None and claims.cluster[0] == -1
 
 
 def test_without_a_camera_nothing_changes() -> None:
     points = np.concatenate([slab(8, 0, -0.7, 0.5, 1.7), slab(8.4, 0, -0.2, 8, 2.6)])
     before = cluster(points, CLUSTERING)
-    blind = replace(looked(points, Detections.empty()), uv=None)
-    for cameras in ((), (blind,), (looked(points, Detections.empty()),)):
-        after, claims, splits = claimed(points, before, *cameras)
+    blind = replace(project_to_camera(points, Detections.empty()), uv=None)
+    for cameras in ((), (blind,), (project_to_camera(points, Detections.empty()),)):
+        after, claims, splits = claim(points, before, *cameras)
         assert after is before and len(splits) == 0 and len(claims) == len(cameras)
 
 
@@ -248,8 +255,8 @@ def test_points_are_neither_lost_nor_shared(scene: tuple[F32, Detections]) -> No
 
 
 def outcome_of(points: F32, before: Clusters, found: Detections) -> tuple[Clusters, Claims, Splits]:
-    after, (claims,), splits = claimed(points, before, looked(points, found))
-    again, (claims_again,), _ = claimed(points, before, looked(points, found))
+    after, (claims,), splits = claim(points, before, project_to_camera(points, found))
+    again, (claims_again,), _ = claim(points, before, project_to_camera(points, found))
     assert claims is not None and claims_again is not None
     np.testing.assert_array_equal(after.labels, again.labels)
     np.testing.assert_array_equal(claims.boxes.center, claims_again.boxes.center)

@@ -27,9 +27,9 @@ from tests.support.fusion_scenes import (
     CAMERA,
     CAMERA_FROM_LIDAR,
     CLUSTERING,
-    claimed,
+    claim,
     detections_of,
-    looked,
+    project_to_camera,
     silhouette,
     slab,
 )
@@ -54,8 +54,8 @@ def masks_of(*boxes: F32, scale: float = 0.5, corner: tuple[int, int] = (0, 10))
 def outcome(detections: Detections, config: FusionConfig | None = None) -> tuple[Bool, Fusion]:
     """Return which points the detection takes, and the fusion."""
     config = config or FusionConfig()
-    seen = looked(POINTS, detections)
-    clusters, (claims,), _ = claimed(POINTS, cluster(POINTS, CLUSTERING), seen, config=config)
+    seen = project_to_camera(POINTS, detections)
+    clusters, (claims,), _ = claim(POINTS, cluster(POINTS, CLUSTERING), seen, config=config)
     assert claims is not None and seen.uv is not None and seen.depth is not None
     fusion = fuse(seen.uv, seen.depth, clusters, detections, CAMERA, CAMERA_FROM_LIDAR, config, claims)
     return np.asarray(clusters.labels == claims.cluster[0]), fusion
@@ -96,7 +96,7 @@ def test_a_mask_without_points_is_left_aside() -> None:
 def test_outlines_are_where_the_masks_are(tmp_path: Path) -> None:
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "masks.rrd")
-    result = looked(POINTS, SEGMENTED)
+    result = project_to_camera(POINTS, SEGMENTED)
     with Writer(recording) as to:
         to.begin(0, 1, 0)
         log_detections(to, result, [])
@@ -111,7 +111,7 @@ def test_outlines_are_where_the_masks_are(tmp_path: Path) -> None:
 def test_a_report_has_the_masks() -> None:
     frame = SyntheticSource(frames=1).snapshot(0).frame
     image = frame.cameras[0].image
-    result = replace(looked(POINTS, SEGMENTED), camera=replace(frame.cameras[0], name="front"))
+    result = replace(project_to_camera(POINTS, SEGMENTED), camera=replace(frame.cameras[0], name="front"))
     assert image is not None
     whole = FrameResult.unprocessed(frame, load(), (result,))
     found = recorded(unpack(*pack(digest(whole))))["front", image.stamp]

@@ -22,7 +22,7 @@ from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoding import MessageError
 from tests.support import bags
-from tests.support.lidar_packets import BY_NAME, LAYOUTS, SCAN, VELODYNE, messages, packet, scan
+from tests.support.lidar_packets import LAYOUTS, MODELS_BY_NAME, SCAN, VELODYNE, messages, packet, scan
 
 
 def angles(name: str) -> list[tuple[float, float]]:
@@ -39,7 +39,7 @@ def decoded(found: list[bytes], kind: str = SCAN, cut: int = 0) -> Any:
 
 @pytest.mark.parametrize("name", list(LAYOUTS))
 def test_a_hesai_scan_by_its_layout(name: str) -> None:
-    model = BY_NAME[name]
+    model = MODELS_BY_NAME[name]
     cloud = decoded([packet(model, 0), packet(model, 1)])
     unit = 0.005 if name == "PandarXT32M" else 0.004
     expected = []
@@ -63,7 +63,7 @@ def test_a_hesai_scan_by_its_layout(name: str) -> None:
 
 @pytest.mark.parametrize("ros1", [False, True])
 def test_a_bag_of_packets_gives_clouds(tmp_path: Path, ros1: bool) -> None:
-    made, model = messages(ros1), BY_NAME["PandarXT16"]
+    made, model = messages(ros1), MODELS_BY_NAME["PandarXT16"]
     stamps = [bags.START + i * bags.PERIOD for i in range(3)]
     scans = [
         scan(made, t, [packet(model, n) for n in range(4)], frame="a" * (n + 1)) for n, t in enumerate(stamps)
@@ -81,7 +81,7 @@ def test_a_bag_of_packets_gives_clouds(tmp_path: Path, ros1: bool) -> None:
 
 
 def test_equal_dual_returns_are_one_point() -> None:
-    model = BY_NAME["PandarXT32"]
+    model = MODELS_BY_NAME["PandarXT32"]
     cloud = decoded([packet(model, 0, mode=0x39)])
     # Blocks go two by two, and only odd channels differ between them.
     assert len(cloud.xyz) == 4 * (16 * 2 + 15)
@@ -89,7 +89,7 @@ def test_equal_dual_returns_are_one_point() -> None:
 
 
 def test_the_angles_of_the_sensor_are_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made, model = messages(), BY_NAME["PandarXT16"]
+    made, model = messages(), MODELS_BY_NAME["PandarXT16"]
     item = bags.Item("/pandar", SCAN, bags.START, scan(made, bags.START, [packet(model, 0)]))
     path = bags.write(tmp_path / "bag", [item], made)
     file = tmp_path / "angles.csv"
@@ -116,7 +116,7 @@ def test_the_angles_of_the_sensor_are_used(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_report_brings_the_sensors_own_angles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made, model = messages(), BY_NAME["PandarXT16"]
+    made, model = messages(), MODELS_BY_NAME["PandarXT16"]
     stamps = [bags.START + i * bags.PERIOD for i in range(3)]
     found = [packet(model, n) for n in range(4)]
     items = [bags.Item("/front/pandar", SCAN, stamp, scan(made, stamp, found)) for stamp in stamps]
@@ -147,13 +147,13 @@ def test_a_report_brings_the_sensors_own_angles(tmp_path: Path, monkeypatch: pyt
 
 
 def test_undecodable_packets_state_the_reason() -> None:
-    model = BY_NAME["PandarXT32"]
+    model = MODELS_BY_NAME["PandarXT32"]
     cut = decoded([packet(model, n) for n in range(4)], cut=1600)  # into the second to last
     assert (len(cut.xyz), cut.dropped) == (2 * 8 * 31, 2 * 8 + 2 * 8 * 32)
     mixed = [
         packet(model, 0),
         packet(model, 1, mode=0x38),
-        packet(BY_NAME["PandarXT16"], 0),
+        packet(MODELS_BY_NAME["PandarXT16"], 0),
         packet(model, 1),
     ]
     some = decoded([*mixed, packet(model, 2)[:700]])

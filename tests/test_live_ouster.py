@@ -15,14 +15,14 @@ from tests.support.ouster_packets import (
     IMU,
     KIND,
     LIDAR,
+    METADATA,
     PACKETS,
     PIXELS,
-    TOLD,
     metadata,
     millimetres,
     packet,
 )
-from tests.support.ouster_packets import where as place
+from tests.support.ouster_packets import expected_point as place
 from tests.support.ros_graphs import own_graph
 from tests.support.waiting import until
 
@@ -66,15 +66,15 @@ def test_scans_wait_for_metadata_and_end_with_the_next_scan(graph: None) -> None
             send(bytes(48), imu)
             return True
 
-        waiting = f"{LIDAR} holds packets of an Ouster whose metadata are waited for on {TOLD}"
+        waiting = f"{LIDAR} holds packets of an Ouster whose metadata are waited for on {METADATA}"
         until(lambda: scan() and waiting in source.missing, "what is waited for")
         assert not source.received[LIDAR] and not source.wait(0)
 
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        robot.node.create_publisher(String, TOLD, latched).publish(String(data=metadata(PROFILE)))
+        robot.node.create_publisher(String, METADATA, latched).publish(String(data=metadata(PROFILE)))
         until(lambda: scan() and source.wait(0), "a scene")
         assert source.roles.lidar_names == ("os_lidar",)
-        assert source.roles.notes[TOLD] == "metadata of the LiDAR"
+        assert source.roles.notes[METADATA] == "metadata of the LiDAR"
         assert source.roles.notes[IMU] == "not used: packets of an Ouster's IMU"
 
         frames = iter(source)

@@ -21,7 +21,7 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import Detector, session
 from tests.support import onnx_networks
 from tests.support.onnx_networks import FLOAT, INT64, Input, image_input, node
-from tests.support.pillar_networks import autoware, stated
+from tests.support.pillar_networks import autoware, settings_of
 
 H, W = 64, 96
 CELLS = sum((H // s) * (W // s) for s in (8, 16, 32))
@@ -366,7 +366,7 @@ def test_broken_files_are_one_line_without_noise(
 
 def refused_3d(parameters: dict[str, Any]) -> str:
     with pytest.raises(UserError) as caught:
-        StageLoader().load(load(settings=stated(parameters)))
+        StageLoader().load(load(settings=settings_of(parameters)))
     line = str(caught.value)
     assert line.startswith("objects.") and "\n" not in line
     return line

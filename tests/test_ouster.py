@@ -13,7 +13,17 @@ from bevviz.config import Config
 from bevviz.drivers import ouster
 from bevviz.errors import UserError
 from tests.support import bags
-from tests.support.ouster_packets import COLUMNS, IMU, LIDAR, PIXELS, TOLD, bag, metadata, millimetres, where
+from tests.support.ouster_packets import (
+    COLUMNS,
+    IMU,
+    LIDAR,
+    METADATA,
+    PIXELS,
+    bag,
+    expected_point,
+    metadata,
+    millimetres,
+)
 
 PROFILES = ("LEGACY", "RNG19_RFL8_SIG16_NIR16", "RNG19_RFL8_SIG16_NIR16_DUAL", "RNG15_RFL8_NIR8")
 
@@ -29,7 +39,7 @@ def test_scans_follow_the_manual(tmp_path: Path, profile: str) -> None:
     )
     with BagSource([path], Config()) as source:
         assert source.roles.notes[LIDAR] == "LiDAR, by type and name"
-        assert source.roles.notes[TOLD] == "metadata of the LiDAR"
+        assert source.roles.notes[METADATA] == "metadata of the LiDAR"
         assert source.total == 4
         frames = list(source)
         again = source.frame(2)
@@ -37,7 +47,7 @@ def test_scans_follow_the_manual(tmp_path: Path, profile: str) -> None:
     for number, frame in enumerate(frames):
         assert frame.stamp == bags.START + number * bags.PERIOD
         assert frame.points_frame == "os_lidar"
-        np.testing.assert_allclose(frame.points, [where(*beam) for beam in there], atol=1e-5)
+        np.testing.assert_allclose(frame.points, [expected_point(*beam) for beam in there], atol=1e-5)
         np.testing.assert_array_equal(frame.fields["ring"], [pixel for _, pixel in there])
         np.testing.assert_array_equal(frame.fields["reflectivity"], [40 + pixel for _, pixel in there])
         signal = 40 if profile == "RNG15_RFL8_NIR8" else 500

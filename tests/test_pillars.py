@@ -42,7 +42,7 @@ from tests.support.pillar_networks import (
     Reference,
     autoware,
     network,
-    stated,
+    settings_of,
 )
 
 HEADS = ("openpcdet_anchors", "openpcdet_centers", "mmdetection3d_anchors", "mmdetection3d_centers")
@@ -206,7 +206,7 @@ def test_each_class_has_its_threshold(tmp_path: Path) -> None:
 
 
 def test_networks_of_two_files_are_supported(tmp_path: Path) -> None:
-    found = network(load(settings=stated(autoware(tmp_path))))
+    found = network(load(settings=settings_of(autoware(tmp_path))))
     boxes, score, names = found(CLOUD)  # of which the encoder takes the first 40 pillars alone
 
     assert names == ["PEDESTRIAN"]
@@ -235,7 +235,7 @@ def test_the_parameters_are_a_part_of_the_section(tmp_path: Path) -> None:
 
 
 def test_the_page_and_the_command_explain_its_parameters() -> None:
-    config = load(settings=stated({**Reference("openpcdet_anchors").params, "method": "net.onnx"}))
+    config = load(settings=settings_of({**Reference("openpcdet_anchors").params, "method": "net.onnx"}))
     shown = {control["key"]: control for control in controls(config)}
     slider = shown["objects.params.score_threshold"]
     assert (slider["kind"], slider["low"], slider["high"], slider["value"]) == ("number", 0, 1, 0.1)
@@ -330,7 +330,7 @@ def test_unusable_files_and_pairs_are_one_line(tmp_path: Path) -> None:
         ({"min_rotation": {"BUS": 1}}, "names 'BUS'"),
     ):
         with pytest.raises(UserError) as caught:
-            network(load(settings=stated({**good, **changed})))
+            network(load(settings=settings_of({**good, **changed})))
         assert words in str(caught.value), changed
 
 

@@ -157,9 +157,9 @@ def _livox() -> list[Row]:
 
 
 def _pandar(model: str) -> list[Row]:
-    from tests.support.lidar_packets import BY_NAME, SCAN, packet, scan
+    from tests.support.lidar_packets import MODELS_BY_NAME, SCAN, packet, scan
 
-    packets = [packet(BY_NAME[model], number) for number in range(3)]
+    packets = [packet(MODELS_BY_NAME[model], number) for number in range(3)]
     return _drive(
         SCAN, lambda stamp: scan(_messages(), stamp, packets, frame=bags.LIDAR_FRAME), without=CLOUD
     )
@@ -186,7 +186,7 @@ def _ouster() -> list[Row]:
     made, profile = _messages(), "RNG15_RFL8_NIR8"
     text = made.make("std_msgs/msg/String", data=ouster_packets.metadata(profile))
     items = [item for item in _base() if item.topic != CLOUD]
-    items.append(bags.Item(ouster_packets.TOLD, "std_msgs/msg/String", bags.START - 1, text))
+    items.append(bags.Item(ouster_packets.METADATA, "std_msgs/msg/String", bags.START - 1, text))
     for number in range(SCANS * ouster_packets.PACKETS):
         scan, part = divmod(number, ouster_packets.PACKETS)
         at = bags.START + scan * bags.PERIOD

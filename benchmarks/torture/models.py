@@ -111,7 +111,7 @@ def end_to_end(path: Path) -> str:
 def samples(folder: Path) -> list[tuple[Path, Case]]:
     """Write the sound models; returns each file with the case that loads it."""
     from bevviz.stages.detector import DEMO_MODEL
-    from tests.support.pillar_networks import Reference, autoware, stated
+    from tests.support.pillar_networks import Reference, autoware, settings_of
 
     found = []
     for write in (detector, end_to_end):
@@ -122,7 +122,7 @@ def samples(folder: Path) -> list[tuple[Path, Case]]:
     found.append((demo, Case((f"detector.model={demo}",), "detector")))
     two_files = autoware(folder)
     for name in ("method", "encoder"):
-        found.append((Path(two_files[name]), Case(tuple(stated(two_files)), "objects")))
+        found.append((Path(two_files[name]), Case(tuple(settings_of(two_files)), "objects")))
     path = folder / "anchors.onnx"
     found.append((path, Case(tuple(Reference("openpcdet_anchors").settings(path)), "objects")))
     return found

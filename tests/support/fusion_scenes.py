@@ -64,10 +64,10 @@ def silhouette(points: F32, across: float = 2.0, along: float = 2.0) -> F32:
 
 PERSON = slab(8, 0, -0.5, 0.6, 1.8)
 CLUSTERING = ClusteringConfig()
-Claimed = tuple[Clusters, tuple[Claims | None, ...], Splits]
+ClaimResult = tuple[Clusters, tuple[Claims | None, ...], Splits]
 
 
-def looked(
+def project_to_camera(
     points: F32, detections: Detections, turn: F64 = CAMERA_FROM_LIDAR, name: str = "front"
 ) -> CameraResult:
     """Project the points into a camera."""
@@ -77,9 +77,9 @@ def looked(
     return CameraResult(Camera(name, None, CAMERA, turn, None), detections, None, uv, depth)
 
 
-def claimed(
+def claim(
     points: F32, clusters: Clusters, *cameras: CameraResult, config: FusionConfig | None = None
-) -> Claimed:
+) -> ClaimResult:
     return claim_clusters(
         points, None, clusters, cameras, config or FusionConfig(), ObjectsConfig(), CLUSTERING
     )

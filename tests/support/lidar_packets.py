@@ -13,7 +13,7 @@ from tests.support import bags
 
 SCAN, PACKET = "pandar_msgs/msg/PandarScan", "pandar_msgs/msg/PandarPacket"
 VELODYNE = "velodyne_msgs/msg/VelodyneScan"
-BY_NAME = {model.name: model for model in MODELS}
+MODELS_BY_NAME = {model.name: model for model in MODELS}
 
 
 # Of each model: its size, its header, the bytes behind the blocks, and where among these the return mode and

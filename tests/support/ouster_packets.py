@@ -15,7 +15,7 @@ from tests.support import bags
 
 PIXELS, COLUMNS, PACKETS = 16, 64, 4  # of a scan, in packets of 16 columns
 KIND = "ouster_sensor_msgs/msg/PacketMsg"
-LIDAR, IMU, TOLD = "/ouster/lidar_packets", "/ouster/imu_packets", "/ouster/metadata"
+LIDAR, IMU, METADATA = "/ouster/lidar_packets", "/ouster/imu_packets", "/ouster/metadata"
 ALTITUDES = [15.0 - 2 * i for i in range(PIXELS)]
 AZIMUTHS = [(-4.2, -1.4, 1.4, 4.2)[i % 4] for i in range(PIXELS)]
 ORIGIN = 15.8
@@ -64,7 +64,7 @@ def packet(profile: str, scan: int, number: int, clock: int) -> bytes:
     return data + (b"" if legacy else bytes(32))
 
 
-def where(column: int, pixel: int) -> tuple[float, float, float]:
+def expected_point(column: int, pixel: int) -> tuple[float, float, float]:
     """Compute the position of a pixel by the formula of the manual."""
     around = 2 * pi * (1 - column / COLUMNS)
     turn, tilt = around - radians(AZIMUTHS[pixel]), radians(ALTITUDES[pixel])
@@ -94,7 +94,7 @@ def bag(
     items = []
     if told is not None:
         text = made.make("std_msgs/msg/String", data=told)
-        items.append(bags.Item(TOLD, "std_msgs/msg/String", bags.START - 1, text))
+        items.append(bags.Item(METADATA, "std_msgs/msg/String", bags.START - 1, text))
     for place, number in enumerate(order or range(scans * PACKETS)):
         scan, part = divmod(number, PACKETS)
         at = bags.START + place // PACKETS * bags.PERIOD + (place % PACKETS + 1) * 16_000_000

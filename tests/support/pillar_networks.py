@@ -90,5 +90,5 @@ def autoware(folder: Path, features: int = 9) -> dict[str, Any]:
     }
 
 
-def stated(parameters: dict[str, Any]) -> list[str]:
+def settings_of(parameters: dict[str, Any]) -> list[str]:
     return [f"objects.{key}={json.dumps(value)}" for key, value in parameters.items()]
