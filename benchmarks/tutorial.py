@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.model.results import Objects
-from bevviz.support import open3d
+from bevviz.synthetic.sensors import load_open3d
 
 
 def read_points(message: Any) -> Iterator[tuple[float, float, float]]:
@@ -37,7 +37,7 @@ class Stages:
     """The Open3D calls of lidar_cluster_node with its default parameters."""
 
     def __init__(self) -> None:
-        self.o3d = open3d.load()
+        self.o3d = load_open3d()
 
     def voxel(self, points: NDArray[np.float32]) -> Any:
         return self.cloud(points).voxel_down_sample(0.05)

@@ -15,13 +15,13 @@ from bevviz.config import ClusteringConfig
 from bevviz.model.frame import F32, I32, Bool
 from bevviz.model.results import ClusterState
 from bevviz.stages.clustering import MIN_SIZE, cluster, dbscan
-from bevviz.support.open3d import load
+from bevviz.synthetic.sensors import load_open3d
 
 # --- DBSCAN ------------------------------------------------------------------------------------
 
 
 def open3d_dbscan(points: F32, eps: float, min_points: int) -> I32:
-    o3d = load()
+    o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
     return np.asarray(cloud.cluster_dbscan(eps, min_points), np.int32)
 

@@ -18,7 +18,7 @@ from bevviz.model.frame import F32, F64, Bool
 from bevviz.model.results import Ground
 from bevviz.stages.clustering import dbscan
 from bevviz.stages.ground import RING_COUNT, RING_SCALE, _sort_into_bins, segment_ground
-from bevviz.support.open3d import load
+from bevviz.synthetic.sensors import load_open3d
 
 Terrain = Callable[[F64, F64], F64]
 
@@ -44,7 +44,7 @@ def scan(
     noise: float = 0.015,
 ) -> Scan:
     """Ray-cast a turning LiDAR ``sensor`` metres above the terrain's origin."""
-    o3d = load()
+    o3d = load_open3d()
     x = np.arange(-90.0, 90.1, 1.0)
     y = np.sort(np.concatenate([np.arange(-60.0, 60.1, 1.0), [-4.001, 4.001]]))
     gx, gy = np.meshgrid(x, y, indexing="ij")
@@ -288,7 +288,7 @@ def _beside(angle: float, length: float) -> tuple[Ground, Bool]:
 
 @pytest.mark.parametrize("frame", ["000000", "000001"])
 def test_the_plane_equals_open3ds(shared: Path, frame: str) -> None:
-    o3d = load()
+    o3d = load_open3d()
     points = kitti(shared, frame)
     ground = segment_ground(points, GroundConfig(method="plane", distance_threshold=0.5, iterations=300))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
@@ -303,7 +303,7 @@ def test_the_plane_equals_open3ds(shared: Path, frame: str) -> None:
 
 def test_plane_refits_as_open3d() -> None:
     """With every point an inlier there is one plane to find, whatever the samples."""
-    o3d = load()
+    o3d = load_open3d()
     rng = np.random.default_rng(0)
     points = rng.uniform([-10, -10, 4.8], [10, 10, 5.2], (2000, 3)).astype(np.float32)
     points[:, 2] += np.float32(0.1) * points[:, 0]

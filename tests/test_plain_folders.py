@@ -18,7 +18,7 @@ from bevviz.datasets.stamps import group_by_sensor
 from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
 from bevviz.model.geometry import has_distortion
-from bevviz.support.open3d import load
+from bevviz.synthetic.sensors import load_open3d
 from tests.support.datasets import cloud
 
 
@@ -144,7 +144,7 @@ def test_pcd_with_padding_and_a_cut_one(padded: np.ndarray, cut: int, tmp_path: 
 
 
 def test_pcd_of_open3d_and_of_pypcd4(tmp_path: Path) -> None:
-    o3d = load()
+    o3d = load_open3d()
     xyz = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
     cloud = o3d.t.geometry.PointCloud(xyz)
     cloud.point["intensity"] = np.arange(300, dtype=np.float32)[:, None]

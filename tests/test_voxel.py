@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from bevviz.config import VoxelConfig
 from bevviz.model.frame import F32
 from bevviz.stages.voxel import voxel_grid
-from bevviz.support.open3d import load
+from bevviz.synthetic.sensors import load_open3d
 
 clouds = hnp.arrays(
     np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-20, 20, width=32)
@@ -23,7 +23,7 @@ clouds = hnp.arrays(
 
 def assert_equal_to_open3d(points: F32, size: float, tolerance: float) -> None:
     """As many points, and each of either side at one of the other."""
-    o3d = load()
+    o3d = load_open3d()
 
     def cloud(xyz: F32) -> Any:
         return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz.astype(np.float64)))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.errors import UserError, first_line
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, U8, Intrinsics
-from bevviz.support import open3d
 from bevviz.synthetic.mesh import Material, Mesh
 from bevviz.synthetic.world import Light
 
@@ -26,12 +28,36 @@ VISIBILITY = 130.0  # metres that a camera sees through the haze, less than the 
 REFLECTANCE, TEXTURE = np.array([_SURFACE[m] for m in Material], np.float32).T
 
 
+def load_open3d() -> Any:
+    """Import and return ``open3d``, which nothing else in the package imports.
+
+    Open3D's wheel links libusb-1.0, which a minimal system lacks. ``libusb-package`` contains it. Once it is
+    loaded globally, the dynamic linker uses it as the system's library.
+
+    Raises:
+        UserError: Open3D cannot be imported.
+    """
+    try:
+        import libusb_package
+
+        path = libusb_package.get_library_path()
+        if path is not None:
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+        import open3d
+    except (ImportError, OSError) as error:  # OSError: a shared library that does not load
+        raise UserError(
+            f"the synthetic drive needs Open3D, which cannot be imported ({first_line(error)}): "
+            "pip install open3d libusb-package; bags and data sets need neither"
+        ) from error
+    return open3d
+
+
 class Caster:
     """Ray caster of one mesh: Open3D's RaycastingScene (Embree; Wald et al. 2014)."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self._core = open3d.load().core
-        self._scene = open3d.load().t.geometry.RaycastingScene()
+        open3d = load_open3d()
+        self._core, self._scene = open3d.core, open3d.t.geometry.RaycastingScene()
         self.mesh = mesh
         a, b, c = (mesh.uv[mesh.triangles[:, i]] for i in range(3))
         self.uv = np.concatenate([a, b - a, c - a], axis=1)  # (T, 6): first corner and the two edges
