@@ -1,4 +1,8 @@
-"""A scene of nuScenes (Caesar et al. 2020), or of a data set with its tables. The devkit is not needed."""
+"""A scene of nuScenes (Caesar et al. 2020), or of a data set with its tables.
+
+The library nuscenes-devkit is licensed for non-commercial use alone. Its release 1.2 requires numpy below 2.
+Release 1.1.9 brings 115 packages (600 MB), among them opencv-python, which overwrites our headless OpenCV.
+"""
 
 from __future__ import annotations
 

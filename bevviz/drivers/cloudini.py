@@ -3,6 +3,9 @@
 A header lists the fields. Chunks of points follow. A chunk holds the differences of a field from point to
 point as zigzag varints; floats are multiples of their resolution. Lossless fields are stored unchanged or as
 the exclusive or with the previous value. zstd or LZ4 compresses each chunk.
+
+The library pureini 0.10 decodes the same points 1.5 to 4 times as fast, but it is under the GPL-3.0. cloudini
+itself has no package for Python.
 """
 
 from __future__ import annotations

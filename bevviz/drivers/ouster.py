@@ -1,6 +1,7 @@
 """Decoder for packets of Ouster's LiDARs, by the layouts in their manuals and the sensor's metadata.
 
-ouster-sdk requires an old release of rosbags. benchmarks/ouster.py compares this decoder with it.
+The library ouster-sdk 1.0 cannot be installed beside bevviz: it requires psutil below 6, rerun-sdk 0.41 at
+least 7, and it pins rosbags to 0.9.23. benchmarks/ouster.py compares this decoder with it.
 """
 
 from __future__ import annotations
