@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,17 +26,12 @@ from bevviz.messages.topics import Topic
 from tests.support import bags, compressed_clouds, lidar_packets, livox_messages, ouster_packets, videos
 
 ROOT = Path(__file__).parents[1]
-MINE = """
-from bevviz.messages.decoders import Decoder
-from bevviz.messages.encode import encode_points
-import numpy as np
-
-def read(data, serialization):
-    points = np.frombuffer(data, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")], offset=4)
-    return encode_points(7, serialization.type, points)
-
-DECODER = Decoder(types=("my_lidar_msgs/msg/Sweep",), kind="PointCloud2", from_bytes=read)
-"""
+# The decoder and the entry point that the documentation shows.
+EXAMPLE = re.search(
+    r"### Messages of another driver.*?```python\n(.*?)```.*?```toml\n(.*?)```",
+    (ROOT / "docs" / "inputs.md").read_text(),
+    re.DOTALL,
+)
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -166,12 +163,15 @@ def test_a_foxglove_cloud_is_a_point_cloud_in_live_as_in_bags(
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Install a package with a decoder."""
+    """Install the package with a decoder that the documentation shows."""
+    assert EXAMPLE is not None
+    code, project = EXAMPLE.groups()
+    ((name, target),) = tomllib.loads(project)["project"]["entry-points"]["bevviz.decoders"].items()
     metadata = tmp_path / "my_lidar-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my_lidar\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text("[bevviz.decoders]\nmine = my_lidar_decoder:DECODER\n")
-    (tmp_path / "my_lidar_decoder.py").write_text(MINE)
+    (metadata / "entry_points.txt").write_text(f"[bevviz.decoders]\n{name} = {target}\n")
+    (tmp_path / "my_lidar_decoder.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     decoders.cache_clear()
     yield tmp_path
