@@ -9,8 +9,9 @@ import pytest
 
 from bevviz.bags.bag import Recording
 from bevviz.datasets import open_dataset
-from bevviz.datasets.folder import read_cloud
-from bevviz.datasets.kitti import CLOUDS, read_labels
+from bevviz.datasets.cloud_files import read_cloud
+from bevviz.datasets.kitti import read_labels
+from bevviz.datasets.kitti_drives import CLOUDS
 from bevviz.errors import UserError
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.detections import decode_detections_3d

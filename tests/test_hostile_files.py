@@ -15,8 +15,8 @@ import pytest
 import bevviz
 from bevviz import UserError
 from bevviz.cli import main
-from bevviz.datasets.dataset import read_points, read_table
-from bevviz.datasets.folder import read_cloud
+from bevviz.datasets.cloud_files import read_cloud, read_points
+from bevviz.datasets.dataset import read_table
 from bevviz.support.files import CONFIG_LIMIT, SENSOR_LIMIT, TABLE_LIMIT, drive_files
 from tests.support import bags, datasets
 from tests.support.commands import Capture, error_of

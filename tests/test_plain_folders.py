@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import bevviz
 from bevviz import UserError
-from bevviz.datasets.columns import are_doubles, count_columns
-from bevviz.datasets.folder import Folder, read_cloud
+from bevviz.datasets.cloud_files import are_doubles, count_columns, read_cloud
+from bevviz.datasets.folder import Folder
 from bevviz.datasets.stamps import group_by_sensor
 from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points

@@ -27,8 +27,8 @@ from bevviz.bags.type_store import MessageTypes
 from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
+from bevviz.datasets.dataset import describe_unread
 from bevviz.datasets.reader import DatasetReader
-from bevviz.datasets.unread_files import describe_unread
 from bevviz.drivers import ouster
 from bevviz.drivers.calibration_file import read_calibration
 from bevviz.drivers.video import VideoPacket, decode_packet, is_video

@@ -16,8 +16,8 @@ from bevviz.bags.rescue import mcap as mcap_rescue
 from bevviz.bags.rescue import sqlite_pages
 from bevviz.bags.rescue.sqlite import SqliteRescuer
 from bevviz.bags.sqlite import SoundSqlite
-from bevviz.datasets.dataset import CLOUDS, IMAGES
-from bevviz.datasets.unread_files import ADVICE as UNREAD
+from bevviz.datasets.cloud_files import CLOUDS
+from bevviz.datasets.dataset import IMAGES, UNREAD
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.files import LFS_HINT, LFS_POINTER, ScratchFolder

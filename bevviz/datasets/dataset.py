@@ -6,38 +6,49 @@ import os
 import re
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bevviz.datasets.columns import are_doubles, are_whole, count_columns
-from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import encode_compressed_image
-from bevviz.model.frame import F32, I64
-from bevviz.support.files import (
-    LFS_HINT,
-    LFS_POINTER,
-    SENSOR_LIMIT,
-    TABLE_LIMIT,
-    read_head,
-    read_lines,
+from bevviz.datasets.cloud_files import (
+    SAMPLE_BYTES,
+    are_doubles,
+    are_whole,
+    count_columns,
+    is_pointer,
+    read_bytes,
 )
-from bevviz.support.files import read_bytes as read_limited
+from bevviz.errors import UserError, first_line
+from bevviz.messages.encode import encode_compressed_image, encode_intrinsics, encode_transforms
+from bevviz.model.frame import F64, I64, Intrinsics
+from bevviz.support.files import LFS_HINT, TABLE_LIMIT, read_lines
 
 SECOND = 1_000_000_000
-SAMPLE_BYTES = 500_000  # bytes of a BIN file from which the number of columns is estimated
+MAP, BASE = "map", "base_link"  # frames of the world and of the vehicle
 MAX_POINTER_BYTES = 1024  # bytes of a pointer file, by the specification of Git LFS
 FIELDS = ("x", "y", "z", "intensity")
 BOXES = "bevviz_msgs/msg/Detection3DArray"
 HIDDEN = re.compile(r"\.|__MACOSX$")
-CLOUDS = (".pcd", ".ply", ".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
-
+AS_CLOUDS = "save them as PCD, PLY, BIN or NPY"
+AS_IMAGES = "save them as PNG or JPEG"
+UNREAD = {
+    **dict.fromkeys(
+        (".las", ".laz", ".e57", ".xyz", ".pts", ".npz", ".vtk", ".feather", ".pkl", ".h5", ".hdf5"),
+        AS_CLOUDS,
+    ),
+    **dict.fromkeys((".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".raw"), AS_IMAGES),
+    **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov"), "save their images as PNG or JPEG"),
+    **dict.fromkeys((".gz", ".zip", ".zst"), "unpack them"),
+    ".pcap": "play them through their driver and record its topics",
+    ".tfrecord": "convert them, for instance to KITTI's layout",
+}
+MAX_LISTED_FILES = 10_000  # files examined in each folder
 # Exceptions of a loader for files that do not follow the documentation of the data set.
 NOT_AS_DOCUMENTED = (
     *(KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError),
@@ -171,6 +182,19 @@ class Dataset:
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         return f"{files[0].relative_to(self.path)}{more}"
 
+    def choose_folder(self) -> Path:
+        """Return the folder of the drive that the user chose.
+
+        Raises:
+            UserError: there is no drive with this name, or several drives and no choice.
+        """
+        drives = {folder.name: folder for folder in self.drives(self.path)}
+        if list(drives.values()) == [self.path]:
+            if self.sequence not in ("", self.path.name):
+                raise UserError(f"{self.path}: is one drive; leave --sequence {self.sequence} out")
+            return self.path
+        return drives[self.choose_drive(list(drives))]
+
     def choose_drive(self, sequences: Sequence[str], others: str = "") -> str:
         """Return the drive that the user chose.
 
@@ -193,17 +217,6 @@ class Dataset:
         return sequences[0]
 
 
-def read_points(path: Path, fields: Sequence[str]) -> NDArray[np.void]:
-    """Return the (N,) whole points of a BIN file with these columns of float32.
-
-    Raises:
-        UserError: the file cannot be read, or it is a Git LFS pointer.
-    """
-    data = read_bytes(path)
-    whole = np.frombuffer(data, "<f4", len(data) // (4 * len(fields)) * len(fields))
-    return as_points(whole.reshape(-1, len(fields)), fields)
-
-
 def image_stream(
     camera: str, times: I64, files: Sequence[Path], *, rectified: bool = True, aside: str = ""
 ) -> Stream:
@@ -215,6 +228,31 @@ def image_stream(
 
     topic = f"/{camera}/{'image_rect' if rectified else 'image_raw'}/compressed"
     return Stream(topic, "sensor_msgs/msg/CompressedImage", times, make, aside)
+
+
+def intrinsics_stream(camera: str, times: I64, intrinsics: Callable[[int], Intrinsics]) -> Stream:
+    """Return the stream of a camera's calibrations."""
+
+    def make(row: int) -> Any:
+        return encode_intrinsics(int(times[row]), camera, intrinsics(row))
+
+    return Stream(f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", times, make)
+
+
+def mounting_stream(start: int, edges: Sequence[tuple[str, str, F64]]) -> list[Stream]:
+    """Return the stream of static transforms (parent, child, parent_from_child); none without transforms."""
+    times = np.array([start], np.int64)
+    stream = Stream("/tf_static", "tf2_msgs/msg/TFMessage", times, lambda _: encode_transforms(start, edges))
+    return [stream] if edges else []
+
+
+def pose_stream(times: I64, frame: str, pose: Callable[[int], F64]) -> Stream:
+    """Return the stream of the (4, 4) poses of a frame in ``MAP``."""
+
+    def make(row: int) -> Any:
+        return encode_transforms(int(times[row]), [(MAP, frame, pose(row))])
+
+    return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
 
 
 def files_in(
@@ -231,35 +269,7 @@ def files_in(
     return [folder / name for name in sorted(names) if not HIDDEN.match(name)]
 
 
-def read_bytes(path: Path, first: int = 0) -> bytes:
-    """Read a scan, an image or labels.
-
-    Args:
-        path: file.
-        first: number of bytes to read from the start; 0: all.
-
-    Raises:
-        UserError: the file cannot be read, is larger than ``SENSOR_LIMIT``, or is a Git LFS pointer.
-    """
-    try:
-        data = read_head(path, first) if first else read_limited(path, SENSOR_LIMIT)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
-    if data.startswith(LFS_POINTER):
-        raise UserError(f"{path}: {LFS_HINT}")
-    return data
-
-
-def is_pointer(path: Path) -> bool:
-    """Tell whether a file is a pointer that Git LFS has not replaced yet.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
-    return read_head(path, len(LFS_POINTER)) == LFS_POINTER
-
-
-def read_table(path: Path, columns: int, names: str = "") -> NDArray[np.float64]:
+def read_table(path: Path, columns: int, names: str = "") -> F64:
     """Read a (N, columns) table of numbers from a text file with one row per line. A comment begins with #.
 
     Args:
@@ -290,20 +300,12 @@ def frame_stamps(rate: float, numbers: Sequence[int]) -> I64:
     return SECOND + np.round(np.asarray(numbers, np.float64) * (SECOND / rate)).astype(np.int64)
 
 
-def add_fields(points: NDArray[np.void], more: dict[str, NDArray[Any]]) -> NDArray[np.void]:
-    """Return points with additional fields."""
-    layout = np.dtype(
-        [*((n, points.dtype[n]) for n in points.dtype.names or ()), *((n, v.dtype) for n, v in more.items())]
-    )
-    wider = np.empty(len(points), layout)
-    for name in points.dtype.names or ():
-        wider[name] = points[name]
-    for name, values in more.items():
-        wider[name] = values
-    return wider
-
-
-def as_points(values: F32, names: Sequence[str]) -> NDArray[np.void]:
-    """View (N, C) float32 values as (N,) points with named fields. Contiguous values are not copied."""
-    layout = np.dtype([(name, "<f4") for name in names])
-    return np.ascontiguousarray(values, "<f4").view(layout).reshape(-1)
+def describe_unread(folder: Path) -> str:
+    """Return a clause about the most frequent unread type in a folder and its subfolders; empty: none."""
+    folders = [folder, *(d for d in sorted(folder.iterdir()) if d.is_dir())]
+    files = [f for place in folders for f, _ in zip(place.iterdir(), range(MAX_LISTED_FILES), strict=False)]
+    counts = Counter(kind for file in files if (kind := file.suffix.lower()) in UNREAD)
+    if not counts:
+        return ""
+    kind, count = counts.most_common(1)[0]
+    return f"{count} {kind} file{'s are' if count > 1 else ' is'} not read: {UNREAD[kind]}"

@@ -3,60 +3,44 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevviz.config.files import parse_yaml
-from bevviz.datasets.columns import are_whole
+from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_cloud, why_no_points
 from bevviz.datasets.dataset import (
-    CLOUDS,
+    BASE,
     HIDDEN,
     IMAGES,
-    SAMPLE_BYTES,
     Dataset,
     Stream,
-    as_points,
+    describe_unread,
     files_in,
     frame_stamps,
     image_stream,
-    is_pointer,
-    read_points,
+    intrinsics_stream,
+    mounting_stream,
+    pose_stream,
     read_table,
 )
-from bevviz.datasets.pcd import read_pcd
-from bevviz.datasets.ply import read_ply
 from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
-from bevviz.datasets.unread_files import describe_unread
-from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import (
-    POINT_FIELD,
-    encode_intrinsics,
-    encode_points,
-    encode_transforms,
-)
+from bevviz.errors import UserError
+from bevviz.messages.encode import encode_points
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
 from bevviz.support.files import (
     CONFIG_LIMIT,
-    LFS_HINT,
-    SENSOR_LIMIT,
     TABLE_LIMIT,
-    open_regular,
-    read_head,
     read_lines,
     read_text,
 )
 
 MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
 NOTE_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
-MAP, BASE = "map", "base_link"
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
 SENSOR_FOLDER = re.compile(  # folders that contain one folder per camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
@@ -98,8 +82,7 @@ class Folder(Dataset):
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
-        if sequence:
-            raise UserError(f"{path}: is one drive; leave --sequence {sequence} out")
+        self.choose_folder()
         about = self._calibration()
         others = describe_unread(path)
         lidars, cameras = self._sensors(about)
@@ -141,7 +124,7 @@ class Folder(Dataset):
                 pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
                 edges.append((BASE, name, pose))
             streams.append(_cloud_stream(name, times, files, fields))
-        self.streams = [*_mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
+        self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""
@@ -256,12 +239,7 @@ class Folder(Dataset):
         if model in geometry.FISHEYE and "D" not in stated:
             distortion = np.zeros(4)  # equidistant: r = f theta
         about = Intrinsics(width, height, matrix, model, distortion)
-        return Stream(
-            f"/{name}/camera_info",
-            "sensor_msgs/msg/CameraInfo",
-            times[:1],
-            lambda row: encode_intrinsics(int(times[row]), name, about),
-        )
+        return intrinsics_stream(name, times[:1], lambda _: about)
 
     def _stamps(
         self, sensors: Mapping[str, dict[str, list[Path]]], about: Mapping[str, Any]
@@ -365,12 +343,8 @@ class Folder(Dataset):
             times = np.round(table[:, 0] * 1e9).astype(np.int64)
         else:
             times = np.array(stamps_in([f"{stamp:.0f}" for stamp in table[:, 0]]), np.int64)
-
-        def make(row: int) -> Any:
-            pose = geometry.transform(table[row, 1:4], table[row, 4:])
-            return encode_transforms(int(times[row]), [(MAP, BASE, pose)])
-
-        return [Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)]
+        pose = pose_stream(times, BASE, lambda row: geometry.transform(table[row, 1:4], table[row, 4:]))
+        return [pose]
 
 
 def _csv_rows(table: Path) -> Iterator[list[str]]:
@@ -435,93 +409,9 @@ def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[
     return ordered, np.array([stamped[file] for file in ordered], np.int64)
 
 
-def _mounting_stream(start: int, edges: Sequence[tuple[str, str, F64]]) -> list[Stream]:
-    times = np.array([start], np.int64)
-    make = partial(encode_transforms, start, list(edges))
-    return [Stream("/tf_static", "tf2_msgs/msg/TFMessage", times, lambda _: make())] if edges else []
-
-
 def _cloud_stream(name: str, times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
     def make(row: int) -> Any:
         points, announced = read_cloud(files[row], fields)
         return encode_points(int(times[row]), name, points, announced)
 
     return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
-
-
-def array_shape(file: Path) -> tuple[int, ...]:
-    """Return the shape of the array in an NPY file; empty if it has named columns or cannot be read."""
-    try:
-        array = _load_array(file)
-    except (OSError, ValueError, EOFError):
-        return ()
-    return () if array.dtype.names else array.shape
-
-
-def _load_array(file: Path) -> NDArray[Any]:
-    """Map an NPY file into memory. Refuse a file with fewer numbers than its header states.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is no NPY file, is cut, or is larger than ``SENSOR_LIMIT``.
-    """
-    with open_regular(file) as opened:
-        if os.fstat(opened.fileno()).st_size > SENSOR_LIMIT:
-            raise ValueError(f"it has more than {SENSOR_LIMIT:,} bytes, which are read at most")
-    loaded = np.load(file, mmap_mode="r", allow_pickle=False)
-    if not isinstance(loaded, np.ndarray):
-        raise ValueError("is an archive of arrays (NPZ), no NPY file")
-    return loaded
-
-
-def why_no_points(file: Path) -> str:
-    """Return why a file with a cloud suffix is no cloud, such as labels or matrices; empty: it may be one."""
-    suffix = file.suffix.lower()
-    if suffix == ".bin":
-        return "whole numbers, no points of float32" if are_whole(read_head(file, SAMPLE_BYTES)) else ""
-    shape = array_shape(file) if suffix == ".npy" else ()
-    if shape and (len(shape) != 2 or (shape[0] in (3, 4) and shape[1] in (3, 4))):
-        return f"of the shape {shape}, no points"
-    return ""
-
-
-def read_cloud(file: Path, fields: Sequence[str]) -> tuple[NDArray[np.void], int]:
-    """Return (N,) points with x, y, z and further fields, and the number that the header states, else 0.
-
-    Args:
-        file: PCD, PLY, BIN (float32) or NPY file.
-        fields: columns of a BIN or NPY file.
-
-    Raises:
-        UserError: the file cannot be read or is damaged.
-    """
-    suffix = file.suffix.lower()
-    try:
-        if suffix == ".bin":
-            return read_points(file, fields), 0
-        if is_pointer(file):
-            raise UserError(f"{file}: {LFS_HINT}")
-        if suffix == ".npy":
-            loaded = _load_array(file)
-            if loaded.dtype.names:
-                return _encodable(loaded.reshape(-1)), 0
-            if loaded.ndim != 2 or not 3 <= loaded.shape[1] <= MAX_COLUMNS:
-                raise ValueError(f"has the shape {loaded.shape}, not (N, 3) to (N, {MAX_COLUMNS})")
-            names = [*fields, *(f"field_{i}" for i in range(len(fields), loaded.shape[1]))][: loaded.shape[1]]
-            return as_points(loaded.astype(np.float32), names), 0
-        points, announced = read_pcd(file) if suffix == ".pcd" else read_ply(file)
-        return _encodable(points), announced
-    except (OSError, ValueError, EOFError, RuntimeError) as error:
-        raise UserError(f"{file}: cannot be read as a cloud: {first_line(error)}") from None
-
-
-def _encodable(points: NDArray[np.void]) -> NDArray[np.void]:
-    """Convert fields to little-endian types that a PointCloud2 can hold."""
-    names = points.dtype.names or ()
-    types = {name: points.dtype[name].newbyteorder("<") for name in names}
-    types = {name: np.dtype(NEAREST_TYPES.get(kind.str[1:], kind)) for name, kind in types.items()}
-    if missing := [name for name, kind in types.items() if kind.str[1:] not in POINT_FIELD]:
-        raise ValueError(f"field {missing[0]} is of the type {types[missing[0]]}")
-    if all(types[name] == points.dtype[name] for name in names):
-        return points
-    return points.astype(np.dtype(list(types.items())))

@@ -1,33 +1,38 @@
-"""Calibration, labels and poses common to KITTI's data sets (Geiger, Lenz and Urtasun 2012)."""
+"""Files of KITTI's data sets: labels, tracklets, calibrations, poses (Geiger, Lenz and Urtasun 2012)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bevviz.datasets.dataset import Stream, files_in, read_points
+from bevviz.datasets.cloud_files import read_bytes
+from bevviz.datasets.dataset import files_in
 from bevviz.errors import UserError
-from bevviz.messages.encode import (
-    encode_intrinsics,
-    encode_labels,
-    encode_points,
-    encode_transforms,
-)
 from bevviz.messages.foreign_boxes import LARGEST
 from bevviz.model import geometry
-from bevviz.model.frame import F64, I64, Boxes3D, ImageLabels, Intrinsics, LabelledBoxes3D
+from bevviz.model.class_names import KITTI
+from bevviz.model.frame import F64, Boxes3D, ImageLabels, LabelledBoxes3D
 from bevviz.support.files import read_text
 
-LIDAR, IMU, MAP = "velodyne", "imu_link", "map"
-CLOUDS = "/velodyne_points"
 COLUMNS = (
     *("truncation", "occlusion", "alpha", "image box's left", "image box's top", "image box's right"),
     *("image box's bottom", "height", "width", "length", "x", "y", "z", "rotation_y"),
 )
 EARTH = 6378137.0  # metres; the radius in KITTI's development kit
+# SemanticKITTI label numbers of objects; moving objects begin at 252.
+OBJECTS = {
+    10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck", 20: "other-vehicle",
+    30: "person", 31: "bicyclist", 32: "motorcyclist",
+    252: "car", 253: "bicyclist", 254: "person", 255: "motorcyclist", 256: "on-rails", 257: "bus",
+    258: "truck", 259: "other-vehicle",
+}  # fmt: skip
 
 
 # --- labels ------------------------------------------------------------------------------------
@@ -56,6 +61,27 @@ def read_labels(file: Path) -> LabelledBoxes3D:
     calibration = Calibration(file.parent.parent / "calib" / file.name)
     lines = list(enumerate(read_text(file).splitlines(), 1))
     return labelled_boxes(file, lines, calibration.rectified_from_lidar)
+
+
+def read_tracked_labels(file: Path, rectified_from_lidar: F64) -> Callable[[int], LabelledBoxes3D]:
+    """Read ``label_02/0000.txt``, in which a line has frame, object, and an object label.
+
+    Return the function that gives the boxes of a frame, which raises UserError as ``labelled_boxes`` does.
+
+    Raises:
+        UserError: the file cannot be read, or a line does not begin with two numbers.
+    """
+    lines: dict[int, list[tuple[int, str]]] = defaultdict(list)
+    ids: dict[int, list[str]] = defaultdict(list)
+    for number, line in enumerate(read_text(file).splitlines(), 1):
+        if not line.strip():
+            continue
+        frame, track, *rest = [*line.split(maxsplit=2), "", ""]
+        if not frame.isdigit() or not track.lstrip("-").isdigit():
+            raise UserError(f"{file}: line {number} does not begin with a frame and an object")
+        lines[int(frame)].append((number, rest[0]))
+        ids[int(frame)].append(track)
+    return lambda frame: labelled_boxes(file, lines[frame], rectified_from_lidar, ids[frame])
 
 
 def labelled_boxes(
@@ -115,11 +141,13 @@ def labelled_boxes(
         table[:, 1].astype(np.int32),
         np.array(dont_care, np.float32).reshape(-1, 4),
     )
-    ones = np.ones(len(labels), np.float32)
     names = tuple(ids[index] for index in kept) if ids else ()
-    return LabelledBoxes3D(
-        str(file), 0, "", boxes, tuple(labels), ones, ids=names, image=image, unusable=tuple(unusable)
-    )
+    return _labelled(file, boxes, labels, ids=names, image=image, unusable=tuple(unusable))
+
+
+def _labelled(file: Path, boxes: Boxes3D, labels: Sequence[str], **more: Any) -> LabelledBoxes3D:
+    """Return the labels of a file, which have no scores."""
+    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), np.ones(len(labels), np.float32), **more)
 
 
 def _why_unusable(kind: str, row: Sequence[float]) -> str:
@@ -132,6 +160,98 @@ def _why_unusable(kind: str, row: Sequence[float]) -> str:
     if kind != "DontCare" and min(size) < 0:
         return f"its size is negative: {' '.join(map(str, size))}"
     return ""
+
+
+def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
+    """Read the labelled objects of each scan by number in the LiDAR frame.
+
+    Raises:
+        UserError: the file cannot be read, or has not KITTI's format.
+    """
+    try:
+        root = ElementTree.fromstring(read_text(file))
+        items = [item for item in root.findall("tracklets/item") if item.find("objectType") is not None]
+        if root.find("tracklets") is None:
+            raise ValueError("no tracklets in it")
+        rows: dict[int, list[tuple[str, str, list[float]]]] = defaultdict(list)
+        for number, item in enumerate(items):
+            kind = _text(item, "objectType")
+            height, width, length = (float(_text(item, name)) for name in "hwl")
+            first = int(_text(item, "first_frame"))
+            if kind not in KITTI:
+                continue
+            for later, pose in enumerate(item.findall("poses/item")):
+                x, y, z, turn = (float(_text(pose, name)) for name in ("tx", "ty", "tz", "rz"))
+                # A location is the centre of the bottom.
+                row = [x, y, z + height / 2, length, width, height, turn]
+                rows[first + later].append((kind, str(number), row))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise UserError(f"{file}: no tracklets as KITTI writes them: {error}") from None
+    labels_by_scan = {}
+    for scan, objects in rows.items():
+        labels, ids, values = zip(*objects, strict=True)
+        boxed = np.array(values, np.float32)
+        boxes = Boxes3D(boxed[:, :3], boxed[:, 3:6], boxed[:, 6])
+        labels_by_scan[scan] = _labelled(file, boxes, labels, ids=tuple(ids))
+    return labels_by_scan
+
+
+def _text(item: Any, name: str) -> str:
+    text = item.findtext(name)
+    if text is None:
+        raise ValueError(f"an item has no {name}")
+    return str(text).strip()
+
+
+def read_semantics(file: Path, points: int) -> NDArray[np.uint32]:
+    """Read the (points,) label of each point.
+
+    Raises:
+        UserError: the file cannot be read, or has another number of labels.
+    """
+    data = read_bytes(file)
+    labels = np.frombuffer(data[: len(data) // 4 * 4], "<u4")
+    if len(labels) != points:
+        raise UserError(
+            f"{file}: {len(labels)} labels for {points} points: one of the two is cut, or of another scan"
+        )
+    return labels
+
+
+def boxes_of(file: Path, points: Any, labels: Any) -> LabelledBoxes3D:
+    """Return a box around the labelled points of each object. It covers only the visible part of the object.
+
+    From above, the box is the smallest rotated rectangle. Its height spans all points.
+
+    Args:
+        file: label file, named in the result.
+        points: (N,) points with x, y, z.
+        labels: (N,) labels: the class in the lower 16 bits, the object number in the upper; 0: no object.
+    """
+    import cv2
+
+    classes = labels & 0xFFFF
+    chosen = np.flatnonzero((labels >> 16 > 0) & np.isin(classes, list(OBJECTS)))
+    order = chosen[np.argsort(labels[chosen], kind="stable")]
+    starts = np.flatnonzero(np.diff(labels[order].astype(np.int64), prepend=-1))
+    centers, sizes, turns, names, ids = [], [], [], list[str](), list[str]()
+    for members in np.split(order, starts[1:]) if len(order) else ():
+        xy = np.column_stack([points["x"][members], points["y"][members]])
+        (x, y), (length, width), angle = cv2.minAreaRect(xy)
+        low, high = float(points["z"][members].min()), float(points["z"][members].max())
+        if width > length:
+            length, width, angle = width, length, angle + 90.0
+        centers.append([x, y, (low + high) / 2])
+        sizes.append([length, width, high - low])
+        turns.append(np.radians(angle))
+        names.append(OBJECTS[int(classes[members[0]])])
+        ids.append(f"{names[-1]}-{int(labels[members[0]] >> 16)}")
+    boxes = Boxes3D(
+        np.array(centers, np.float32).reshape(-1, 3),
+        np.array(sizes, np.float32).reshape(-1, 3),
+        np.array(turns, np.float32),
+    )
+    return _labelled(file, boxes, names, ids=tuple(ids))
 
 
 # --- calibration -------------------------------------------------------------------------------
@@ -155,7 +275,7 @@ class Calibration:
 
     def camera(self, number: int) -> tuple[F64, F64]:
         """Return (3, 3) K and (4, 4) camera_from_lidar of a camera. Camera 2 is the left colour camera."""
-        matrix, camera_from_reference = split_projection(self._matrix(3, 4, f"P{number}"))
+        matrix, camera_from_reference = _split_projection(self._matrix(3, 4, f"P{number}"))
         return matrix, camera_from_reference @ self.rectified_from_lidar
 
     @property
@@ -188,7 +308,40 @@ def named_rows(file: Path) -> Mapping[str, F64]:
     return rows
 
 
-def split_projection(projection: F64) -> tuple[F64, F64]:
+def rectified_camera(folder: Path, number: str) -> tuple[F64, F64]:
+    """Read (3, 3) K and (4, 4) camera_from_lidar of a camera of the raw data.
+
+    Raises:
+        UserError: a file of the calibration cannot be read, or has not KITTI's format.
+    """
+    file = folder / "calib_cam_to_cam.txt"
+    rows = named_rows(file)
+    rectified = np.eye(4)
+    try:
+        projection = rows[f"P_rect_{number}"].reshape(3, 4)
+        rectified[:3, :3] = rows["R_rect_00"].reshape(3, 3)
+    except (KeyError, ValueError):
+        raise UserError(f"{file}: no P_rect_{number} or R_rect_00, as KITTI writes it") from None
+    K, camera_from_reference = _split_projection(projection)
+    return K, camera_from_reference @ rectified @ read_rigid(folder / "calib_velo_to_cam.txt")
+
+
+def read_rigid(file: Path) -> F64:
+    """Read the (4, 4) transform of a file with R and T.
+
+    Raises:
+        UserError: the file cannot be read, or has not KITTI's format.
+    """
+    rows = named_rows(file)
+    pose = np.eye(4)
+    try:
+        pose[:3, :3], pose[:3, 3] = rows["R"].reshape(3, 3), rows["T"]
+    except (KeyError, ValueError):
+        raise UserError(f"{file}: no R and T, as KITTI writes them") from None
+    return pose
+
+
+def _split_projection(projection: F64) -> tuple[F64, F64]:
     """Split a (3, 4) projection into (3, 3) K and (4, 4) camera_from_reference, both rectified cameras."""
     camera_from_reference = np.eye(4)
     try:
@@ -198,7 +351,27 @@ def split_projection(projection: F64) -> tuple[F64, F64]:
     return projection[:, :3], camera_from_reference
 
 
-# --- positions ---------------------------------------------------------------------------------
+# --- times and positions---------------------------------------------------------------------------
+
+
+def read_timestamps(file: Path) -> list[int]:
+    """Read the nanoseconds of each line, such as ``2011-09-26 13:02:25.964389445`` in UTC.
+
+    Raises:
+        UserError: the file cannot be read, or has not KITTI's format.
+    """
+    lines = enumerate(read_text(file).split("\n"), 1)
+    return [_parse_time(file, number, line) for number, line in lines if line.strip()]
+
+
+def _parse_time(file: Path, number: int, line: str) -> int:
+    """Parse ``2011-09-26 13:02:25.964389445`` as UTC to nanoseconds."""
+    day, _, fraction = line.strip().partition(".")
+    try:
+        whole = datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        return round(whole.timestamp()) * 10**9 + int(fraction[:9].ljust(9, "0") or "0")
+    except ValueError:
+        raise UserError(f"{file}: line {number} is no time, as 2011-09-26 13:02:25.964389445") from None
 
 
 def poses_of_oxts(table: F64) -> F64:
@@ -224,53 +397,3 @@ def _rotations(axis: int, angles: F64) -> F64:
     turns[:, a, a] = turns[:, b, b] = np.cos(angles)
     turns[:, b, a], turns[:, a, b] = np.sin(angles), -np.sin(angles)
     return turns
-
-
-# --- streams -----------------------------------------------------------------------------------
-
-
-def cloud_stream(times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
-    """Return the stream of scans with x, y, z, reflectance and further columns (Waymo's has 6 columns)."""
-
-    def make(row: int) -> Any:
-        return encode_points(int(times[row]), LIDAR, read_points(files[row], fields))
-
-    return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
-
-
-def camera_info_stream(camera: str, times: I64, matrix: F64) -> Stream:
-    """Return a stream with one calibration for all images."""
-    first_time = times[:1]
-
-    def make(row: int) -> Any:
-        return encode_intrinsics(int(first_time[row]), camera, Intrinsics(0, 0, matrix))
-
-    return Stream(f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", first_time, make)
-
-
-def mounting_stream(start: int, edges: Sequence[tuple[str, str, F64]]) -> Stream:
-    """Return the stream of static transforms (parent, child, parent_from_child)."""
-    times = np.array([start], np.int64)
-    return Stream(
-        "/tf_static", "tf2_msgs/msg/TFMessage", times, lambda row: encode_transforms(int(times[row]), edges)
-    )
-
-
-def pose_stream(times: I64, child: str, poses: F64) -> Stream:
-    """Return the stream of (N, 4, 4) poses of a vehicle frame in the map."""
-
-    def make(row: int) -> Any:
-        return encode_transforms(int(times[row]), [(MAP, child, poses[row])])
-
-    return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
-
-
-def ground_truth_stream(message_type: str, times: I64, label: Any) -> Stream:
-    """Return the stream of ground truth in the LiDAR frame. ``label`` returns the labels of a row."""
-
-    def make(row: int) -> Any:
-        labels: LabelledBoxes3D = label(row)
-        details = labels.labels, labels.ids, labels.image, labels.unusable
-        return encode_labels(int(times[row]), LIDAR, labels.boxes, *details)
-
-    return Stream("/ground_truth", message_type, times, make)

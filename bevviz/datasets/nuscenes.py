@@ -18,22 +18,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.datasets.dataset import Dataset, Stream, image_stream
-from bevviz.datasets.folder import read_cloud
-from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import (
-    encode_intrinsics,
-    encode_labels,
-    encode_points,
-    encode_transforms,
+from bevviz.datasets.cloud_files import read_cloud
+from bevviz.datasets.dataset import (
+    BASE,
+    MAP,
+    Dataset,
+    Stream,
+    image_stream,
+    intrinsics_stream,
+    mounting_stream,
+    pose_stream,
 )
+from bevviz.errors import UserError, first_line
+from bevviz.messages.encode import encode_labels, encode_points
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES, NUSCENES_WITHOUT_CLASS
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
 from bevviz.support import progress
 from bevviz.support.files import open_regular
 
-MAP, BASE = "map", "base_link"
 TABLES = "sample_data.json"
 FIELDS = ("x", "y", "z", "intensity", "ring")
 READ_SIZE = 1 << 22  # characters read at once; the largest table has a gigabyte
@@ -124,12 +127,7 @@ class NuScenes(Dataset):
                 f"{' ...' if len(others) > 8 else ''}"
             )
         self.streams = [
-            Stream(
-                "/tf_static",
-                "tf2_msgs/msg/TFMessage",
-                clouds[0].times[:1],
-                lambda _: encode_transforms(int(clouds[0].times[0]), edges),
-            ),
+            *mounting_stream(int(clouds[0].times[0]), edges),
             _pose_stream([poses[row["ego_pose_token"]] for rows in rows_by_channel.values() for row in rows]),
             *images,
             *self._ground_truth(tables, key_stamps),
@@ -190,11 +188,7 @@ class NuScenes(Dataset):
         rectified = not distortion.any()
         model = "" if rectified else "plumb_bob" if len(distortion) <= 5 else "rational_polynomial"
         about = Intrinsics(0, 0, matrix, model, distortion if model else np.zeros(0))
-
-        def info(row: int) -> Any:
-            return encode_intrinsics(int(times[row]), channel, about)
-
-        yield Stream(f"/{channel}/camera_info", "sensor_msgs/msg/CameraInfo", times[:1], info)
+        yield intrinsics_stream(channel, times[:1], lambda _: about)
         yield image_stream(channel, times, files, rectified=rectified)
 
     def _ground_truth(self, tables: Path, key_stamps: Mapping[str, int]) -> Iterator[Stream]:
@@ -239,12 +233,7 @@ def _pose_stream(poses: Sequence[Record]) -> Stream:
     """Return the stream of vehicle poses by stamp."""
     pose_rows = {1000 * int(row["timestamp"]): row for row in poses}
     times = np.array(sorted(pose_rows), np.int64)
-
-    def make(row: int) -> Any:
-        stamp = int(times[row])
-        return encode_transforms(stamp, [(MAP, BASE, _pose(pose_rows[stamp]))])
-
-    return Stream("/tf", "tf2_msgs/msg/TFMessage", times, make)
+    return pose_stream(times, BASE, lambda row: _pose(pose_rows[int(times[row])]))
 
 
 def _pose(row: Record) -> F64:
