@@ -1,4 +1,4 @@
-"""Differences between two results of the same frame: which objects correspond, and how they differ."""
+"""Differences between two results of the same frame, and what the ground truth says about them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.compare.truth_score import TruthComparison
+from bevviz.evaluate import Truth, judge, position_text
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, Boxes3D
-from bevviz.model.results import FrameResult
+from bevviz.model.frame import F32, F64, Bool, Boxes3D
+from bevviz.model.results import FrameResult, Objects
 from bevviz.stages.fusion import assign
 
 MAX_PAIR_DISTANCE = 2.0  # metres between the centres of one object, in the bird's-eye view
@@ -101,6 +101,11 @@ class FrameDifferences:
     def side_with(self, difference: Difference) -> tuple[SideResult, int]:
         """Return a side that has the object, and the object's row there. B comes first."""
         return (self.a, difference.row_a) if difference.row_b < 0 else (self.b, difference.row_b)
+
+    def position_of(self, difference: Difference) -> str:
+        """Return the position of the object relative to the points' origin, as ``at 12.3 m, 4° left``."""
+        side, row = self.side_with(difference)
+        return position_text(side.boxes, row)
 
     @property
     def number(self) -> int:
@@ -192,3 +197,58 @@ def _make_pairs(
         pairs.append(Difference(change, i, j, a[i], b[j], pair_distance, float(iou[i, j])))
     only_b = sorted(set(range(len(b))) - set(column.tolist()))
     return (*pairs, *(Difference(Change.ONLY_B, -1, j, "", b[j]) for j in only_b))
+
+
+# --- ground truth ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TruthComparison:
+    """Frame of both sides compared with the ground truth. Row i is the i-th object to be found."""
+
+    labels: tuple[str, ...]
+    boxes: Boxes3D  # in the frame of the points
+    a: Bool  # found by A
+    b: Bool
+    wrong_a: tuple[str, ...]  # names of A's false objects
+    wrong_b: tuple[str, ...]
+    names: frozenset[str]  # names that the labels of this frame accept; other names are not judged
+
+    @property
+    def fixed(self) -> Sequence[int]:
+        """Rows of objects that only B finds."""
+        rows: list[int] = np.flatnonzero(self.b & ~self.a).tolist()
+        return rows
+
+    @property
+    def broken(self) -> Sequence[int]:
+        """Rows of objects that only A finds."""
+        rows: list[int] = np.flatnonzero(self.a & ~self.b).tolist()
+        return rows
+
+    def text(self, row: int) -> str:
+        """Return class and distance of an object, as ``person at 12.3 m``."""
+        return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
+
+
+def compare_with_truth(a: FrameResult, b: FrameResult, truth: Truth) -> TruthComparison:
+    """Compare both sides of a frame with its ground truth."""
+    to_find = np.flatnonzero(truth.must)
+    (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
+    return TruthComparison(
+        labels=tuple(truth.labels[k] for k in to_find),
+        boxes=truth.boxes.chosen(to_find),
+        a=found_a[to_find],
+        b=found_b[to_find],
+        wrong_a=wrong_a,
+        wrong_b=wrong_b,
+        names=frozenset().union(*truth.accepted),
+    )
+
+
+def _side(objects: Objects | None, truth: Truth) -> tuple[Bool, tuple[str, ...]]:
+    """Return (K,) whether each labelled box is found, and the names of the false objects."""
+    if objects is None:
+        return np.zeros(len(truth.labels), bool), ()
+    matches = judge(objects, truth)
+    return ~matches.missed, tuple(objects.names[j].lower() for j in np.flatnonzero(matches.false))

@@ -13,8 +13,8 @@ from bevviz.compare.differences import (
     Change,
     Difference,
     FrameDifferences,
+    TruthComparison,
 )
-from bevviz.compare.truth_score import TruthComparison
 from bevviz.model.colors import SIDE_COLORS, StateColor
 from bevviz.model.frame import F64
 from bevviz.recording import entities
@@ -104,7 +104,7 @@ class DifferenceLogger(Writer):
         self.put(entities.COMPARE, document(differences_page(differences)))
         changed = [d for d in differences.objects if d.change is not Change.SAME]
         self.lines(
-            entities.COMPARE_LOG, [("INFO", f"{d.text} {position_text(d, differences)}") for d in changed]
+            entities.COMPARE_LOG, [("INFO", f"{d.text} {differences.position_of(d)}") for d in changed]
         )
         worst = worst_of_each_class(differences.objects)
         self._lanes.log(self, {entities.difference_state(name): change for name, change in worst.items()})
@@ -174,15 +174,6 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
     return worst
 
 
-def position_text(difference: Difference, differences: FrameDifferences) -> str:
-    """Return the position of the object relative to its frame's origin, as ``at 12.3 m, 4° left``."""
-    side, row = differences.side_with(difference)
-    x, y = side.boxes.center[row, :2].tolist()
-    angle = float(np.degrees(np.arctan2(y, x)))
-    direction = "left" if angle >= 0 else "right"
-    return f"at {np.hypot(x, y):.1f} m, {abs(angle):.0f}° {direction}"
-
-
 def differences_page(differences: FrameDifferences) -> str:
     """Return the differences of one frame as Markdown."""
     return "\n".join(_lines(differences))
@@ -205,7 +196,7 @@ def _lines(differences: FrameDifferences) -> Iterator[str]:
             yield ""
             yield f"#### {change[0].upper() + change[1:]}: {len(selected)}"
             yield ""
-            yield from (f"- {markdown(_item(d))} {position_text(d, differences)}" for d in selected)
+            yield from (f"- {markdown(_item(d))} {differences.position_of(d)}" for d in selected)
     for camera, pairs in differences.images.items():
         rows = [d for d in pairs if d.change is not Change.SAME]
         if rows:

@@ -9,10 +9,9 @@ import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import FailureSummary
-from bevviz.compare.differences import FrameDifferences, differences, seen
+from bevviz.compare.differences import FrameDifferences, compare_with_truth, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
-from bevviz.compare.truth_score import compare_with_truth
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate.ground_truth import TruthLookup

@@ -17,9 +17,8 @@ from bevviz.compare.differences import (
     Change,
     Difference,
     FrameDifferences,
+    TruthComparison,
 )
-from bevviz.compare.log import position_text
-from bevviz.compare.truth_score import TruthComparison
 from bevviz.config import ParameterChange
 from bevviz.model.protocols import Observer
 from bevviz.support import table
@@ -280,5 +279,5 @@ def _row(difference: Difference, differences: FrameDifferences) -> dict[str, Any
         "distance": round(difference.distance, 3) if pair else None,
         "iou": round(difference.iou, 3) if pair else None,
         "text": difference.text,
-        "place": position_text(difference, differences),
+        "place": differences.position_of(difference),
     }

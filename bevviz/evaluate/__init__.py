@@ -9,7 +9,7 @@ from bevviz.evaluate.ground_truth import (
     truth_of,
     truth_source,
 )
-from bevviz.evaluate.matching import Matches, ObjectScore, judge, match, pair_in_order
+from bevviz.evaluate.matching import Matches, ObjectScore, judge, match, pair_in_order, position_text
 
 __all__ = [
     "MAX_DISTANCE",
@@ -21,6 +21,7 @@ __all__ = [
     "judge",
     "match",
     "pair_in_order",
+    "position_text",
     "truth_in",
     "truth_of",
     "truth_source",

@@ -14,7 +14,7 @@ from bevviz.evaluate.average_precision import AveragePrecision, scored_objects
 from bevviz.evaluate.detections import DetectionScore
 from bevviz.evaluate.ground_score import count_ground
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
-from bevviz.evaluate.matching import Matches, ObjectScore, share
+from bevviz.evaluate.matching import Matches, ObjectScore, position_text, share
 from bevviz.evaluate.metric_names import base_of, ranges
 from bevviz.evaluate.tracking_score import TrackScore
 from bevviz.model.frame import Boxes3D, Frame
@@ -265,13 +265,6 @@ def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches
             for j in np.flatnonzero(matches.false).tolist()
         ),
     )
-
-
-def position_text(boxes: Boxes3D, row: int) -> str:
-    """Return the position relative to the points' origin, as ``at 12.3 m, 4° left``."""
-    x, y = boxes.center[row, :2].tolist()
-    angle = math.degrees(math.atan2(y, x))
-    return f"at {math.hypot(x, y):.1f} m, {abs(angle):.0f}° {'left' if angle >= 0 else 'right'}"
 
 
 def _distance(boxes: Boxes3D, row: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bevviz.evaluate.ground_truth import MAX_DISTANCE, Truth
-from bevviz.model.frame import F32, F64, I32, Bool
+from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
 from bevviz.model.results import Objects
 
 
@@ -116,6 +117,13 @@ class ObjectScore:
         """Harmonic mean of precision and recall."""
         total = self.total
         return share(2 * total["tp"], total["fp"] + total["fn"])
+
+
+def position_text(boxes: Boxes3D, row: int) -> str:
+    """Return the position of a box relative to the points' origin, as ``at 12.3 m, 4° left``."""
+    x, y = boxes.center[row, :2].tolist()
+    angle = math.degrees(math.atan2(y, x))
+    return f"at {math.hypot(x, y):.1f} m, {abs(angle):.0f}° {'left' if angle >= 0 else 'right'}"
 
 
 def share(right: int, wrong: int) -> float:

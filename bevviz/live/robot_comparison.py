@@ -19,7 +19,6 @@ from bevviz.compare.differences import (
     differences,
     seen,
 )
-from bevviz.compare.log import position_text
 from bevviz.compare.sides import published_result, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
@@ -172,7 +171,7 @@ class AgainstRobot:
             lasted = (ours.stamp - self._since) / SECOND
             if lasted >= self.config.robot_time:
                 self._fired = True
-                words = ", ".join(f"{_words(d)} {position_text(d, frame_differences)}" for d in different[:3])
+                words = ", ".join(f"{_words(d)} {frame_differences.position_of(d)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 with self._lock:
                     self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
