@@ -18,7 +18,7 @@ from tqdm import tqdm
 from benchmarks.kitti import DATA
 from benchmarks.pages import write_section
 from bevviz.config import Config, load
-from bevviz.evaluate.ground_score import GROUND_LABELS
+from bevviz.evaluate.evaluation import GROUND_LABELS
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool, Boxes3D
 from bevviz.stages.clustering import cluster

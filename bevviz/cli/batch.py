@@ -28,7 +28,7 @@ from bevviz.errors import UserError
 from bevviz.support import progress
 
 if TYPE_CHECKING:
-    from bevviz.evaluate.gate import Limit
+    from bevviz.evaluate.metrics import Limit
     from bevviz.fleet.engine.task import Engine, JobResults
     from bevviz.fleet.jobs import Job
     from bevviz.fleet.table import RunInfo
@@ -110,7 +110,7 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _limits(options: argparse.Namespace) -> list[Limit]:
-    from bevviz.evaluate.gate import parse_limits
+    from bevviz.evaluate.metrics import parse_limits
 
     limits = parse_limits(options.min, options.max)
     if (limits or options.junit) and options.paths and options.truth is None:
@@ -250,7 +250,7 @@ def _gate(
     junit: Path | None,
 ) -> bool:
     """Return whether every bag is within every limit."""
-    from bevviz.evaluate.gate import LimitResult, check, write_junit
+    from bevviz.evaluate.metrics import LimitResult, check, write_junit
 
     suites: dict[str, list[LimitResult] | str] = dict(failed)
     for table, info in complete:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.evaluate.evaluation import Evaluation
-    from bevviz.evaluate.gate import Limit
+    from bevviz.evaluate.metrics import Limit
     from bevviz.model.protocols import FrameSource, Observer
     from bevviz.model.results import FrameResult
 
@@ -64,8 +64,8 @@ def add(commands: Commands) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from bevviz.evaluate.evaluation import Evaluation
-    from bevviz.evaluate.gate import parse_limits
     from bevviz.evaluate.ground_truth import truth_in
+    from bevviz.evaluate.metrics import parse_limits
 
     limits = parse_limits(options.min, options.max)
     config = load_config(options)
@@ -115,7 +115,7 @@ def _run(
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
     """Print and write the results. Return the exit status of the gate: 1 if a limit is not kept, else 0."""
-    from bevviz.evaluate.gate import check, write_junit
+    from bevviz.evaluate.metrics import check, write_junit
 
     if not Outputs.of(options) and not json_on_stdout(options):
         print(evaluation.table())

@@ -11,21 +11,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bevviz.evaluate.average_precision import AveragePrecision, scored_objects
-from bevviz.evaluate.detections import DetectionScore
-from bevviz.evaluate.ground_score import count_ground
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
-from bevviz.evaluate.matching import Matches, ObjectScore, position_text, share
-from bevviz.evaluate.metric_names import base_of, ranges
+from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
+from bevviz.evaluate.metrics import base_of, ranges
 from bevviz.evaluate.tracking_score import TrackScore
 from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Objects
+from bevviz.stages.voxel import spread_to_points
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-
 EXAMPLES = 10  # number of unusable labels in the JSON
+# Numbers of SemanticKITTI's classes (Behley et al. 2019), stored in the field ``label`` of a cloud.
+GROUND_LABELS = (40, 44, 48, 49, 60, 72)  # road, parking, pavement, other ground, marking, terrain
+OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
+UNLABELLED = (0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,16 +121,15 @@ class Evaluation(Observer[FrameResult]):
             counts = self.counts(cls)
             if not counts.total():
                 continue
-            yield from _rates(counts, f".{cls}" if cls else "")
-            errors = self._errors[cls] if cls else self._score.errors
-            if errors:
-                tail = f".{cls}" if cls else ""
+            tail = f".{cls}" if cls else ""
+            yield from _rates(counts, tail)
+            if errors := self._errors[cls] if cls else self._score.errors:
                 yield f"error_m{tail}", float(np.median(errors))
                 yield f"error_90_m{tail}", float(np.quantile(errors, 0.9))
             for low, high in ranges():
                 range_counts = self.counts(cls, low, high)
                 if range_counts.total():
-                    yield from _rates(range_counts, (f".{cls}" if cls else "") + f"@{low}-{high}")
+                    yield from _rates(range_counts, f"{tail}@{low}-{high}")
         total = self.counts()
         yield "missed_per_frame", total["missed"] / frames
         yield "false_per_frame", total["false"] / frames
@@ -246,6 +247,22 @@ def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:
 def _plain(value: float) -> float | None:
     """Return None for NaN, which JSON does not have, else the rounded number."""
     return None if math.isnan(value) else round(value, 6)
+
+
+def count_ground(counts: Counter[str], result: FrameResult) -> None:
+    """Count the points of a frame by label and by ground mask. The cloud needs a field ``label``."""
+    labels = result.frame.fields.get("label")
+    if labels is None or labels.dtype.kind not in "ui" or result.ground is None or result.voxels is None:
+        return
+    kind = labels.astype(np.int64) & 0xFFFF
+    known = ~np.isin(kind, UNLABELLED)
+    is_ground = spread_to_points(result.ground.mask, result.voxels.inverse)
+    ground_points, object_points = np.isin(kind, GROUND_LABELS), np.isin(kind, OBJECT_LABELS)
+    counts["true"] += int((is_ground & ground_points).sum())
+    counts["false"] += int((is_ground & ~ground_points & known).sum())
+    counts["missed"] += int((~is_ground & ground_points).sum())
+    counts["kept"] += int((~is_ground & object_points).sum())
+    counts["lost"] += int((is_ground & object_points).sum())
 
 
 # --- words -------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS
-from bevviz.evaluate.metric_names import base_of, ranges
+from bevviz.evaluate.metrics import base_of, ranges
 from bevviz.evaluate.tracking_score import HINT
 from bevviz.support import table
 from bevviz.support.text import printable
