@@ -12,7 +12,7 @@ from jinja2 import UndefinedError
 from bevviz.fleet.page import BagTotals, page
 from bevviz.fleet.table import RunInfo
 from bevviz.model.frame import Scene
-from bevviz.report.plots import plot
+from bevviz.report.pictures import plot
 from bevviz.support.html import render, template_environment
 from tests.support.html_pages import Page
 

@@ -34,7 +34,7 @@ from bevviz.recording.provenance import Dependency, Provenance
 from bevviz.report.check import CheckResult
 from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
-from bevviz.report.plots import ticks
+from bevviz.report.pictures import ticks
 from bevviz.stages.detector import Detector
 from tests.support import bags
 from tests.support.commands import Capture, error_of

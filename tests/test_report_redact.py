@@ -21,9 +21,8 @@ from bevviz.config import DetectorConfig
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.model.frame import F32, U8
-from bevviz.report.image_fields import ImageFinder
 from bevviz.report.pictures import shrink
-from bevviz.report.redact import CELLS, Redactor, _encoded, grow_boxes, hide_boxes
+from bevviz.report.redact import CELLS, ImageFinder, Redactor, _encoded, grow_boxes, hide_boxes
 from bevviz.report.summary import STRIP_WIDTH
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags, videos

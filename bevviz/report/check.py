@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from bevviz.recording import entities
 from bevviz.recording.decoding import check_decodes, reader_errors_as_user_errors
 from bevviz.recording.provenance import differences, file_hash, model_path, provenance
 from bevviz.report.bag_window import open_window
+from bevviz.report.facts import ReportInfo
 from bevviz.report.fingerprints import (
     ROUNDING,
     DigestDifference,
@@ -34,12 +36,11 @@ from bevviz.report.fingerprints import (
     unpack,
 )
 from bevviz.report.make import replay
-from bevviz.report.report_info import ReportInfo
-from bevviz.report.seal import check_seal
 from bevviz.stages.detector import DEMO_MODEL
 from bevviz.support.files import ScratchFolder
 
 UNREADABLE = "cannot be read as a report"
+_SEAL = re.compile(rb'id="seal">SHA-256 of the recording: ([0-9a-f]{64})<')
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +174,25 @@ class _Comparer(Observer[FrameResult]):
         self._result.add(number, compare(self.remaining.pop(number, ()), digest(result)))
         if self._interrupted and not self.remaining:
             self.complete.set()
+
+
+def check_seal(rrd: Path) -> bool:
+    """Return whether a page beside the recording states its checksum.
+
+    Raises:
+        UserError: the checksum differs. A damaged file could be misread, or crash its reader.
+    """
+    page = rrd.with_suffix(".html")
+    try:
+        checksums = _SEAL.findall(page.read_bytes()) if page.is_file() else []
+    except OSError:
+        checksums = []
+    if checksums and checksums[-1].decode() != file_hash(rrd):
+        raise UserError(
+            f"{rrd}: changed or damaged: it is not the file that {page.name}, its page, tells of "
+            "(SHA-256); without that page beside it, it is compared even so"
+        )
+    return bool(checksums)
 
 
 def read(rrd: Path) -> StoredReport:

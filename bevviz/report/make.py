@@ -53,15 +53,16 @@ from bevviz.report.bag_window import (
 from bevviz.report.facts import (
     AnswerText,
     Facts,
+    ReportInfo,
     commands,
     file_lines,
+    shareable,
     traceback_texts,
     window_text,
 )
 from bevviz.report.fingerprints import digest, pack
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
-from bevviz.report.report_info import ReportInfo, shareable
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress

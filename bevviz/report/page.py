@@ -10,8 +10,7 @@ from bevviz.bags.source import SECOND
 from bevviz.model.results import Explanation, FrameResult
 from bevviz.recording import entities
 from bevviz.report.facts import Facts
-from bevviz.report.pictures import camera_picture, jpeg, shrink
-from bevviz.report.plots import Plot, Series, plot
+from bevviz.report.pictures import Plot, Series, camera_picture, jpeg, plot, shrink
 from bevviz.report.summary import WindowSummary
 from bevviz.support.html import render
 
