@@ -15,8 +15,7 @@ from bevviz.recording.primitives import document
 from bevviz.support import table
 from bevviz.support.text import markdown
 from bevviz.sweep.chart import chart_view, log_chart, log_map
-from bevviz.sweep.parameters import Parameter, Values
-from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
+from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Parameter, Sweep, Values
 
 
 def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: Mapping[str, str]) -> None:
