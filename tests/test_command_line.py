@@ -13,8 +13,7 @@ from urllib.request import urlopen
 import pytest
 
 from bevviz.cli import main
-from bevviz.cli.machine import join_json_option
-from bevviz.cli.outputs import program, set_up_notes
+from bevviz.cli.outputs import join_json_option, program, set_up_notes
 from tests.support import bags, documented_json
 from tests.support.waiting import PATIENCE
 

@@ -28,16 +28,14 @@ from bevviz.cli import (
     live,
     outputs,
     report,
-    style,
     sweep,
     trust,
     tune,
     why,
     workbench,
 )
-from bevviz.cli.inputs import check_outputs
-from bevviz.cli.machine import join_json_option
 from bevviz.cli.options import follow_recording, join_negative_numbers
+from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
 from bevviz.support.version import __version__
@@ -107,7 +105,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         return run(options)
     except UserError as error:
         _log().debug("what led to the error", exc_info=error)
-        print(f"{style.error('bevviz: error:')} {error}", file=sys.stderr)
+        print_error(error)
         return 2
     except KeyboardInterrupt:
         print("bevviz: interrupted", file=sys.stderr)
@@ -123,12 +121,11 @@ def _main(arguments: Sequence[str] | None) -> int:
 
         if (disk_message := full_disk_error(error)) is not None:
             _log().debug("what led to the error", exc_info=error)
-            print(f"{style.error('bevviz: error:')} {disk_message}", file=sys.stderr)
+            print_error(disk_message)
             return 2
         _log().error("an error that nobody foresaw", exc_info=error)
         description = f"{type(error).__name__}: {first_line(error)}"
-        prefix = style.error("bevviz: error of bevviz itself:")
-        print(f"{prefix} {description}; --verbose shows where, please report it", file=sys.stderr)
+        print_error(f"{description}; --verbose shows where, please report it", "error of bevviz itself")
         return 3
     finally:
         if arguments is None:

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -16,7 +15,7 @@ from bevviz.cli.options import (
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, say, warn
+from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
 from bevviz.support import progress
 
 if TYPE_CHECKING:
@@ -73,9 +72,8 @@ def _calib(options: argparse.Namespace) -> int:
                 steps.update(round(100 * share) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
-    write_json(options, "calib", {"cameras": [result.to_dict() for result in results]})
-    if not json_on_stdout(options):
-        _print(results)
+    tree = {"cameras": [result.to_dict() for result in results]}
+    print_result(options, "calib", tree, lambda: "\n".join(map(_text, results)))
     if options.write is not None:
         _write(results, options.write)
     _log(results, shots, scene, config, options)
@@ -96,15 +94,13 @@ def _cameras(scene: Scene, requested: str | None, reason: str) -> tuple[str, ...
     return (requested,)
 
 
-def _print(results: list[Calibration]) -> None:
-    for result in results:
-        print(result.answer)
-        print(f"\n{result.table()}\n")
-        print(f"{result.measured_from}; an interval is two standard deviations wide")
-        for note in result.notes:
-            print(note)
-        if result.moved:
-            print(f"\nWith that put right, for --config:\n\n{result.config}")
+def _text(result: Calibration) -> str:
+    """Return the result of one camera for the terminal."""
+    measured = f"{result.measured_from}; an interval is two standard deviations wide"
+    lines = [result.answer, f"\n{result.table()}\n", measured, *result.notes]
+    if result.moved:
+        lines.append(f"\nWith that put right, for --config:\n\n{result.config}")
+    return "\n".join(lines)
 
 
 def _write(results: list[Calibration], path: Path) -> None:

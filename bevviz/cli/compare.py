@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -15,10 +14,11 @@ from bevviz.cli.options import (
     add_output,
     add_selection,
     add_truth,
+    collect_settings,
     load_config_from,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, print_hints, say, warn
+from bevviz.cli.outputs import Outputs, add_json, print_hints, print_result, say, warn
 from bevviz.cli.run import run_logged
 from bevviz.errors import UserError
 
@@ -174,9 +174,7 @@ def _default(options: argparse.Namespace) -> Path:
 
 
 def _report(summary: ComparisonSummary, options: argparse.Namespace) -> None:
-    if not json_on_stdout(options):
-        print(summary.table(), flush=True)
-    write_json(options, "compare", summary.as_tree())
+    print_result(options, "compare", summary.as_tree(), summary.table)
     if options.csv is not None:
         summary.write_csv(options.csv)
 
@@ -196,8 +194,7 @@ def _side(options: argparse.Namespace, base: str | None, settings: list[str]) ->
     preset = options.preset if base not in presets else cast("Preset", base)
     files = [] if options.config is None else [options.config]
     files += [] if base is None or base in presets else [Path(base)]
-    model = [f"detector.model={options.model}"] if options.model else []
-    config = load_config_from(options, files, [*options.set, *model, *settings], preset)
+    config = load_config_from(options, files, [*collect_settings(options), *settings], preset)
     default_name = options.config or (
         "as recorded" if _recorded(options) and preset is None else config.preset
     )

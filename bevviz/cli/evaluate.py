@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -18,8 +17,8 @@ from bevviz.cli.options import (
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, print_hints, say, warn
-from bevviz.cli.run import run_logged, run_with_progress
+from bevviz.cli.outputs import Outputs, add_json, json_on_stdout, print_hints, say, warn, write_json
+from bevviz.cli.run import run_logged, run_with_progress, table_status
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -89,10 +88,7 @@ def _run(
         print_hints(frames.scene, config)
         end = run_with_progress(frames, session, [evaluation, failures])
         warn([*frames.warnings, *failures.warnings])
-        if end.interrupted:
-            say(f"interrupted after {end.frames} frames; the table is of these")
-            return 130
-        return 0 if end.frames else 1
+        return table_status(end)
     from bevviz.evaluate.log import EvaluationRecorder
     from bevviz.recording.recorder import Recorder
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_config,
@@ -14,6 +13,7 @@ from bevviz.cli.options import (
     load_config,
     positive,
 )
+from bevviz.cli.outputs import add_json, print_result
 from bevviz.errors import UserError
 
 
@@ -51,16 +51,12 @@ def _info(options: argparse.Namespace) -> int:
 
         seconds = options.seconds or info.LISTEN
         live = info.describe(load_config(options), options.ros_args, seconds)
-        write_json(options, "info", contents_tree(live))
-        if not json_on_stdout(options):
-            print(info.render(live))
+        print_result(options, "info", contents_tree(live), lambda: info.render(live))
         return 0
     if options.seconds is not None:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
     bag_info = describe_bag(options.paths, load_config(options))
-    write_json(options, "info", contents_tree(bag_info))
-    if not json_on_stdout(options):
-        print(render_bag_info(bag_info))
+    print_result(options, "info", contents_tree(bag_info), lambda: render_bag_info(bag_info))
     return 0

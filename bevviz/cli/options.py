@@ -238,23 +238,13 @@ def load_config(options: argparse.Namespace) -> Config:
 
 def collect_settings(options: argparse.Namespace) -> list[str]:
     """Return the settings of ``--set``, ``--model``, ``--keep`` and the data set, as ``key=value``."""
-    model = getattr(options, "model", None)
-    return [
-        *options.set,
-        *([f"detector.model={model}"] if model else []),
-        *_dataset(options),
-        *_keep(options),
-    ]
-
-
-def _keep(options: argparse.Namespace) -> list[str]:
-    keep = getattr(options, "keep", None)
-    return [f"logging.keep={keep}"] if keep else []
-
-
-def _dataset(options: argparse.Namespace) -> list[str]:
-    values = {key: getattr(options, f"source_{key}", None) for key in ("dataset", "sequence")}
-    return [f"source.{key}={value}" for key, value in values.items() if value is not None]
+    values = {
+        "detector.model": getattr(options, "model", None) or None,
+        "source.dataset": getattr(options, "source_dataset", None),
+        "source.sequence": getattr(options, "source_sequence", None),
+        "logging.keep": getattr(options, "keep", None),
+    }
+    return [*options.set, *(f"{key}={value}" for key, value in values.items() if value is not None)]
 
 
 def load_config_from(
@@ -267,7 +257,6 @@ def load_config_from(
     from bevviz.config import load
 
     recorded: RecordingSource | None = getattr(options, "recorded", None)
-    settings = [*settings, *_dataset(options)]
     if recorded is not None:
         config = recorded.load(file, settings, preset)
     else:

@@ -1,22 +1,23 @@
-"""Outputs of a command: recordings, viewers, servers, and lines on stderr."""
+"""Outputs of a command: recordings, viewers, JSON, lines on stderr, and the check of their paths."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import shlex
 import shutil
 import socket
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote
 
-from bevviz.cli import style
 from bevviz.cli.interrupts import wait_for_interrupt
+from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.text import printable
 
@@ -102,6 +103,8 @@ class Outputs(NamedTuple):
             wait_for_interrupt()
 
 
+# --- lines on stderr ---------------------------------------------------------------------------
+
 _quiet = False
 
 
@@ -121,7 +124,20 @@ def say(line: str, *, always: bool = False) -> None:
 def warn(warnings: Iterable[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
-        print(f"bevviz: {style.warning('warning:')} {printable(warning)}", file=sys.stderr)
+        print(f"bevviz: {_colored('warning:', '33')} {printable(warning)}", file=sys.stderr)
+
+
+def print_error(message: object, kind: str = "error") -> None:
+    """Print an error on stderr."""
+    print(f"{_colored(f'bevviz: {kind}:', '1;31')} {message}", file=sys.stderr)
+
+
+def _colored(text: str, code: str) -> str:
+    """Colour a text on stderr. NO_COLOR (no-color.org) disables colours, FORCE_COLOR forces them."""
+    is_terminal = os.environ.get("TERM") != "dumb" and sys.stderr.isatty()
+    if os.environ.get("NO_COLOR") or not (os.environ.get("FORCE_COLOR") or is_terminal):
+        return text
+    return f"\x1b[{code}m{text}\x1b[0m"
 
 
 def print_hints(scene: Scene, config: Config) -> None:
@@ -175,3 +191,137 @@ def open_browser(address: str) -> None:
 def has_display() -> bool:
     """Return whether windows can be shown."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+# --- --json: the result for other programs, in one format for each command (docs/api.md) -------
+
+OPTION = "--json"
+STDOUT = "-"
+
+
+def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
+    """Add the option ``--json``."""
+    group.add_argument(
+        OPTION,
+        nargs="?",
+        const=STDOUT,
+        type=Path,
+        metavar="FILE.json",
+        help="the result for programs, instead of the text; into a file: beside it",
+    )
+
+
+def join_json_option(arguments: Iterable[str]) -> list[str]:
+    """Replace ``--json PATH`` by ``--json=- PATH``, unless PATH is a .json file."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] == OPTION and not argument.endswith(".json"):
+            joined[-1] = f"{OPTION}={STDOUT}"
+        joined.append(argument)
+    return joined
+
+
+def json_on_stdout(options: argparse.Namespace) -> bool:
+    """Return whether JSON replaces the text on standard output."""
+    return str(options.json) == STDOUT
+
+
+def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> None:
+    """Print or write the result if ``--json`` is given.
+
+    Args:
+        options: of the command.
+        form: name of the format. The number after it increases with a change that breaks a reader.
+        tree: the result: values that JSON can represent, NaN, and tuples.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    if options.json is None:
+        return
+    import json
+
+    from bevviz.support.files import save_text
+
+    text = json.dumps({"form": f"bevviz.{form}/1", **_plain(tree)}, indent=1, allow_nan=False)
+    if json_on_stdout(options):
+        print(text, flush=True)
+    else:
+        save_text(options.json, f"{text}\n", OPTION)
+
+
+def print_result(
+    options: argparse.Namespace, form: str, tree: Mapping[str, Any], text: Callable[[], str]
+) -> None:
+    """Print the result as text or as JSON, and write it as ``--json FILE`` says; see ``write_json``."""
+    if not json_on_stdout(options):
+        print(text(), flush=True)
+    write_json(options, form, tree)
+
+
+def _plain(value: Any) -> Any:
+    """Replace NaN and infinity by None, and tuples by lists."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# --- the check that no output overwrites an input or another output ----------------------------
+
+READ = ("paths", "recording", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
+WRITTEN = {
+    "save": "--save",
+    "output": "-o",
+    "csv": "--csv",
+    "json": "--json",
+    "junit": "--junit",
+    "write": "--write",
+    "bag": "--bag",
+}
+# Files written at the end of the run. Only ``check_outputs`` checks their folder before.
+TEXTS = ("csv", "json", "write")
+
+
+def check_outputs(options: argparse.Namespace) -> None:
+    """Check the output paths before the run starts.
+
+    Raises:
+        UserError: an output is one of the inputs, also by another name or link. Or two outputs are the same
+            file. Or the folder of an output does not exist.
+    """
+    if getattr(options, "check", False):  # It writes nothing.
+        return
+    inputs = {identity: path for path in _inputs(options) for identity in _identities(path)}
+    outputs: dict[Path, str] = {}
+    for name, option in WRITTEN.items():
+        target = getattr(options, name, None)
+        if not isinstance(target, Path) or target.is_dir() or target == Path(STDOUT):
+            continue
+        other = outputs.setdefault(target.resolve(), option)
+        if other != option and (target.is_file() or not target.exists()):
+            raise UserError(f"{option} {target}: {other} writes that file; give another name")
+        if name in TEXTS and not target.parent.is_dir():
+            raise UserError(f"{option} {target}: there is no folder {target.parent}")
+        for identity in _identities(target):
+            if identity in inputs:
+                other_name = "" if inputs[identity] == target else f" ({inputs[identity]})"
+                raise UserError(f"{option} {target}: is what is read{other_name}; give another name")
+
+
+def _inputs(options: argparse.Namespace) -> Iterator[Path]:
+    for name in READ:
+        values = getattr(options, name, None)
+        for value in values if isinstance(values, list) else [values]:
+            if isinstance(value, str | Path) and str(value):
+                yield Path(value)
+
+
+def _identities(path: Path) -> Iterator[tuple[int, int]]:
+    """Yield device and inode of a file, or of each file in a folder."""
+    with suppress(OSError, ValueError):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            with suppress(OSError):
+                status = file.stat()
+                yield status.st_dev, status.st_ino

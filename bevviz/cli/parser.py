@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import NoReturn
 
-from bevviz.cli import style
+from bevviz.cli.outputs import print_error
 from bevviz.support.text import did_you_mean, printable
 
 COMMAND = "COMMAND"
@@ -52,7 +51,7 @@ class Parser(argparse.ArgumentParser):
             else:
                 message = f"{message[: choice.start()]}'{wrong}' is none of {', '.join(known)}"
                 message += did_you_mean(wrong, known, CUTOFF)
-        print(f"{style.error('bevviz: error:')} {printable(message)}\n{self.short_usage()}", file=sys.stderr)
+        print_error(f"{printable(message)}\n{self.short_usage()}")
         self.exit(2)
 
     def short_usage(self) -> str:

@@ -34,6 +34,14 @@ def run_with_progress(
         return run(items, processor, [*observers, Progress()], stop=ended)
 
 
+def table_status(end: RunEnd) -> int:
+    """Return the exit status of a run whose result is a table. Tell the user if the run was interrupted."""
+    if end.interrupted:
+        say(f"interrupted after {end.frames} frames; the table is of these")
+        return 130
+    return 0 if end.frames else 1
+
+
 def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     """Run every stage on every frame and log the results to every output. Return the exit status.
 

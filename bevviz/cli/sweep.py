@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_bag,
@@ -15,11 +14,12 @@ from bevviz.cli.options import (
     add_output,
     add_selection,
     add_truth,
+    collect_settings,
     load_config_from,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, print_hints, say, warn
-from bevviz.cli.run import run_with_progress
+from bevviz.cli.outputs import Outputs, add_json, print_hints, print_result, warn
+from bevviz.cli.run import run_with_progress, table_status
 
 if TYPE_CHECKING:
     from bevviz.config import Config
@@ -50,11 +50,12 @@ def _sweep(options: argparse.Namespace) -> int:
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
 
-    parameters, constant = parse(options.set)
-    model = [f"detector.model={options.model}"] if options.model else []
+    parameters, options.set = parse(options.set)
 
     def configured(settings: list[str]) -> Config:
-        return load_config_from(options, options.config, [*constant, *model, *settings], options.preset)
+        return load_config_from(
+            options, options.config, [*collect_settings(options), *settings], options.preset
+        )
 
     configs = combine(parameters, configured)
     config = common_frames(configs.values())
@@ -68,9 +69,7 @@ def _sweep(options: argparse.Namespace) -> int:
             print_hints(source.scene, config)
             end = run_with_progress(source, sweep, [])
             warn(source.warnings)
-            if not json_on_stdout(options):
-                print(sweep.table())
-            write_json(options, "sweep", sweep.as_tree())
+            print_result(options, "sweep", sweep.as_tree(), sweep.table)
             if options.csv is not None:
                 sweep.write_csv(options.csv)
             if sinks is not None:
@@ -79,7 +78,4 @@ def _sweep(options: argparse.Namespace) -> int:
                 log_sweep(sinks.recording, sweep, source.scene.name, present)
                 if not end.interrupted:
                     outputs.keep_serving(sinks)
-    if end.interrupted:
-        say(f"interrupted after {end.frames} frames; the table is of these")
-        return 130
-    return 0 if end.frames else 1
+    return table_status(end)

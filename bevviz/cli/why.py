@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.machine import add_json, json_on_stdout, write_json
 from bevviz.cli.options import (
     Commands,
     add_at,
@@ -18,7 +17,7 @@ from bevviz.cli.options import (
     number,
     positive,
 )
-from bevviz.cli.outputs import Outputs, say, warn
+from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.contexts import garbage_collection_off
@@ -136,11 +135,10 @@ def _why(options: argparse.Namespace) -> int:
         answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
         neighbours = _neighbours(questioner, selection, answers)
         headline = _headline(questioner, selection)
-        write_json(options, "why", _tree(result, answers, neighbours, headline))
-        if not json_on_stdout(options):
-            print(printable(f"frame {frame.index}, preset {config.preset}: {headline}"))
-            if answers:
-                print(f"\n{plain_text(answers, options.limit, neighbours)}")
+        text = printable(f"frame {frame.index}, preset {config.preset}: {headline}")
+        if answers:
+            text = f"{text}\n\n{plain_text(answers, options.limit, neighbours)}"
+        print_result(options, "why", _tree(result, answers, neighbours, headline), lambda: text)
         if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
@@ -190,7 +188,6 @@ def _headline(questioner: FrameExplainer, selection: Selection) -> str:
 
 
 def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
-
     yield from progress.bar(answers, unit="object", desc="what would change it", leave=False)
 
 
