@@ -5,12 +5,12 @@ of the ROS 2 tutorial pipeline. The tutorial's own parameter names (``cluster_to
 everywhere. A user-defined stage takes its parameters under ``SECTION.params``.
 """
 
-from bevviz.config.class_sizes import CLASS_SIZES
 from bevviz.config.files import Layer, config_yaml, flat_yaml, read_layer, stated_lines
 from bevviz.config.keys import (
     TUTORIAL_NAMES,
     ParameterChange,
     changes,
+    field_of,
     flatten,
     keys,
     unit,
@@ -19,7 +19,16 @@ from bevviz.config.keys import (
     values,
 )
 from bevviz.config.loading import changed_config, load, untrusted_layers
-from bevviz.config.methods import BUILTIN_METHODS, METHOD_KEYS
+from bevviz.config.methods import (
+    BUILTIN_METHODS,
+    METHOD_KEYS,
+    object_files,
+    object_network_params,
+    params_of,
+    plugin_of,
+    stage_topics,
+    with_object_files,
+)
 from bevviz.config.sections import (
     AnomaliesConfig,
     AnomalyKind,
@@ -39,14 +48,7 @@ from bevviz.config.sections import (
     TrackingConfig,
     VoxelConfig,
 )
-from bevviz.config.user_stages import (
-    object_files,
-    object_network_params,
-    params_of,
-    plugin_of,
-    stage_topics,
-    with_object_files,
-)
+from bevviz.config.value_types import CLASS_SIZES
 
 __all__ = [
     "BUILTIN_METHODS",
@@ -75,6 +77,7 @@ __all__ = [
     "changed_config",
     "changes",
     "config_yaml",
+    "field_of",
     "flat_yaml",
     "flatten",
     "keys",

@@ -12,10 +12,9 @@ from pydantic.fields import FieldInfo
 from bevviz.config import (
     TUTORIAL_NAMES,
     Config,
-    Section,
+    field_of,
     keys,
     load,
-    params_of,
     unit,
     unit_spellings,
     unknown_key,
@@ -25,23 +24,6 @@ from bevviz.errors import UserError
 from bevviz.support.text import printable
 
 WIDTH = 100
-
-
-def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
-    """Return the pydantic field of a dotted key, or None for an unknown key.
-
-    Args:
-        key: dotted key.
-        config: configuration whose stages define the keys ``SECTION.params.NAME``. Without it, they are
-            unknown.
-    """
-    section, _, name = key.partition(".")
-    if config is not None and name.startswith("params."):
-        return params_of(config, section).get(name.removeprefix("params."))
-    model = Config.model_fields[section].annotation if section in Config.model_fields else None
-    if not (isinstance(model, type) and issubclass(model, Section)):
-        return Config.model_fields.get(key)
-    return model.model_fields.get(name)
 
 
 def describe_parameters(asked: str, config: Config) -> str:

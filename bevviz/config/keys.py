@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
+from bevviz.config.methods import params_of
 from bevviz.config.sections import Config, Section
-from bevviz.config.units import Unit
-from bevviz.config.user_stages import params_of
+from bevviz.config.value_types import Unit
 
 TUTORIAL_NAMES = {
     "voxel_size": "voxel.size",
@@ -127,11 +128,9 @@ def unit_spellings(key: str) -> tuple[str, ...]:
 
 def _unit(key: str) -> Unit | None:
     """Return the unit of a dotted key, or None if it has none."""
-    section, _, name = key.partition(".")
-    model = _model(section)
-    if model is None or name not in model.model_fields:
+    info = field_of(key)
+    if info is None:
         return None
-    info = model.model_fields[name]
     # An optional quantity carries its unit inside the union.
     inner = [
         extra for argument in get_args(info.annotation) for extra in getattr(argument, "__metadata__", ())
@@ -141,6 +140,21 @@ def _unit(key: str) -> Unit | None:
         if isinstance(owner, Unit):
             return owner
     return None
+
+
+def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
+    """Return the pydantic field of a dotted key, or None for an unknown key.
+
+    Args:
+        key: dotted key.
+        config: configuration whose stages define the keys ``SECTION.params.NAME``. Without it, they are
+            unknown.
+    """
+    section, _, name = key.partition(".")
+    if config is not None and name.startswith("params."):
+        return params_of(config, section).get(name.removeprefix("params."))
+    model = _model(section)
+    return Config.model_fields.get(key) if model is None else model.model_fields.get(name)
 
 
 def _model(section: str) -> type[BaseModel] | None:

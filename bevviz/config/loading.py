@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from bevviz.config.files import Layer, parse_yaml, read_layer
-from bevviz.config.keys import TUTORIAL_NAMES, flatten, keys, unit, unknown_key, values
-from bevviz.config.methods import METHOD_KEYS
+from bevviz.config.keys import TUTORIAL_NAMES, field_of, flatten, keys, unit, unknown_key, values
+from bevviz.config.methods import METHOD_KEYS, names_function, params_model
 from bevviz.config.pillars import COMPLETE_SENTENCE, is_network_file
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
-from bevviz.config.user_stages import names_function, params_model
 from bevviz.errors import UserError
 from bevviz.support.text import short_repr
 
@@ -91,7 +90,12 @@ def load(
         stated[key], origin[key], layers_in_force[key] = value, layer.where, layer
     running_functions = [config.functions for config in (in_force, base) if isinstance(config, Config)]
     functions = _functions(entries, stated, layers_in_force, running_functions)
-    params = _params({**preset_values, **stated}, origin, functions)
+    param_models = _param_models({**preset_values, **stated}, origin, functions)
+    params = {
+        f"{section}.params.{name}": info.description or ""
+        for section, model in param_models.items()
+        for name, info in model.model_fields.items()
+    }
     known_keys = [*keys(), *params]
     tree: dict[str, Any] = {"preset": preset_name}
     for key, value in {**preset_values, **stated}.items():
@@ -105,7 +109,7 @@ def load(
         if full != "preset":
             _insert(tree, full, value)
     try:
-        for section, model in _param_models(tree, functions):
+        for section, model in param_models.items():
             prefix = f"{section}.params."
             tree[section]["params"] = model.model_validate(tree[section].get("params", {})).model_dump(
                 mode="json"
@@ -174,8 +178,9 @@ def _setting(text: str, trust: Trust, where: str = "") -> Layer:
     if not sep:
         raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
     parsed = parse_yaml(value, f"--set {text}") if value.strip() else ""
-    if isinstance(parsed, int) and _is_text(key.strip()):  # The text 0001 is a name, not the number 1.
-        parsed = value.strip()
+    info = field_of(key.strip())
+    if isinstance(parsed, int) and info is not None and info.annotation is str:
+        parsed = value.strip()  # The text 0001 is a name, not the number 1.
     return Layer(where or f"--set {text}", {key.strip(): parsed}, trust)
 
 
@@ -235,16 +240,11 @@ def _alike(method: Any, other: Any) -> bool:
     return is_network_file(str(method)) and is_network_file(str(other))
 
 
-def _is_text(key: str) -> bool:
-    """Return whether the value of a parameter is text."""
-    section, _, name = key.partition(".")
-    model = Config.model_fields[section].annotation if section in Config.model_fields else None
-    return name in getattr(model, "model_fields", {}) and model.model_fields[name].annotation is str  # type: ignore[union-attr]
-
-
-def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions) -> dict[str, str]:
-    """Return dotted keys and descriptions of the parameters of the named plugins and networks."""
-    descriptions: dict[str, str] = {}
+def _param_models(
+    stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions
+) -> dict[str, type[BaseModel]]:
+    """Return the model of the parameters for each section whose function or network has parameters."""
+    models: dict[str, type[BaseModel]] = {}
     for section, key in METHOD_KEYS.items():
         method = stated.get(f"{section}.{key}")
         if not isinstance(method, str):
@@ -254,19 +254,8 @@ def _params(stated: Mapping[str, Any], origin: Mapping[str, str], functions: Fun
         except UserError as error:
             raise UserError(f"{origin[f'{section}.{key}']}: {error}") from error.__cause__
         if model is not None:
-            fields = model.model_fields
-            descriptions |= {
-                f"{section}.params.{name}": info.description or "" for name, info in fields.items()
-            }
-    return descriptions
-
-
-def _param_models(tree: Mapping[str, Any], functions: Functions) -> Iterator[tuple[str, type[BaseModel]]]:
-    """Yield each section whose function or network has parameters, with the model of these parameters."""
-    for section, key in METHOD_KEYS.items():
-        model = params_model(section, str(tree.get(section, {}).get(key, "")), functions)
-        if model is not None:
-            yield section, model
+            models[section] = model
+    return models
 
 
 def _lower(message: str) -> str:

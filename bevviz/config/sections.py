@@ -17,9 +17,17 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from bevviz.config.class_sizes import CLASS_SIZES, ClassSize, with_default_sizes
 from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
-from bevviz.config.units import Degrees, Megabytes, Metres, Pixels, Seconds
+from bevviz.config.value_types import (
+    CLASS_SIZES,
+    ClassSize,
+    Degrees,
+    Megabytes,
+    Metres,
+    Pixels,
+    Seconds,
+    with_default_sizes,
+)
 
 Preset = Literal["default", "reference"]
 Functions = Mapping[tuple[str, str], str]  # (section, module:function) -> folder of the module

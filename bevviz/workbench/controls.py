@@ -9,8 +9,7 @@ import annotated_types
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
-from bevviz.config import Config, unit, values
-from bevviz.config.descriptions import field_of
+from bevviz.config import Config, field_of, unit, values
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 
