@@ -1,4 +1,4 @@
-"""Log the result of ``bevviz calib``: points over the image, stated and corrected, and the score curves."""
+"""Log the result of ``bevviz calib``, and the views of it: points over the image, and the score curves."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
-from bevviz.calib.offsets import TIME, error_pose
+from bevviz.calib.offsets import AXES, TIME, error_pose
 from bevviz.calib.result import AxisFinding, Calibration
 from bevviz.calib.samples import Shot
 from bevviz.config import LoggingConfig
@@ -115,4 +116,35 @@ def _page(result: Calibration) -> str:
             *map(markdown, result.notes),
             f"\n{fenced(result.config, 'yaml')}" if result.moved else "",
         ]
+    )
+
+
+# --- views for the layout ----------------------------------------------------------------------
+
+
+def alignment(camera: str) -> rrb.Tabs:
+    """Return tabs with the image, the points by depth and the edges of the cloud, as stated and corrected."""
+    return rrb.Tabs(
+        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
+        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
+    )
+
+
+def calibration(camera: str) -> rrb.TextDocumentView:
+    """Return the view of the result page of 'bevviz calib'."""
+    return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
+
+
+def score_curves(camera: str) -> rrb.Grid:
+    """Return bar charts of the score over the offset along each axis."""
+    return rrb.Grid(
+        *(
+            rrb.BarChartView(
+                name=f"{axis.short}, {axis.unit}",
+                origin=entities.calib_curve(camera, axis.name),
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for axis in AXES
+        ),
+        grid_columns=2,
     )

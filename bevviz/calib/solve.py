@@ -8,7 +8,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bevviz.calib.evidence import LEAD, caution_factor, independent_views, lead, scatter
 from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
 from bevviz.calib.result import AxisFinding, AxisResult, Calibration
 from bevviz.calib.samples import REACH, Shot, Shots
@@ -29,6 +28,10 @@ UNTIMED = 0.05  # metres along z where the motion is unknown: 5 ms at 10 m/s
 TURNS, AHEAD = 3, 5  # number of turns in AXES; row of the shift along z
 MOTIONLESS = "the motion of the robot is not known"
 STILL = 1.0  # metres per second; at lower speeds the time of an image has no effect
+REPLICATES = 24  # climbs with random weights
+SETTLED = 0.05  # pixels, last step of the climb of a replicate
+VIEW = 6.0  # hidden variance of a view, as a multiple of the variance of its parts (docs/calib.md)
+LEAD = 2.0  # standard errors by which the best peak must be higher than another
 
 Progress = Callable[[float, str], None]
 
@@ -59,7 +62,7 @@ def calibrate(
 
     The function maximises the score of ``bevviz.calib.score`` over three turns, three shifts and the time
     together. It starts from a grid and goes from coarse to fine. A weak prior (``Axis.prior``) holds the
-    offsets that the scene does not determine. The uncertainty comes from ``bevviz.calib.evidence`` and
+    offsets that the scene does not determine. The uncertainty comes from ``bevviz.calib.solve`` and
     includes ``Axis.floor``.
 
     Args:
@@ -139,7 +142,7 @@ def _weigh(
         return _Estimate(np.zeros(len(AXES)), 2 * PRIOR), _Judgement(AxisFinding.UNKNOWN, reason)
     best = peaks[0]
     nothing = _Estimate(best.offsets, 2 * PRIOR)
-    rivals = [rival for rival in peaks[1:] if np.less(*lead(best, rival))]
+    rivals = [rival for rival in peaks[1:] if np.less(*_lead(best, rival))]
     error = float(np.sqrt((best.sums.score.sum(0) ** 2).sum()))
     if len(rivals) > RIVALS or best.height < LEAD * error:
         return nothing, _no_peak(scorer, best, error)
@@ -164,7 +167,7 @@ def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
         return _Judgement(
             AxisFinding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)"
         )
-    shown, taken = max(round(independent_views(best)), 1), len(scorer.shots)
+    shown, taken = max(round(_independent_views(best)), 1), len(scorer.shots)
     frames = f"{shown} frame{'s' if shown > 1 else ''}"
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
@@ -253,8 +256,61 @@ def _why_unsure(shots: Shots, axis: Axis) -> str:
 
 
 def _data_deviation(scorer: Scorer, peak: Peak, free: Bool) -> F64:
-    """Return the (7,) standard deviation from the data, including the floor of calibrated sensors."""
-    return np.asarray(caution_factor(peak) * np.hypot(scatter(scorer, peak, free), FLOOR), np.float64)
+    """Return the (7,) standard deviation from the data, including the floor of calibrated sensors.
+
+    It is widened for few views: they have errors that they do not show.
+    """
+    caution = np.sqrt(1 + VIEW / _independent_views(peak))
+    return np.asarray(caution * np.hypot(_scatter(scorer, peak, free), FLOOR), np.float64)
+
+
+def _scatter(scorer: Scorer, peak: Peak, free: Bool) -> F64:
+    """Return the (7,) standard deviation of a peak, from climbs with random weights of the data.
+
+    The edges of one border have the same error, and so have the edges of one object in many frames: thirty
+    images of one place are worth one image. So nothing here counts edges. The data is divided into frames and
+    into parts of the image, and both are weighted at random, independently (Owen and Eckles 2012,
+    "Bootstrapping data arrays of arbitrary order"). The weight of a frame varies more if other frames are
+    like it: the weights of eight copies of a frame add up to the weight of one unique frame. If all frames
+    are the same, the result is the scatter between the parts of one image.
+    """
+    rng = np.random.default_rng(0)
+    frames, parts = peak.sums.score.shape
+    shape = _independent_views(peak) / frames
+    replicates = []
+    for _ in range(REPLICATES):
+        weight = np.outer(rng.gamma(shape, 1 / shape, frames), rng.exponential(size=parts))
+        replicates.append(climb(scorer, peak.offsets, free, peak, weight / weight.mean(), SETTLED).offsets)
+    return np.asarray(np.sqrt(((np.stack(replicates) - peak.offsets) ** 2).mean(0)), np.float64)
+
+
+def _independent_views(peak: Peak) -> float:
+    """Return how many frames have independent errors: 1 for the same frame thirty times.
+
+    This is the participation ratio of the gradients of the frames' parts at the peak, correlated frame with
+    frame.
+    """
+    values, vectors = np.linalg.eigh(peak.metric)
+    pull = peak.sums.gradient @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    pull = pull.reshape(len(pull), -1)
+    pull = pull[np.linalg.norm(pull, axis=1) > 0]
+    if not len(pull):
+        return 1.0
+    correlation = np.corrcoef(pull) if len(pull) > 1 else np.ones((1, 1))
+    return float(len(pull) ** 2 / (correlation**2).sum())
+
+
+def _lead(best: Peak, rival: Peak) -> tuple[float, float]:
+    """Return by how much the best peak is higher than another, and by how much it must be.
+
+    The comparison goes part by part and frame by frame, as that of Vuong 1989, "Likelihood Ratio Tests for
+    Model Selection and Non-Nested Hypotheses", goes sample by sample.
+    """
+    ahead = best.sums.score - rival.sums.score
+    by_frame, by_part = ahead.sum(1), ahead.sum(0)
+    n = len(by_frame)
+    between = float(((by_frame - by_frame.mean()) ** 2).sum()) * n / (n - 1) if n > 1 else 0.0
+    return float(ahead.sum()), LEAD * float(np.sqrt(max(between, float((by_part**2).sum()))))
 
 
 def _confusion(shots: Shots) -> F64:
