@@ -16,6 +16,8 @@ from bevviz.calib.edges import cloud_edges
 from bevviz.calib.offsets import SCALES, TIME, error_pose
 from bevviz.calib.result import correction_yaml
 from bevviz.calib.score import Scorer
+from bevviz.calib.search import search
+from bevviz.calib.solve import FIT
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
@@ -268,6 +270,21 @@ def test_images_of_other_frames_give_no_answer(kitti: list[Frame]) -> None:
     result = calibrate(shots_of(swapped))
     assert set(findings(result).values()) == {"no agreement"}
     assert "the edges of image and cloud do not agree anywhere" in result.answer
+    assert best_score(swapped) < FIT / 1.2
+    assert best_score(kitti) > 1.2 * FIT
+
+
+def test_the_worst_agreement_of_a_right_calibration(shared: Path) -> None:
+    """Of all real frames, these four score least."""
+    assert best_score(Kitti(shared / "kitti_more", range(12, 16)).frames) > 1.2 * FIT
+
+
+def best_score(frames: Sequence[Frame]) -> float:
+    """Return the mean score of the highest peak."""
+    name = frames[0].cameras[0].name
+    shots = gather(frames, [name], lambda frame, stamp: None)[name].shots
+    free = np.array([True] * TIME + [False])
+    return search(shots, free, lambda done, what: None)[1][0].sums.mean
 
 
 def shots_of(frames: Iterable[Frame]) -> Shots:
@@ -285,6 +302,17 @@ def test_one_view_repeated_twelve_times_counts_once(drive: Drive) -> None:
     ratio = np.array([b.interval / a.interval for a, b in zip(once.axes, often.axes, strict=True)])
     # Which of the edges are drawn differs; twelve views would give 0.29 of each.
     assert ratio.min() > 0.4 and np.exp(np.log(ratio[:5]).mean()) > 0.7
+
+
+def test_two_frames_do_not_confirm_shift_along_z_and_time(drive: Drive) -> None:
+    """These two have different speeds, so their intervals are small."""
+    once, often = (calibrate(gather(drive.frames[::step], ["zed"], drive.pose)["zed"]) for step in (5, 1))
+    assert set(findings(often).values()) == {"fine"}
+    assert often.answer == "Camera 'zed': calibration and clock are fine."
+    assert findings(once)["tz"] == findings(once)["dt"] == "cannot tell"
+    assert once.axes[TIME].interval < once.axes[TIME].axis.sure
+    assert once.axes[TIME].reason == "2 frames cannot hold it: it takes 6 or more"
+    assert once.answer.endswith("From 2 frames it cannot tell the shift along z and time of the image.")
 
 
 def changed(drive: Drive, change: object) -> Iterator[Frame]:

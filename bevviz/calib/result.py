@@ -95,12 +95,14 @@ class Calibration:
             text = f"Camera '{self.camera}': what can be told is fine: the {_names(fine)}."
         else:
             text = f"Camera '{self.camera}': calibration and clock are fine."
-        return f"{text} It cannot tell the {_names(unknown)}." if unknown else text
+        if not unknown:
+            return text
+        return f"{text} From {frames_text(self.frames)} it cannot tell the {_names(unknown)}."
 
     @property
     def measured_from(self) -> str:
         """Amount of data, e.g. ``30 frames, 43192 edges``."""
-        return f"{self.frames} frame{'s' * (self.frames != 1)}, {self.edges} edges"
+        return f"{frames_text(self.frames)}, {self.edges} edges"
 
     @property
     def moved(self) -> bool:
@@ -149,6 +151,11 @@ class Calibration:
             "extrinsics": {"stated": self.stated.tolist(), "corrected": self.corrected.tolist()},
             "notes": list(self.notes),
         }
+
+
+def frames_text(count: int) -> str:
+    """Return e.g. ``2 frames``."""
+    return f"{count} frame{'s' * (count != 1)}"
 
 
 def correction_yaml(results: Sequence[Calibration]) -> str:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
-from bevviz.calib.result import AxisFinding, AxisResult, Calibration
+from bevviz.calib.result import AxisFinding, AxisResult, Calibration, frames_text
 from bevviz.calib.samples import REACH, Shot, Shots
 from bevviz.calib.score import Scorer
 from bevviz.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
@@ -20,7 +20,7 @@ from bevviz.model.frame import F64, Bool
 SAMPLES = 41  # points of a score curve
 EDGES = 500  # fewer edges give no result
 RIVALS = 2  # with more peaks about as high as the best one, there are probably more still
-FIT = 0.035  # mean score of the worst real scene with a right calibration (docs/calib.md)
+FIT = 0.03  # mean score between that of unrelated images and of right calibrations (docs/calib.md)
 HALF = 3  # frames, least size of the halves that are compared
 CERTAIN = 1.25  # intervals, that is 2.5 standard deviations: a larger offset is significant
 ALONG = 0.005  # metres by which edges of other moving things shift the result along the robot's way
@@ -168,7 +168,7 @@ def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
             AxisFinding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)"
         )
     shown, taken = max(round(_independent_views(best)), 1), len(scorer.shots)
-    frames = f"{shown} frame{'s' if shown > 1 else ''}"
+    frames = frames_text(shown)
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
     return _Judgement(
@@ -223,7 +223,11 @@ def _judge(shots: Shots, estimate: _Estimate, trouble: _Judgement | None) -> tup
 
 
 def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: str) -> _Judgement:
-    """Return the finding for one axis."""
+    """Return the finding for one axis.
+
+    Shift along z and time are told apart by differences between the frames alone. Too few frames to compare
+    their halves agree by chance, so they do not confirm these two.
+    """
     if axis is AXES[TIME]:
         speeds = _speeds(shots)
         if len(speeds) < len(shots.shots):
@@ -233,6 +237,10 @@ def _finding(shots: Shots, axis: Axis, offset: float, interval: float, rival: st
     if abs(offset) > max(CERTAIN * interval, axis.least):
         return _Judgement(AxisFinding.OFF)
     if abs(offset) + interval <= axis.sure:
+        if axis.name in ("tz", "dt") and (taken := len(shots.shots)) < 2 * HALF:
+            return _Judgement(
+                AxisFinding.UNKNOWN, f"{frames_text(taken)} cannot hold it: it takes {2 * HALF} or more"
+            )
         return _Judgement(AxisFinding.FINE)
     return _Judgement(AxisFinding.UNKNOWN, rival or _why_unsure(shots, axis))
 

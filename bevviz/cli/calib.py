@@ -96,7 +96,7 @@ def _cameras(scene: Scene, requested: str | None, reason: str) -> tuple[str, ...
 
 def _text(result: Calibration) -> str:
     """Return the result of one camera for the terminal."""
-    measured = f"{result.measured_from}; an interval is two standard deviations wide"
+    measured = f"{result.measured_from}; an interval is two standard deviations to either side"
     lines = [result.answer, f"\n{result.table()}\n", measured, *result.notes]
     if result.moved:
         lines.append(f"\nWith that put right, for --config:\n\n{result.config}")
