@@ -527,7 +527,7 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         "report/check.py",
     }
     finding = {file for file, call in calls("load_plugin") if ast.unparse(call.func) == "plugins.load_plugin"}
-    assert finding == {"config/user_stages.py"}
+    assert finding == {"config/methods.py"}
 
 
 def test_a_recorded_detector_is_refused_with_a_preset_too(received: Path) -> None:
