@@ -6,15 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_output,
-    add_selection,
-    load_config,
-    open_bag,
-)
+from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
 from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
 from bevviz.support import progress
 

@@ -5,14 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_selection,
-    load_config,
-    open_bag,
-)
+from bevviz.cli.options import Commands, add_bag, add_config, add_selection, load_config, open_bag
 from bevviz.cli.outputs import print_hints, say, warn
 from bevviz.cli.run import run_with_progress
 

@@ -5,14 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import (
-    Commands,
-    add_config,
-    add_dataset,
-    add_ros_args,
-    load_config,
-    positive,
-)
+from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
 from bevviz.cli.outputs import add_json, print_result
 from bevviz.errors import UserError
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -23,6 +25,34 @@ ISO 8601 (2026-11-21T10:00:00)."""
 
 # Matches several numbers, the first of them negative.
 _NEGATIVES = re.compile(r"-[\d.][-+\d.eE]*(,[-+\d.eE]+)+")
+
+
+def parse_whole(least: int, most: float, problem: str) -> Callable[[str], int]:
+    """Return a parser of whole numbers from ``least`` to ``most``."""
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"'{text}' {problem}")
+        return int(text)
+
+    return parse
+
+
+def parse_real(is_valid: Callable[[float], bool], problem: str) -> Callable[[str], float]:
+    """Return a parser of numbers."""
+
+    def parse(text: str) -> float:
+        with suppress(ValueError):
+            if is_valid(value := float(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"'{text}' {problem}")
+
+    return parse
+
+
+number = parse_whole(0, inf, "is no number, counted from 0")
+positive = parse_whole(1, inf, "is no whole number of 1 or more")
+port = parse_whole(1, 65534, "is no port (1 to 65534)")
 
 
 def add_bag(parser: argparse.ArgumentParser, *, detector: bool = True) -> argparse._ArgumentGroup:
@@ -110,13 +140,6 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--end", metavar="TIME", help="stop at this time")
     group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
     group.add_argument("--frames", type=frame_range, metavar="A:B", help="run scans A to B-1, counted from 0")
-
-
-def number(text: str) -> int:
-    """Parse a number of 0 or more."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is no number, counted from 0")
-    return int(text)
 
 
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
@@ -329,20 +352,6 @@ def join_negative_numbers(arguments: Iterable[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
-
-
-def positive(text: str) -> int:
-    """Parse a whole number of 1 or more."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is no whole number of 1 or more")
-    return int(text)
-
-
-def port(text: str) -> int:
-    """Parse a port."""
-    if not text.isdecimal() or not 0 < int(text) < 65535:
-        raise argparse.ArgumentTypeError(f"'{text}' is no port (1 to 65534)")
-    return int(text)
 
 
 def frame_range(text: str) -> tuple[int | None, int | None]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config
+from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config, parse_real
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
 from bevviz.support.files import CONFIG_LIMIT, read_text
+
+_seconds = parse_real(lambda seconds: 0 <= seconds < 1e6, "is no time in seconds")
 
 
 def add(commands: Commands) -> None:
@@ -114,13 +116,3 @@ def _check(options: argparse.Namespace) -> int:
 
 def _read(path: Path) -> str:
     return read_text(path, CONFIG_LIMIT, problem=f"--note-file {path}: cannot be read", pipe=True).strip()
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < 1e6:
-        raise argparse.ArgumentTypeError(f"'{text}' is no time in seconds")
-    return value

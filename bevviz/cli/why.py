@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bevviz.cli.options import (
@@ -15,6 +16,7 @@ from bevviz.cli.options import (
     add_output,
     load_config,
     number,
+    parse_real,
     positive,
 )
 from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
@@ -32,6 +34,8 @@ EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx --class person   every person, however weakly detected
   bevviz why drive.mcap --at-frame 125 --model yolo11n.onnx --box 320,180    what is at that pixel
   bevviz why drive.mcap --at 12.5 --point 8.2,-1.5,-0.8 --serve         what is there, shown in a browser"""
+
+_metres = parse_real(lambda metres: 0 < metres < 1000, "is no length in metres")
 
 
 def add(commands: Commands) -> None:
@@ -100,16 +104,6 @@ def _numbers(*counts: int) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
-def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1000:
-        raise argparse.ArgumentTypeError(f"'{text}' is no length in metres")
-    return value
-
-
 @garbage_collection_off()
 def _why(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
@@ -132,7 +126,8 @@ def _why(options: argparse.Namespace) -> int:
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.explained(frame)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
-        answers = questioner.explain(selection, options.limit, _progress, everything=options.all)
+        bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
+        answers = questioner.explain(selection, options.limit, bar, everything=options.all)
         neighbours = _neighbours(questioner, selection, answers)
         headline = _headline(questioner, selection)
         text = printable(f"frame {frame.index}, preset {config.preset}: {headline}")
@@ -185,10 +180,6 @@ def _headline(questioner: FrameExplainer, selection: Selection) -> str:
     if selection.label:
         return f"{problem}: the detector has no candidate, however weak"
     return f"{problem}: there is no detection, however weak"
-
-
-def _progress(answers: Sequence[Answer]) -> Iterable[Answer]:
-    yield from progress.bar(answers, unit="object", desc="what would change it", leave=False)
 
 
 def _tree(

@@ -21,16 +21,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from bevviz.config import (
-    BUILTIN_METHODS,
-    TUTORIAL_NAMES,
-    Config,
-    Layer,
-    Preset,
-    flatten,
-    plugins,
-    read_layer,
-)
+from bevviz.config import BUILTIN_METHODS, TUTORIAL_NAMES, Config, Layer, Preset, flatten, plugins, read_layer
 from bevviz.config.files import read_toml
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.pillars import is_network_file

@@ -28,14 +28,7 @@ from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.recording.primitives import document
-from bevviz.recording.provenance import (
-    Provenance,
-    file_hash,
-    model_path,
-    names_path,
-    provenance,
-    versions,
-)
+from bevviz.recording.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
 from bevviz.recording.recorder import DiskWatch, Recorder
 from bevviz.recording.sinks import open_recording
 from bevviz.recording.source_lookup import Origin
