@@ -1,33 +1,39 @@
-"""Metrics of a drive: objects by class and range, average precision, tracks, detections, ground."""
+"""Metrics of a drive, and their tables: objects by class and range, average precision, tracks, ground."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.evaluate.average_precision import AveragePrecision, scored_objects
+from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, AveragePrecision, scored_objects
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
 from bevviz.evaluate.metrics import base_of, ranges
-from bevviz.evaluate.tracking_score import TrackScore
+from bevviz.evaluate.tracking_score import HINT, TrackScore
 from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Objects
 from bevviz.stages.voxel import spread_to_points
+from bevviz.support import table
+from bevviz.support.text import printable
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-EXAMPLES = 10  # number of unusable labels in the JSON
+UNUSABLE = 10  # number of unusable labels in the JSON
+WORST = 10  # number of frames in the table
+EXAMPLES = 3  # number of objects shown for each of them
 # Numbers of SemanticKITTI's classes (Behley et al. 2019), stored in the field ``label`` of a cloud.
 GROUND_LABELS = (40, 44, 48, 49, 60, 72)  # road, parking, pavement, other ground, marking, terrain
 OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
 UNLABELLED = (0, 1)
+
+Row = tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,9 +215,7 @@ class Evaluation(Observer[FrameResult]):
 
     def table(self) -> str:
         """Return the evaluation for the terminal."""
-        from bevviz.evaluate.tables import text
-
-        return text(self)
+        return "\n".join(map(printable, _lines(self, table.lines)))
 
     def as_tree(self) -> dict[str, Any]:
         """Return every metric, and the frames with errors, worst first, for JSON."""
@@ -219,7 +223,7 @@ class Evaluation(Observer[FrameResult]):
             "frames": len(self.judged),
             "frames_without_truth": self.without,
             "unusable_labels": len(self.unusable),
-            "unusable_examples": self.unusable[:EXAMPLES],
+            "unusable_examples": self.unusable[:UNUSABLE],
             "metrics": {name: _plain(value) for name, value in self.metrics.items()},
             "worst": self.worst,
         }
@@ -291,3 +295,105 @@ def _distance(boxes: Boxes3D, row: int) -> float:
 def _no_objects() -> Objects:
     none = np.zeros(0, np.int32)
     return Objects(Boxes3D.empty(), (), np.zeros(0, np.float32), none, (), none)
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def page(evaluation: Evaluation) -> str:
+    """Return the tables in Markdown."""
+    return "\n".join(_lines(evaluation, lambda rows: [table.markdown(rows)], "- "))
+
+
+def _lines(
+    evaluation: Evaluation, laid_out: Callable[[list[Row]], Iterable[str]], bullet: str = "  "
+) -> Iterator[str]:
+    totals = evaluation.counts()
+    without = f", {evaluation.without} without truth left out" if evaluation.without else ""
+    labels = totals["true"] + totals["missed"]
+    yield f"{len(evaluation.judged)} frames{without}; {labels} objects had to be found"
+    if evaluation.unusable:
+        count = "1 label is" if len(evaluation.unusable) == 1 else f"{len(evaluation.unusable)} labels are"
+        yield f"{count} left out, the first: {evaluation.unusable[0]}"
+    for rows in tables(evaluation):
+        yield ""
+        yield from laid_out(rows)
+    if any(labels <= RECALL_POINTS for labels in evaluation.labels.values()):
+        few = f"of {RECALL_POINTS} labels or fewer"
+        yield f"({few} an average precision is (labels - 1) / {RECALL_POINTS} at best, by KITTI's rule)"
+    if "hota" in evaluation.metrics and "mota" not in evaluation.metrics:
+        yield f"({HINT})"
+    worst = evaluation.worst
+    yield ""
+    if not worst:
+        yield "nothing missed, nothing false"
+        return
+    yield f"{len(worst)} of {len(evaluation.judged)} frames have something missed or false; the worst:"
+    for frame in worst[:WORST]:
+        wrong = [f"{kind} {what}" for kind in ("missed", "false") for what in frame[kind]]
+        more = "; ..." if wrong[EXAMPLES:] else ""
+        counts = ", ".join(f"{len(frame[k])} {k}" for k in ("missed", "false") if frame[k])
+        yield f"{bullet}frame {frame['frame']}: {counts} ({'; '.join(wrong[:EXAMPLES])}{more})"
+
+
+def tables(evaluation: Evaluation) -> Iterator[list[Row]]:
+    """Yield the rows of each table, headings first. Tables without metrics are left out."""
+    heads: Row = ("objects", "there", "found", "missed", "false", "precision", "recall", "error m", "90 % m")
+    yield [
+        heads,
+        *(_row(evaluation, name or "all", f".{name}" if name else "") for name in (*evaluation.classes, "")),
+    ]
+    by_range = (_row(evaluation, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
+    yield [("range", *heads[1:7]), *by_range]
+    metrics = evaluation.metrics
+    if labels := evaluation.labels:
+        columns = [f"ap_{view}_{overlap}" for view in VIEWS for overlap in OVERLAPS]
+        rows = [
+            (n.replace(".", ", "), str(labels[n]), *(_number(metrics, f"{c}.{n}") for c in columns))
+            for n in sorted(labels, key=_by_difficulty)
+        ]
+        yield [("average precision", "labels", *(f"{v.upper()} {o}" for v in VIEWS for o in OVERLAPS)), *rows]
+    tracked = ("hota", "deta", "assa", "mota", "motp_m", "idf1", "id_switches")
+    if "hota" in metrics:
+        heads = ("tracks", "HOTA", "DetA", "AssA", "MOTA", "MOTP m", "IDF1", "id switches")
+        yield [heads, *_by_class(metrics, tracked)]
+    detected = ("detection_precision", "detection_recall")
+    if "detection_recall" in metrics:
+        yield [("image boxes, IoU 0.5", "precision", "recall"), *_by_class(metrics, detected)]
+    if "ground_iou" in metrics:
+        ground = ("ground_precision", "ground_recall", "ground_iou", "object_points_kept")
+        heads = ("points", "precision", "recall", "IoU", "object points kept")
+        yield [heads, ("ground", *(_number(metrics, name) for name in ground))]
+
+
+def _row(evaluation: Evaluation, title: str, tail: str) -> Row:
+    cls, _, range_name = tail.removeprefix(".").partition("@")
+    low, _, high = range_name.partition("-")
+    counts = evaluation.counts(cls, float(low or 0), float(high or "inf"))
+    numbers = (counts["true"] + counts["missed"], counts["true"], counts["missed"], counts["false"])
+    rates = (
+        _number(evaluation.metrics, f"{n}{tail}") for n in ("precision", "recall", "error_m", "error_90_m")
+    )
+    return (title, *map(str, numbers), *rates)
+
+
+def _by_class(metrics: Mapping[str, float], names: tuple[str, ...]) -> Iterator[Row]:
+    """Yield a row for each class that has the first metric. The row of all classes comes last."""
+    classes = [name.partition(".")[2] for name in metrics if name.partition(".")[0] == names[0]]
+    for cls in sorted(classes, key=lambda cls: (not cls, cls)):
+        yield (cls or "all", *(_number(metrics, f"{name}.{cls}" if cls else name) for name in names))
+
+
+def _by_difficulty(name: str) -> tuple[str, int]:
+    order = ("easy", "moderate", "hard")
+    cls, _, difficulty = name.partition(".")
+    return cls, order.index(difficulty) if difficulty in order else -1
+
+
+def _number(metrics: Mapping[str, float], name: str) -> str:
+    value = metrics.get(name, math.nan)
+    if math.isnan(value):
+        return "-"
+    base = base_of(name)
+    digits = 0 if base in ("id_switches", "fragmentations") else 2 if (base or "").endswith("_m") else 3
+    return f"{value:.{digits}f}"

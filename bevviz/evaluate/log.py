@@ -8,9 +8,8 @@ from typing import TypeAlias
 import numpy as np
 import rerun as rr
 
-from bevviz.evaluate.evaluation import Evaluation
+from bevviz.evaluate.evaluation import Evaluation, page
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.evaluate.tables import page
 from bevviz.model.colors import TRUTH_COLORS
 from bevviz.model.frame import Boxes3D
 from bevviz.model.protocols import Items, Observer
