@@ -27,7 +27,7 @@ REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_snap")
 # The longest files, so that no worker is left alone with one at the end; a browser not beside a robot.
 FIRST = (
     *("test_workbench", "test_calib", "test_example_notebooks", "test_torture_benchmark"),
-    *("test_workbench_native", "test_damaged_bags", "test_live_ros", "test_live"),
+    *("test_damaged_bags", "test_live_ros", "test_live"),
 )
 
 

@@ -502,8 +502,8 @@ def test_only_clients_with_the_token_are_admitted(address: str) -> None:
     assert answered(address) == 200
     assert answered(f"{site}/") == 403
     assert answered(f"{site}/?token=wrong") == 403
-    assert answered(f"{site}/page/bench.js?token={token}") == 200
-    assert answered(f"{site}/page/bench.js") == 403
+    assert answered(f"{site}/page/panel.js?token={token}") == 200
+    assert answered(f"{site}/page/panel.js") == 403
     assert answered(f"{site}/page/..%2fserver.py?token={token}") == 404
     assert answered(f"{site}/config.yaml?token={token}&set=clustering.eps=0.7") == 200
     assert answered(f"{site}/config.yaml?token={token}&set=clustering.eps=-1") == 400

@@ -29,7 +29,8 @@ EXAMPLES = """examples:
   bevviz open drive.mcap --model yolo11n.onnx           a page: click what you see, and it answers
   bevviz open drive.mcap --model yolo11n.onnx --at 12.5 that scan first
   bevviz open demo.rrd                                  a recording without a bag, shown as it is
-  bevviz open drive.mcap --port 8400 --no-browser       over ssh -L 8400:127.0.0.1:8400"""
+  bevviz open drive.mcap --port 8400 --no-browser       over ssh -L 8400:127.0.0.1:8400
+  bevviz bag drive.mcap --viewer                        Rerun's own viewer (or --connect URL), no questions"""
 
 
 def add(commands: Commands) -> None:
@@ -53,12 +54,6 @@ def add(commands: Commands) -> None:
     page.add_argument(
         "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
     )
-    page.add_argument(
-        "--viewer", action="store_true", help="Rerun's viewer in a window, the page is the panel alone"
-    )
-    page.add_argument(
-        "--connect", metavar="URL", help="the same with a viewer that runs: rerun+http://127.0.0.1:9876/proxy"
-    )
     command.set_defaults(run=_open, shows_recordings=True)
 
 
@@ -71,7 +66,7 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    config, native_viewer = load_config(options), _wants_native_viewer(options)
+    config = load_config(options)
     with ExitStack() as stack:
         from bevviz.bags.source import BagSource
 
@@ -83,14 +78,6 @@ def _open(options: argparse.Namespace) -> int:
         def make() -> WorkbenchSession:
             _arrow_without_pandas()
             print_hints(source.scene, config)
-            bench = make_session()
-            if native_viewer:
-                from bevviz.workbench.native_viewer import NativeViewer
-
-                bench.native = NativeViewer((bench.film, bench.desk), bench.recording_id, options.connect)
-            return bench
-
-        def make_session() -> WorkbenchSession:
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
             from bevviz.workbench.session import WorkbenchSession
@@ -114,7 +101,7 @@ def _open(options: argparse.Namespace) -> int:
 
         with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
             drive = "\n".join(str(path.resolve()) for path in options.paths)
-            serve(make, drive, options.port, ready, "native" if native_viewer else "page")
+            serve(make, drive, options.port, ready)
     return 0
 
 
@@ -132,21 +119,6 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
         announce_viewer(address)
         wait_for_interrupt()
     return 0
-
-
-def _wants_native_viewer(options: argparse.Namespace) -> bool:
-    """Return whether Rerun's viewer is shown next to the page.
-
-    Raises:
-        UserError: the viewer cannot be shown or reached.
-    """
-    if options.connect is not None:
-        from bevviz.recording.sinks import check_viewer
-
-        check_viewer(options.connect)
-    elif options.viewer and not has_display():
-        raise UserError("--viewer: no display; without it the page has a viewer of its own")
-    return options.viewer or options.connect is not None
 
 
 def _arrow_without_pandas() -> None:

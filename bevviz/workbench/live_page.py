@@ -123,7 +123,7 @@ class LiveSite(Site):
     async def page(self, request: Request) -> Response:
         """Return the HTML page with the script of the robot's panel."""
         response = await super().page(request)
-        script = b'<script type="module" src="/page/live.js"></script>\n</body>'
+        script = b'<script type="module" src="/page/robot.js"></script>\n</body>'
         response.body = bytes(response.body).replace(b"</body>", script)
         response.headers["Content-Length"] = str(len(response.body))
         return response

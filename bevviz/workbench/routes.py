@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Container
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -25,21 +25,10 @@ from bevviz.workbench.startup import SessionStartup
 if TYPE_CHECKING:
     from bevviz.workbench.session import WorkbenchSession
 
-Kind = Literal["page", "native", "live"]  # viewer in the page, native viewer, page of a running robot
+Kind = Literal["page", "live"]  # page of a drive, page of a running robot
 
 PAGE = Path(__file__).parent / "page"
-FILES = (
-    "bench.css",
-    "bench.js",
-    "list.js",
-    "live.js",
-    "native.js",
-    "rest.js",
-    "state.js",
-    "talk.js",
-    "viewer.js",
-    "work.js",
-)
+FILES = frozenset(path.name for path in PAGE.iterdir() if path.suffix in (".js", ".css"))
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
 KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 POLICY = (
@@ -77,7 +66,6 @@ def site_routes(site: Site) -> list[BaseRoute]:
         Route("/report/{number:int}/{name}", site.report),
         WebSocketRoute("/film", site.recording),
         WebSocketRoute("/talk", site.talk),
-        WebSocketRoute("/native", site.native),
     ]
 
 
@@ -199,14 +187,6 @@ class Site:
     def _visit(self, workbench: WorkbenchSession, socket: WebSocket) -> PageConnection:
         return PageConnection(workbench, socket, self._desk, self._run)
 
-    async def native(self, socket: WebSocket) -> None:
-        """Connect the page with the native viewer beside it."""
-        workbench = await self._startup.session()
-        if workbench is None or workbench.native is None:
-            await socket.close()
-            return
-        await workbench.native.talk(socket)
-
 
 class PageState:
     """State of a page, from its messages on one socket.
@@ -253,7 +233,7 @@ class _File(FileResponse):
     chunk_size = 4 * 2**20  # The viewer has 64 MB, and each chunk waits for a busy interpreter.
 
 
-def _file(folder: Path, names: tuple[str, ...], name: str, cache: str) -> Response:
+def _file(folder: Path, names: Container[str], name: str, cache: str) -> Response:
     if name not in names:
         return PlainTextResponse("there is no such file\n", 404)
     kind = KINDS[Path(name).suffix]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -44,9 +44,6 @@ from bevviz.workbench.reports import ReportMaker, folder_of
 from bevviz.workbench.trials import TrialRunner, trial_effects, tried_logger
 from bevviz.workbench.truth_frames import TruthOf
 
-if TYPE_CHECKING:
-    from bevviz.workbench.native_viewer import NativeViewer
-
 KEPT = 6  # results of recently viewed frames that are kept
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
@@ -75,7 +72,6 @@ class WorkbenchSession(Closable):
         film: buffer with the recording of the whole drive.
         desk: buffer with answers and tried results, shown together with ``film``.
         recording_id: recording id of both buffers.
-        native: the native viewer beside the page, if there is one.
         entries: the findings, grouped over frames.
         trials: runs over the drive with other values.
         reports: bug reports, saved beside the bag.
@@ -114,7 +110,6 @@ class WorkbenchSession(Closable):
         self._last_questioner: FrameExplainer | None = None
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
-        self.native: NativeViewer | None = None
         self.recording_id = f"bench-{time.time_ns()}"
         self._main, self._main_stream = self.stream()
         self._desk, self._desk_stream = self.stream()
@@ -153,8 +148,6 @@ class WorkbenchSession(Closable):
         self.reports.end()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
-        if self.native is not None:
-            self.native.close()
         for stream in (self._main_stream, self._desk_stream, self.trials.film):
             stream.read()  # Rerun warns about a binary stream with unread data.
         self.film.close()

@@ -1,13 +1,13 @@
 // Rerun's viewer, as its notebook widget. The widget wraps the viewer of its version; this page acts as the notebook.
 
-import { nextPicture, wake } from "./rest.js";
-import { $, asked, state } from "./state.js";
+import { nextPicture, wake } from "./idle_drawing.js";
+import { $, asked, state } from "./page_state.js";
 
 console.debug = () => {}; // The viewer logs 50,000 lines at its start, which takes seconds.
 const version = $("viewer").dataset.version;
-export const kind = $("viewer").dataset.kind; // page, native (a window of its own) or live (of a robot)
-if (kind !== "native") keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
-const widget = (await import(kind === "native" ? "/page/native.js" : `/viewer/${version}/widget.js`)).default;
+export const kind = $("viewer").dataset.kind; // page (of a drive) or live (of a robot)
+keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
+const widget = (await import(`/viewer/${version}/widget.js`)).default;
 
 // Results of the run and results with other values are on two timelines of the same recording.
 const OPENED = "stamp";
@@ -102,7 +102,6 @@ function viewerEvent(event) {
 function moved(event) {
   if (event.type === "timeline_change") current = event.timeline;
   const there = Number(target) === event.time && (current ?? timeline()) === timeline();
-  if (there && kind === "native") target = null; // The page does not see its time slider.
   if (target !== null && !there && event.type === "time_update") { // a late event about the previous time
     if (tries > 0) move(target);
     tries -= 1;

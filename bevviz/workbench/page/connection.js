@@ -1,7 +1,7 @@
 // Connection to the server: send questions, receive answers and recordings, reconnect.
 
-import { nextPicture } from "./rest.js";
-import { $, state } from "./state.js";
+import { nextPicture } from "./idle_drawing.js";
+import { $, state } from "./page_state.js";
 import { kind, toViewer, viewerReady } from "./viewer.js";
 
 const RETRY = 1500; // ms between attempts to reach the server
@@ -50,7 +50,7 @@ export function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
-      if (kind !== "native") viewerReady.then(() => { lanes = [film("film")]; });
+      viewerReady.then(() => { lanes = [film("film")]; });
     } else if (message.type === "failed") gone(message.text);
     else handlers[message.type]?.(message);
   };
@@ -59,7 +59,7 @@ export function connect() {
     if (!$("gone").textContent) gone("The server is gone: nothing is answered until it is back. Looking for it ...");
     setTimeout(async () => {
       try {
-        const answer = await fetch("/page/bench.js", { method: "HEAD", cache: "no-store" });
+        const answer = await fetch("/page/panel.js", { method: "HEAD", cache: "no-store" });
         if (answer.status === 403) gone("Another server is there now: open the address that it printed.");
       } catch { /* The server is still gone. */ }
       connect();

@@ -1,10 +1,10 @@
 // The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
-import * as list from "./list.js";
-import { $, asked, element, remember, state, stated } from "./state.js";
-import { connect, newest, on, send, want } from "./talk.js";
+import * as list from "./findings.js";
+import { $, asked, element, remember, state, stated } from "./page_state.js";
+import { connect, newest, on, send, want } from "./connection.js";
 import { drawnThen, isTried, kind, seek, showSide, tell } from "./viewer.js";
-import * as work from "./work.js";
+import * as work from "./jobs.js";
 
 let controls = [];
 let opened = []; // controls of the configuration that the drive was opened with

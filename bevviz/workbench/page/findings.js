@@ -1,6 +1,6 @@
 // Ranked list of findings: missed and false objects, differences, anomalies and notes.
 
-import { $, element, remember, seconds, state } from "./state.js";
+import { $, element, remember, seconds, state } from "./page_state.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most

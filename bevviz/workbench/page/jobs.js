@@ -1,8 +1,8 @@
 // Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
-import { $, element, seconds, state } from "./state.js";
+import { $, element, seconds, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
-import { send } from "./talk.js";
+import { send } from "./connection.js";
 
 let trial = null; // the newest trial, from the server
 
