@@ -14,14 +14,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.calib import AXES, Axis, AxisFinding, Calibration, calibrate, gather
+from bevviz.calib import AXES, Axis, AxisFinding, Calibration
 from bevviz.calib.offsets import SCALES, TIME
-from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
-from tests.support.miscalibrated_drives import EVERY, Drive, stated_wrongly
+from bevviz.model.frame import F64
+from tests.support.miscalibrated_drives import EVERY, Drive, Kitti
 
 BEGIN, END = "<!-- benchmarks.calib: begin -->", "<!-- benchmarks.calib: end -->"
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -48,54 +47,6 @@ class Case:
         """Whether a finding relies on an interval that does not hold the truth."""
         relied = self.result.axes[row].finding in (AxisFinding.OFF, AxisFinding.FINE)
         return relied and not self.held(row)
-
-
-# --- frames ------------------------------------------------------------------------------------
-
-
-class Kitti:
-    """Real frames, whose own calibration is taken for the truth. Nothing tells how the car moved."""
-
-    def __init__(self, folder: Path, numbers: Iterable[int]) -> None:
-        self.frames = [_read(folder, number) for number in numbers]
-
-    def calibrate(self, offsets: F64, chosen: Sequence[int] | None = None) -> Calibration:
-        frames = self.frames if chosen is None else [self.frames[i] for i in chosen]
-        return calibrate(gather(stated_wrongly(frames, offsets), ["image_2"], _nowhere)["image_2"])
-
-
-def _nowhere(frame: Frame, stamp: int) -> None:
-    return None
-
-
-def _read(folder: Path, number: int) -> Frame:
-    calibration = folder / "calib" / f"{number:06}.txt"
-    lines = (calibration if calibration.exists() else folder / "calib.txt").read_text().splitlines()
-    rows = {
-        name: np.array(values.split(), np.float64)
-        for name, values in (line.split(":") for line in lines if line)
-    }
-    projection = rows["P2"].reshape(3, 4)
-    beside, rectified, reference = np.eye(4), np.eye(4), np.eye(4)
-    beside[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
-    rectified[:3, :3] = rows["R0_rect"].reshape(3, 3)
-    reference[:3] = rows["Tr_velo_to_cam"].reshape(3, 4)
-    bgr = cv2.imread(str(folder / "image_2" / f"{number:06}.png"))
-    assert bgr is not None
-    points = np.fromfile(folder / "velodyne" / f"{number:06}.bin", np.float32).reshape(-1, 4)
-    xyz = np.ascontiguousarray(points[:, :3])
-    camera = Camera(
-        "image_2",
-        Image(0, "image_2", np.asarray(bgr, np.uint8)),
-        Intrinsics(bgr.shape[1], bgr.shape[0], projection[:, :3]),
-        beside @ rectified @ reference,
-        None,
-    )
-    cloud = Cloud(0, "velodyne", xyz, {"intensity": points[:, 3]})
-    return Frame(
-        number, 0, 0, "velodyne", xyz, "velodyne",
-        clouds=(cloud,), points_from_clouds=(np.eye(4),), cameras=(camera,),
-    )  # fmt: skip
 
 
 # --- what is planted ---------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrin
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
 from tests.support import bags, documented_json
-from tests.support.miscalibrated_drives import Drive, stated_wrongly
+from tests.support.miscalibrated_drives import Drive, Kitti, stated_wrongly
 from tests.support.recordings import Recording, verify
 
 pytestmark = pytest.mark.usefixtures("elsewhere")

@@ -1,7 +1,7 @@
 """Readers of cloud files: BIN, NPY, PCD and PLY.
 
-The library pypcd4 reads PCD files. Open3D crashes on those with padding between the fields, as PCL writes, fills
-cut PLY files with uninitialised memory and drops integer properties. The library plyfile is under the
+The library pypcd4 reads PCD files. Open3D crashes on those with padding between the fields, as PCL writes,
+fills cut PLY files with uninitialised memory and drops integer properties. The library plyfile is under the
 GPL. The format of PLY is Turk's (The PLY Polygon File Format, 1994).
 """
 
