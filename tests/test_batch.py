@@ -28,8 +28,17 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.fleet.batch import intact_results, lock_folder, unfinished_jobs
-from bevviz.fleet.jobs import PARTIAL, Job, find_bags, make_jobs, name_bags, tables
+from bevviz.fleet.jobs import (
+    PARTIAL,
+    Job,
+    find_bags,
+    intact_results,
+    lock_folder,
+    make_jobs,
+    name_bags,
+    tables,
+    unfinished_jobs,
+)
 from bevviz.fleet.table import SEVERITIES, row, severity
 from bevviz.fleet.work import run
 from bevviz.model.results import DetectionState

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
-from bevviz.fleet.page import BagTotals, page
+from bevviz.fleet.summary import BagTotals, page
 from bevviz.fleet.table import RunInfo
 from bevviz.model.frame import Scene
 from bevviz.report.pictures import plot

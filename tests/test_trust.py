@@ -344,7 +344,7 @@ def test_workers_find_no_python_of_the_folder(received: Path) -> None:
     program = (
         f"import sys; sys.path[:] = {path!r}\n"
         "if __name__ == '__main__':\n"
-        "    from bevviz.fleet.engine.local import Processes\n"
+        "    from bevviz.fleet.processes import Processes\n"
         "    workers = Processes(1)\n"
         "    workers._idle[0].process.join(3)\n"
         "    workers.close()\n"

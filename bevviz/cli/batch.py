@@ -29,8 +29,9 @@ from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.evaluate.metrics import Limit
-    from bevviz.fleet.engine.task import Engine, JobResults
-    from bevviz.fleet.jobs import Job
+    from bevviz.fleet.cluster import Cluster
+    from bevviz.fleet.jobs import Job, JobResults
+    from bevviz.fleet.processes import Processes
     from bevviz.fleet.table import RunInfo
 
 
@@ -92,7 +93,7 @@ def add(commands: Commands) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from bevviz.fleet.batch import intact_results, lock_folder
+    from bevviz.fleet.jobs import intact_results, lock_folder
 
     limits = _limits(options)
     if options.catalog and options.serve_catalog:
@@ -144,7 +145,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
         options: of the command.
         failed: filled with the name and the error of each failed bag.
     """
-    from bevviz.fleet.batch import unfinished_jobs
+    from bevviz.fleet.jobs import unfinished_jobs
 
     todo = unfinished_jobs(jobs, options.force, _warn)
     if len(todo) < len(jobs):
@@ -185,23 +186,20 @@ def _warn(text: str) -> None:
 def _execute(
     todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
 ) -> JobResults:
-    from bevviz.fleet.work import BagTask
-
     if not todo:
         return
     with ExitStack() as stack:
-        engine: Engine
+        engine: Cluster | Processes
         if options.dask:
-            from bevviz.fleet.engine.dask import Cluster
+            from bevviz.fleet.cluster import Cluster
 
             engine = stack.enter_context(Cluster(options.dask))
         else:
-            from bevviz.fleet.engine.local import Processes
+            from bevviz.fleet.processes import Processes
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
             engine = stack.enter_context(Processes(min(workers, len(todo))))
-        tasks = map(BagTask, todo)
-        yield from stack.enter_context(closing(engine.run(tasks, options.retries, on_frame, tick)))
+        yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
 
 
 def _sum_up(

@@ -1,27 +1,33 @@
-"""Jobs of a batch: their bags, their names, and the key that shows whether a result is up to date."""
+"""Jobs of a batch: their bags and names, their folder, and whether a result is complete and intact."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import re
+import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar, cast
 
 from bevviz.bags.bag import METADATA
 from bevviz.bags.source import FrameSelection
 from bevviz.config import Config, with_object_files
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
-from bevviz.fleet.table import RunInfo, read_info
+from bevviz.fleet.table import NAME, RunInfo, find_damage, read_info
 from bevviz.recording.provenance import dependencies_of, file_hash, model_path
+from bevviz.support import cleanup, progress
 from bevviz.support.files import bag_files, sampled_files
 from bevviz.support.text import path_text
+
+T = TypeVar("T")
 
 PARTIAL = ".bevviz-partial"  # folder of unfinished results
 
@@ -72,6 +78,11 @@ class Job:
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
+    def identity(self) -> str:
+        """Name that is unique everywhere. Two jobs share it only if they make the same result."""
+        return f"{self.folder}-{self.name}-{self.key}"
+
+    @property
     def recording_id(self) -> str:
         """Recording ID with the job's name and key. A viewer merges recordings with the same ID."""
         return f"{self.name}-{self.key[:8]}"
@@ -82,6 +93,19 @@ class Job:
         if info is None or info.key != self.key or not self.recording.is_file():
             return None
         return info
+
+
+@dataclass(frozen=True, slots=True)
+class JobResult:
+    """Outcome of a job. ``error`` is empty if its results are complete."""
+
+    name: str
+    frames: int = 0
+    seconds: float = 0.0
+    error: str = ""
+
+
+JobResults: TypeAlias = Generator[JobResult, None, None]
 
 
 def make_jobs(
@@ -174,7 +198,7 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
         owners: bag -> name of its existing results.
     """
     names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
-    taken = {"summary", *owners.values()}
+    taken = {NAME, *owners.values()}
     unnamed = [bag for bag in bags if bag not in names]
     deepest = max((len(bag.parts) for bag in unnamed), default=0)
     for depth in range(1, deepest + 1):
@@ -192,6 +216,104 @@ def _name(bag: Path, depth: int) -> str:
     stem = bag.name if bag.is_dir() else re.sub(r"(\.(mcap|db3|bag|active|zstd|zst))+$", "", bag.name)
     parts = [*bag.parts[-depth:-1], stem]
     return re.sub(r"[^\w.-]+", "_", "-".join(parts), flags=re.ASCII).strip("._") or "bag"
+
+
+# --- results ----------------------------------------------------------------------------------
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock the folder for one batch. Delete the unfinished files of an interrupted batch before and after.
+
+    Raises:
+        UserError: the folder cannot be made, or another batch works in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise UserError(f"-o {folder}: {error.strerror}") from None
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"-o {folder}: another batch is running in it") from None
+        except OSError:
+            pass  # Some network file systems cannot lock folders.
+        remove = partial(shutil.rmtree, folder / PARTIAL, ignore_errors=True)
+        remove()
+        cleanup.register(folder, remove)
+        try:
+            yield
+        finally:
+            remove()
+            cleanup.unregister(folder)
+    finally:
+        os.close(handle)
+
+
+def unfinished_jobs(
+    jobs: Sequence[Job], force: bool, warn: Callable[[str], None] = lambda _: None
+) -> list[Job]:
+    """Return the jobs without a complete, up-to-date result. The largest bags come first.
+
+    The order keeps a worker from running a large bag alone at the end. The table of a damaged result is
+    deleted, so that the result counts as missing.
+
+    Args:
+        jobs: all jobs of the batch.
+        force: return all jobs.
+        warn: gets one line for each damaged result.
+    """
+    for job in jobs:
+        if force:
+            job.table.unlink(missing_ok=True)
+    _delete_damaged([job for job in jobs if job.table.exists()], warn)
+    return sorted((job for job in jobs if not job.complete()), key=lambda job: -job.size)
+
+
+def intact_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
+    """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
+    results: list[tuple[Path, RunInfo]] = []
+    unchecked = 0
+    for table in _with_bar([path for path in sorted(folder.glob("*.parquet")) if path.stem != NAME]):
+        info = read_info(table)
+        if damage := find_damage(table, table.with_suffix(".rrd")):
+            warn(f"{table.stem}: {damage}; it is left out until its bag is run again")
+        elif info is not None:
+            results.append((table, info))
+            unchecked += not info.recording_sha256
+    if unchecked:
+        warn(f"{unchecked} tables of an older version hold no checksum: their recordings are not checked")
+    return results
+
+
+def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
+    """Delete the tables of damaged results, and those of an older version, which hold no checksum.
+
+    Args:
+        jobs: that have a table.
+        warn: gets a line for each damaged result, and one for all tables of an older version.
+    """
+    older = 0
+    for job in _with_bar(jobs):
+        info = read_info(job.table)
+        if info is not None and info.key != job.key:
+            continue  # It is out of date anyway.
+        if damage := find_damage(job.table, job.recording):
+            warn(f"{job.name}: {damage}; its bag is run again")
+        elif info is not None and info.recording_sha256:
+            continue
+        else:
+            older += 1
+        job.table.unlink()
+    if older:
+        warn(f"{older} tables of an older version hold no checksum of a recording; their bags are run again")
+
+
+def _with_bar(results: Iterable[T]) -> Iterable[T]:
+    """Show a bar, as recordings are read from end to end."""
+    return cast(Iterable[T], progress.bar(results, desc="check", unit="bag", delay=1, leave=False))
 
 
 # --- content -----------------------------------------------------------------------------------

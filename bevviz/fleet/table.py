@@ -28,6 +28,8 @@ STAGES = (
     "total",
 )
 
+NAME = "summary"  # of the table and the page of all bags
+
 FAILURE, PROBLEM, ANOMALY, WRONG = 10.0, 3.0, 0.5, 1.0
 UNMATCHED = {
     "no_cluster": 2.0,

@@ -1,4 +1,4 @@
-"""Engine on a Dask cluster that shares the file system with this machine."""
+"""Jobs on a Dask cluster that shares the file system with this machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bevviz.errors import UserError, first_line
-from bevviz.fleet.engine.task import JobResult, JobResults, Task
+from bevviz.fleet.jobs import Job, JobResult, JobResults
+from bevviz.fleet.work import run
 from bevviz.recording.ports import is_listening
 from bevviz.support.contexts import Closable
 
@@ -53,15 +54,15 @@ class Cluster(Closable):
 
     def run(
         self,
-        jobs: Iterable[Task],
+        jobs: Iterable[Job],
         retries: int,
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """Run tasks as ``Engine.run`` does. The frames of a job are reported when it has ended."""
+        """Run jobs as ``Processes.run`` does. The frames of a job are reported when it has ended."""
         from distributed import wait
 
-        pending, running = iter(jobs), dict[Any, Task]()
+        pending, running = iter(jobs), dict[Any, Job]()
 
         def submit(count: int) -> None:
             # The scheduler runs a key once, even if two clients submit it.
@@ -89,7 +90,7 @@ class Cluster(Closable):
             self._client.cancel(list(running))
 
 
-def _result(job: Task, future: Any) -> JobResult:
+def _result(job: Job, future: Any) -> JobResult:
     if future.status == "finished":
         result: JobResult = future.result()
         return result
@@ -99,8 +100,8 @@ def _result(job: Task, future: Any) -> JobResult:
     return JobResult(job.name, error=f"{type(error).__name__}: {error}" if error else "cancelled")
 
 
-def _work(job: Task) -> JobResult:
+def _work(job: Job) -> JobResult:
     """Run a job on the worker."""
     from distributed import get_worker
 
-    return job.run(get_worker().state.nthreads, lambda: None)
+    return run(job, get_worker().state.nthreads)

@@ -1,4 +1,4 @@
-"""Engine of worker processes on this machine. A worker that dies costs no other job; its own is run again."""
+"""Jobs in worker processes on this machine. A worker that dies costs no other job; its own is run again."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import os
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
-from bevviz.fleet.engine.task import JobResult, JobResults, Task
+import cv2
+
+from bevviz.fleet.jobs import Job, JobResult, JobResults
+from bevviz.fleet.work import run
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
 
@@ -21,7 +24,7 @@ from bevviz.support.contexts import Closable
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 TICK = 0.2  # seconds
-SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
+_FRAME = "frame"  # message of a worker after each frame
 
 
 @dataclass
@@ -30,7 +33,7 @@ class _Worker:
 
     process: SpawnProcess
     pipe: Connection
-    job: Task | None = None
+    job: Job | None = None
 
 
 class Processes(Closable):
@@ -58,21 +61,26 @@ class Processes(Closable):
 
     def run(
         self,
-        jobs: Iterable[Task],
+        jobs: Iterable[Job],
         retries: int,
         on_frame: Callable[[], None],
         tick: Callable[[], None] = lambda: None,
     ) -> JobResults:
-        """Run tasks as ``Engine.run`` does. A job whose process died is run again, too.
+        """Run each job once and yield its outcome as soon as it ends. Busy workers are ended at the end.
 
-        ``tick`` is called at least every ``TICK`` seconds. Busy workers are ended at the end.
+        Args:
+            jobs: the jobs, in order. Each is taken when a worker is free, or nearly so.
+            retries: how often a job is run again if its process died, or its input is not the cause of the
+                failure.
+            on_frame: called for each frame of any job.
+            tick: called at least every ``TICK`` seconds. An exception in it ends the run.
         """
         pending = iter(jobs)
-        to_retry: deque[Task] = deque()
+        to_retry: deque[Job] = deque()
         attempts: Counter[str] = Counter()
         busy: list[_Worker] = []
 
-        def next_job() -> Task | None:
+        def next_job() -> Job | None:
             return to_retry.popleft() if to_retry else next(pending, None)
 
         try:
@@ -115,19 +123,22 @@ class Processes(Closable):
         context = get_context("spawn")  # A fork would copy threads of Rerun and onnxruntime amid their work.
         ours, theirs = context.Pipe()
         arguments = (theirs, self._threads, speaks)
+        # A worker looks for Python's own modules first, not for files of the working directory. OpenBLAS and
+        # Open3D read the number of threads when they are loaded.
+        variables = {"PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": str(self._threads)}
         process = context.Process(target=_work, args=arguments, name="bevviz batch", daemon=True)
         # The worker inherits the signal mask: the batch alone handles signals of the terminal and ends its
         # workers. The batch must not be interrupted between the start of a worker and its storage.
         previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
-            with _safe_path():
+            with _environment(variables):
                 process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
         theirs.close()  # Without this, the pipe would not report the end of the process.
         return _Worker(process, ours)
 
-    def _assign(self, worker: _Worker, job: Task) -> _Worker:
+    def _assign(self, worker: _Worker, job: Job) -> _Worker:
         """Send a job to a worker. If its process has ended, send it to a new one."""
         if worker.process.exitcode is None:
             try:
@@ -143,23 +154,21 @@ class Processes(Closable):
 
 
 @contextmanager
-def _safe_path() -> Iterator[None]:
-    """Let a new process look for Python's own modules first, not for files of the working directory."""
-    previous = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that start meanwhile."""
+    previous = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if previous is None:
-            del os.environ[SAFE_PATH]
-        else:
-            os.environ[SAFE_PATH] = previous
+        for name, value in previous.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
-_FRAME = "frame"
-
-
-def _judge(process: SpawnProcess, job: Task, message: JobResult | str | None) -> tuple[bool, JobResult]:
+def _judge(process: SpawnProcess, job: Job, message: JobResult | str | None) -> tuple[bool, JobResult]:
     """Return whether to try a job again, and how it ended."""
     if isinstance(message, JobResult):
         return False, message
@@ -186,17 +195,14 @@ def _work(pipe: Connection, threads: int, speaks: bool) -> None:
         (lambda text: print(f"bevviz: {text}", file=sys.stderr)) if speaks else None, bars=False
     )
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    os.environ["OMP_NUM_THREADS"] = str(threads)  # Open3D reads it when it is loaded.
-    import cv2
-
     cv2.setNumThreads(threads)
     while True:
         try:
-            job: Task = pipe.recv()
+            job: Job = pipe.recv()
         except EOFError:
             return
         try:
-            result: JobResult | str = job.run(threads, lambda: pipe.send(_FRAME))
+            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME))
         except BrokenPipeError:
             return  # The batch has ended.
         except Exception as error:
