@@ -229,7 +229,7 @@ def run(session: Session, frame: Frame, found: Detections) -> FrameResult:
     detect = session.stages.detect
     assert isinstance(detect, Shown)
     detect.detections = found
-    return session.watch(session.perceive(frame))
+    return session.add_anomalies(session.perceive(frame))
 
 
 def _delay(

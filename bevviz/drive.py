@@ -112,7 +112,7 @@ class Drive(Closable):
         number = self._number(time, frame)
         key = number, id(self.config)
         if key not in self._results:
-            self._results[key] = self.session.alone(self.raw(number))
+            self._results[key] = self.session.run_single(self.raw(number))
             while len(self._results) > MAX_RESULTS:
                 self._results.popitem(last=False)
         self._results.move_to_end(key)
@@ -202,7 +202,7 @@ class Drive(Closable):
         if viewer.config == self.config:
             return viewer.selected(self.at(frame=viewer.clicked))
         session = Session(viewer.config, loader=self.session.loader)
-        return viewer.selected(session.alone(self.raw(viewer.clicked)))
+        return viewer.selected(session.run_single(self.raw(viewer.clicked)))
 
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> FrameExplainer:
         """Return an object that answers questions about one scan. It computes shared results once.

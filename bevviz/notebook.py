@@ -144,9 +144,9 @@ class NotebookViewer(Recorder):
         self.viewer.on_event(self._on_event)
         self.viewer.display()
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Log a frame and store its times and tracks."""
-        super().see(result)
+        super().observe(result)
         self._frames.add(result)
         if result.tracks is not None:
             no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)

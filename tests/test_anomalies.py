@@ -92,7 +92,7 @@ class Drive:
         result = replace(result, tracks=tracks, **changes)
         result = replace(result, anomalies=self._detector.update(result, self.config))
         self.said += [(self._index, a.kind, a.text) for a in self._onsets.of(result.anomalies)]
-        self.summary.see(result)
+        self.summary.observe(result)
         return result.anomalies
 
     def person(self, frames: int, **more: Any) -> None:

@@ -185,7 +185,7 @@ def test_a_perfect_result_is_perfect(drive: Path) -> None:
             boxes = in_points_frame(result.frame, truth)
             none = np.full(len(boxes), -1, np.int32)
             objects = Objects(boxes, truth.labels, truth.scores, none, ("",) * len(boxes), none)
-            evaluation.see(replace(result, objects=objects))
+            evaluation.observe(replace(result, objects=objects))
     assert evaluation.metrics["recall"] == evaluation.metrics["precision"] == 1
     assert evaluation.metrics["error_90_m"] == pytest.approx(0, abs=1e-4)
     assert evaluation.worst == []

@@ -183,11 +183,11 @@ def test_a_track_has_its_most_frequent_class(tmp_path: Path) -> None:
     """A detector may begin with another name; an instance of nuScenes has one for all of its annotations."""
 
     class Beginning(NuScenesExport):
-        def see(self, result: FrameResult) -> None:
+        def observe(self, result: FrameResult) -> None:
             objects = result.objects
             if self.frames == 0 and objects is not None:
                 result = replace(result, objects=replace(objects, names=("bus",) * len(objects)))
-            super().see(result)
+            super().observe(result)
 
     bevviz.simulate(6).run([Beginning(tmp_path / "scenes")])
     tables = {name: json.loads((tmp_path / f"scenes/{VERSION}/{name}.json").read_text()) for name in TABLES}

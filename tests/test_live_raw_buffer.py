@@ -132,7 +132,7 @@ class Digests(Observer[FrameResult]):
         self.by_stamp: dict[int, Any] = {}
         self.results: list[FrameResult] = []
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         self.by_stamp[result.frame.stamp] = digest(result)
         self.results.append(result)
 

@@ -56,15 +56,15 @@ def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0
 
 def test_boxes_may_arrive_before_or_after_the_result(first: Frame) -> None:
     against = AgainstRobot("", CONFIG.live)
-    (with_it,) = against.see(result(first, 0, robot=10.1))
+    (with_it,) = against.compare(result(first, 0, robot=10.1))
     assert [d.change for d in with_it.found.objects] == [Change.SAME] and against.topic == TOPIC
-    assert against.see(result(first, 1)) == []
+    assert against.compare(result(first, 1)) == []
     early = result(first, 3)  # the robot has said so before our result is there
     late = [(result(first, 1).frame.stamp, theirs(first, 11.0)), (early.frame.stamp, theirs(first, 10.4))]
-    (after,) = against.see(result(first, 2), late)
+    (after,) = against.compare(result(first, 2), late)
     assert after.found.index == 1 and after.found.objects[0].change is Change.MOVED
     assert after.found.objects[0].distance == pytest.approx(1.0, abs=1e-4)
-    (before,) = against.see(early)
+    (before,) = against.compare(early)
     assert before.found.index == 3 and (against.frames, against.differing) == (
         3,
         1,
@@ -81,16 +81,16 @@ def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
 def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
     against = AgainstRobot("", CONFIG.live)
     camera = first.cameras[0].name
-    assert against.see(result(first, 0)) == []
+    assert against.compare(result(first, 0)) == []
     old = result(first, 0).frame
-    assert against.see(result(first, 1), [(old.stamp, detections(old, camera))]) == []
-    (after,) = against.see(result(first, 2), [(old.stamp, theirs(old, 10.0))])
+    assert against.compare(result(first, 1), [(old.stamp, detections(old, camera))]) == []
+    (after,) = against.compare(result(first, 2), [(old.stamp, theirs(old, 10.0))])
     assert after.found.index == 0 and after.found.b.images[camera].names == ("car",)
     assert against.late_images == 0
-    (direct,) = against.see(result(first, 3, robot=10.0))
+    (direct,) = against.compare(result(first, 3, robot=10.0))
     assert direct.found.b.images == {}
     known = result(first, 3).frame
-    against.see(result(first, 4), [(known.stamp, detections(known, camera))])
+    against.compare(result(first, 4), [(known.stamp, detections(known, camera))])
     assert against.late_images == 1
 
 
@@ -98,7 +98,7 @@ def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
     against = AgainstRobot("", CONFIG.live)
     reasons = []
     for index in range(12):
-        against.see(result(first, index, robot=10.0 if index in (0, 7) else 11.0))
+        against.compare(result(first, index, robot=10.0 if index in (0, 7) else 11.0))
         reasons.append(against.reason())
     assert [bool(reason) for reason in reasons] == [index in (4, 11) for index in range(12)]
     assert reasons[4] is not None and reasons[4].startswith(
@@ -111,28 +111,28 @@ def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
     both = result(first, 0)
     frame = both.frame
     both = replace(both, frame=replace(frame, robot_boxes=(theirs(frame, 1, "/a"), theirs(frame, 1, "/b"))))
-    assert against.see(both) == [] and "which of its topics" in against.problem
+    assert against.compare(both) == [] and "which of its topics" in against.problem
     for index in range(1, 3 * WAITING):
-        against.see(result(first, index), [(index, theirs(first, 1, "/a"))])
+        against.compare(result(first, index), [(index, theirs(first, 1, "/a"))])
     assert len(against._waiting) == WAITING and len(against._late) <= WAITING
 
 
 def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None:
     """Nothing was found and nothing was looked for are two things: a failed stage is no difference."""
     against = AgainstRobot("", CONFIG.live)
-    (before,) = against.see(result(first, 0, robot=11.0))
+    (before,) = against.compare(result(first, 0, robot=11.0))
     assert before.found.counts[Change.MOVED] == 1
     for index in range(1, 9):
         failed = replace(result(first, index, robot=11.0), objects=None)
-        assert against.see(failed) == []
+        assert against.compare(failed) == []
         assert against.reason() is None
     assert (against.frames, against.differing, against.without_ours) == (1, 1, 8)
-    assert against.see(result(first, 9)) == []
+    assert against.compare(result(first, 9)) == []
     late = [(result(first, 9).frame.stamp, theirs(first, 10.0))]
-    (after,) = against.see(replace(result(first, 10), objects=None), late)
+    (after,) = against.compare(replace(result(first, 10), objects=None), late)
     assert after.found.index == 9 and after.found.counts == {Change.SAME: 1}
     nobody = Objects(
         Boxes3D.empty(), (), np.zeros(0, np.float32), np.zeros(0, np.int32), (), np.zeros(0, np.int32)
     )
-    (nothing,) = against.see(replace(result(first, 11, robot=10.0), objects=nobody))
+    (nothing,) = against.compare(replace(result(first, 11, robot=10.0), objects=nobody))
     assert nothing.found.counts == {Change.ONLY_B: 1}

@@ -178,7 +178,7 @@ def fly(folder: Path) -> Flight:
 
             def on_result(result: FrameResult) -> None:
                 frames.append(result.frame)
-                diagnostics.see(result)
+                diagnostics.observe(result)
 
             live = Live(
                 source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot=""

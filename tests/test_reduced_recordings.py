@@ -52,9 +52,9 @@ def test_raw_clouds_are_kept_around_anomalies(
     for i, stamp in enumerate(stamps):
         for_reason = sum(one % every != 0 for one in found)
         given = RawCloudFrame((i, stamp, 0), ())
-        more = kept.see(given, config, strange=i in strange, wanted=i in asked_for)
+        more = kept.select(given, config, is_event=i in strange, is_requested=i in asked_for)
         found += [one.clock[0] for one in more]
-        assert kept.held <= around + 1
+        assert kept.buffered <= around + 1
         if i in asked_for or (i in strange and (not for_reason or for_reason < share * (i + 1))):
             at.append(stamp)
         elif i in strange:

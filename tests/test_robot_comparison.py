@@ -57,7 +57,7 @@ KNOWN = ("car", "person", "cyclist", "truck", "bicycle")
 def ours() -> FrameResult:
     """Return the result of our fusion for a frame of the synthetic drive."""
     frame = SyntheticSource(frames=12).snapshot(8).frame
-    return Session(load(settings=["detector.model=demo"])).alone(frame)
+    return Session(load(settings=["detector.model=demo"])).run_single(frame)
 
 
 def held(
@@ -298,7 +298,7 @@ def test_the_frame_step_keeps_both() -> None:
     scores = np.ones(len(boxes), np.float32)
     stated = LabelledBoxes3D("/objects", frame.stamp, frame.points_frame, boxes, names, scores, frame.pose)
     theirs = load(settings=["detector.model=demo", "objects.method=topic:/objects"])
-    result = Session(theirs).alone(replace(frame, robot_boxes=(stated,)))
+    result = Session(theirs).run_single(replace(frame, robot_boxes=(stated,)))
     assert result.failures == () and result.opinions is not None and result.ranges is not None
     assert words(result.opinions) == ["confirmed"] * (len(fused) - 1) + ["contradicted"]
     assert result.opinions.fused.names == fused.names
@@ -308,12 +308,12 @@ def test_the_frame_step_keeps_both() -> None:
     assert result.timings["opinions"] > 0
     labelled = replace(stated, topic="/ground_truth")  # a data set's own topic, as bevviz has it
     of_people = load(settings=["detector.model=demo", "objects.method=topic:/ground_truth"])
-    again = Session(of_people).alone(replace(frame, truth=labelled))
+    again = Session(of_people).run_single(replace(frame, truth=labelled))
     assert again.opinions is not None and words(again.opinions) == words(result.opinions)
-    silent = Session(theirs).alone(frame)  # it has published nothing at this time
+    silent = Session(theirs).run_single(frame)  # it has published nothing at this time
     assert [failure.stage for failure in silent.failures] == ["objects"] and silent.opinions is None
     no_model = load(settings=["objects.method=topic:/objects"])
-    assert Session(no_model).alone(replace(frame, robot_boxes=(stated,))).opinions is None
+    assert Session(no_model).run_single(replace(frame, robot_boxes=(stated,))).opinions is None
 
 
 def test_the_names_of_networks_meet_those_of_detectors() -> None:
@@ -334,7 +334,7 @@ def kitti(shared: Path) -> Drive:
     config = load(settings=[f"detector.model={shared / 'models/yolox_nano.onnx'}"])
     session = Session(config)
     with BagSource([shared / "kitti"], config) as source:
-        results = [session.alone(frame) for frame in source]
+        results = [session.run_single(frame) for frame in source]
     files = label_files(shared / "kitti/label_2")
     return list(zip(results, map(read_labels, files), strict=True))
 

@@ -64,10 +64,10 @@ class Squares:
 
 
 class Seen(Observer[int]):
-    def __init__(self, *, fails_at: int = -1, pause: float = 0.0, beside: int | None = None) -> None:
+    def __init__(self, *, fails_at: int = -1, pause: float = 0.0, queue_size: int | None = None) -> None:
         self.seen: list[int] = []
         self.threads: set[int] = set()
-        self.beside, self.name = beside, "seen"
+        self.queue_size, self.name = queue_size, "seen"
         self.begun = self.ended = 0
         self._fails_at, self._pause = fails_at, pause
 
@@ -75,7 +75,7 @@ class Seen(Observer[int]):
         assert items.scene.name == "numbers"
         self.begun += 1
 
-    def see(self, result: int) -> None:
+    def observe(self, result: int) -> None:
         time.sleep(self._pause)
         self.threads.add(threading.get_ident())
         if len(self.seen) == self._fails_at:
@@ -143,11 +143,11 @@ def test_an_error_of_the_work_comes_in_its_turn() -> None:
 
 def test_a_signal_during_work_ends_the_run_after_it() -> None:
     class Interrupting(Seen):
-        def see(self, result: int) -> None:
+        def observe(self, result: int) -> None:
             if len(self.seen) == 3:
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.5)  # seen by the thread that waits, in the midst of this
-            super().see(result)
+            super().observe(result)
 
     seen = Interrupting()
     end = run(Numbers(10_000), Squares(), [seen])
@@ -214,8 +214,8 @@ def test_a_run_can_be_stopped() -> None:
     stop = threading.Event()
 
     class Stopping(Seen):
-        def see(self, result: int) -> None:
-            super().see(result)
+        def observe(self, result: int) -> None:
+            super().observe(result)
             stop.set()
 
     numbers = Numbers(10_000)
@@ -229,7 +229,7 @@ def test_the_collector_is_left_as_it_was() -> None:
     inside: list[Any] = []
 
     class Looking(Seen):
-        def see(self, result: int) -> None:
+        def observe(self, result: int) -> None:
             inside.append(gc.get_threshold())
 
     run(Numbers(2), Squares(), [Looking()])
@@ -251,7 +251,7 @@ def test_slow_work_takes_the_newest() -> None:
 
 
 def test_a_slow_background_observer_delays_nobody() -> None:
-    dropping, fast, slow = DropPolicy(), Seen(), Seen(pause=0.1, beside=2)
+    dropping, fast, slow = DropPolicy(), Seen(), Seen(pause=0.1, queue_size=2)
     run(Numbers(30, pause=0.01), Squares(), [slow, fast], dropping=dropping)
     assert len(fast.seen) == 30
     assert slow.seen == sorted(slow.seen)
@@ -262,7 +262,7 @@ def test_a_slow_background_observer_delays_nobody() -> None:
 
 def test_an_error_of_a_background_observer_ends_the_run() -> None:
     with pytest.raises(RuntimeError, match="full"):
-        run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, beside=1)], dropping=DropPolicy())
+        run(Numbers(10_000, pause=0.01), Squares(), [Seen(fails_at=2, queue_size=1)], dropping=DropPolicy())
 
 
 @pytest.mark.parametrize("dropping", [None, DropPolicy()], ids=["waited for", "dropping"])

@@ -290,7 +290,7 @@ def test_a_track_is_its_cluster_or_its_expected_place() -> None:
     with pytest.raises(UserError, match="there is no track 9999 in this frame; there are "):
         questioner.ask(Selection(track=9999))
     with pytest.raises(UserError, match="tracks are known in a run over the drive only"):
-        FrameExplainer(session.alone(source.frame(6))).ask(Selection(track=1))
+        FrameExplainer(session.run_single(source.frame(6))).ask(Selection(track=1))
 
 
 def test_a_row_number_selects_that_row_of_the_result() -> None:

@@ -708,7 +708,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         bench = WorkbenchSession(drive, again.frames, [bag])
-        bench.see(drive.at(frame=0))
+        bench.observe(drive.at(frame=0))
         told = bench.attempt(0, ("clustering.min_cluster_points=100000",))
         recoloured = bench.attempt(0, ("ground.distance_threshold=0.5",))
         bench.attempt(0, ("detector.conf_threshold=0.9",))
@@ -751,7 +751,7 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
             middle = (stamps[3] + stamps[4]) // 2
             assert bench.number_at(middle) == 3
             assert bench.number_at(stamps[-1] + 10**9) == FRAMES - 1
-            bench.see(drive.at(frame=ran))
+            bench.observe(drive.at(frame=ran))
         bench.close()
 
 
@@ -780,7 +780,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
         bench = WorkbenchSession(drive, again.frames, [bag], first=3)
         bench._show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):
-            bench.see(result)
+            bench.observe(result)
         first, *others = [bench.film[row] for row in range(len(bench.film))]
         bench.close()
     assert left([first, others[0]], results[3].frame.stamp) == [True]

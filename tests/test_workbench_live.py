@@ -295,7 +295,7 @@ def test_the_objects_method_is_changed_there_and_back(
     assert bench.live.config.objects.method == "topic:/nobody"
     told = bench.attempt(0, ())
     assert not told["changes"] and not told["opinions"] and not any(told["effects"].values())
-    again = bench.live.session.alone(results[0].frame)
+    again = bench.live.session.run_single(results[0].frame)
     assert again.opinions is None and again.objects is not None and results[0].objects is not None
     assert again.objects.names == results[0].objects.names
 

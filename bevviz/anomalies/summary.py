@@ -30,7 +30,7 @@ class AnomalySummary(Observer[FrameResult]):
         self._count: Counter[str] = Counter()
         self._first: dict[str, int] = {}
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Count the anomalies that begin in this frame."""
         self._start = result.frame.stamp if self._start is None else self._start
         for anomaly in self._onsets.of(result.anomalies):
@@ -54,7 +54,7 @@ class FailureSummary(Observer[FrameResult]):
         self._count: Counter[str] = Counter()
         self._first: dict[str, str] = {}
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Count the failures of this frame."""
         self._frames += 1
         for failure in result.failures:

@@ -225,7 +225,7 @@ def _watch_robot(
             if publisher is not None:
                 publisher.publish(result)
             if diagnostics is not None:
-                diagnostics.see(result)
+                diagnostics.observe(result)
 
         def follow(live: Live, orders: Orders = orders) -> Callable[[Config], None]:
             control.save = orders.save = live.save

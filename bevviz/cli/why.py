@@ -124,7 +124,7 @@ def _why(options: argparse.Namespace) -> int:
             option = f"--at {options.at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{option}: the scan there cannot be read")
         outputs = Outputs.of(options)
-        result = session.run(frame) if outputs else session.explained(frame)
+        result = session.run(frame) if outputs else session.run_explained(frame)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
         answers = questioner.explain(selection, options.limit, bar, everything=options.all)

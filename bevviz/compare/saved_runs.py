@@ -206,7 +206,7 @@ class SavedPairRecorder(Observer[SavedFrames]):
             log_over_shared_image(writer_b, camera)
         self._differences = DifferenceLogger(recording, pair.summary.names, pair.summary.about)
 
-    def see(self, frames: SavedFrames) -> None:
+    def observe(self, frames: SavedFrames) -> None:
         """Log the differences of a frame."""
         posed = frames.a if frames.a.fused else frames.b
         self._differences.log(frames.found, frames.a.received, posed.world_from_points)

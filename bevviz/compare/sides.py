@@ -41,11 +41,11 @@ class SideFailures(Observer[ComparedFrame]):
     def __init__(self) -> None:
         self._sides = {"A": FailureSummary(), "B": FailureSummary()}
 
-    def see(self, result: ComparedFrame) -> None:
+    def observe(self, result: ComparedFrame) -> None:
         """Collect the failures of a frame."""
         for side, frame_result in (("A", result.a), ("B", result.b)):
             if frame_result is not None:
-                self._sides[side].see(frame_result)
+                self._sides[side].observe(frame_result)
 
     @property
     def warnings(self) -> list[str]:
@@ -135,7 +135,7 @@ class ComparisonRecorder(Observer[ComparedFrame]):
             logger.log_static()
         self._differences = DifferenceLogger(self._recording, self._summary.names, self._summary.about)
 
-    def see(self, compared: ComparedFrame) -> None:
+    def observe(self, compared: ComparedFrame) -> None:
         """Log both sides and their differences for a frame."""
         for logger, result in zip(self._loggers, (compared.a, compared.b), strict=True):
             if result is not None:

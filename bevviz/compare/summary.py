@@ -66,7 +66,7 @@ class ComparisonSummary(Observer[FrameComparison]):
         """Differences of the configurations, in Markdown."""
         return fenced("\n".join(parameters(self.config)))
 
-    def see(self, compared: FrameComparison) -> None:
+    def observe(self, compared: FrameComparison) -> None:
         """Count a frame, or note that a side has no result."""
         if compared.found is None:
             self.without += 1

@@ -76,7 +76,7 @@ class Evaluation(Observer[FrameResult]):
         self._errors: dict[str, list[float]] = defaultdict(list)
         self._metrics: dict[str, float] | None = None
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Compare a frame with its ground truth."""
         truth = self._truth(result.frame)
         self._metrics, self.last = None, None

@@ -45,7 +45,7 @@ class EvaluationRecorder(Observer[FrameResult]):
             series = rr.SeriesLines(colors=[color], names=[outcome], widths=[2])
             self._writer.static(entities.judged_count(outcome), series)
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Log the evaluation of a frame."""
         if self._evaluation.last is None:
             return

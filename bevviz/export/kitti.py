@@ -38,7 +38,7 @@ class KittiExport(FolderExport):
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
         return "velodyne", "image_2", "calib", "label_2"
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Write a frame, or count why it is skipped."""
         frame = result.frame
         camera = next((c for c in frame.cameras if self._camera in ("", c.name)), None)

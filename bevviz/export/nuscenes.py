@@ -88,7 +88,7 @@ class NuScenesExport(FolderExport):
             channel += "_"
         return self._channels.setdefault(camera, channel)
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Write a frame as a sample, or count why it is skipped."""
         frame = result.frame
         if not frame.lidar:

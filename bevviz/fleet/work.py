@@ -141,7 +141,7 @@ class _RowCollector(Observer[FrameResult]):
         self._on_frame, self._evaluation = on_frame, evaluation
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         values = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             judgement = self._evaluation.now

@@ -44,7 +44,7 @@ class Diagnostics:
         # A steady clock. The node's clock stands still while a simulation is paused.
         self._node.create_timer(PERIOD, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Store the newest result. Any thread may call it."""
         self._result, self._at = result, time.monotonic()
 

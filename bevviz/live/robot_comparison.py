@@ -87,7 +87,7 @@ class AgainstRobot:
         """Names of the two sides."""
         return "bevviz", f"the robot's {self.topic or self._asked or 'fused boxes'}"
 
-    def see(
+    def compare(
         self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes2D | LabelledBoxes3D]] = ()
     ) -> list[Compared]:
         """Take in a frame.

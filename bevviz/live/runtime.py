@@ -329,7 +329,7 @@ class Live:
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
         boxes = [(late_result.frame_stamp, late_result.boxes) for late_result in late]
-        compared = self.against.see(result, boxes) if self.against is not None else ()
+        compared = self.against.compare(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
         self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
         for watcher in self._watchers:
@@ -494,13 +494,13 @@ class LiveRecorder(Observer[FrameResult]):
 
     def __init__(self, live: Live) -> None:
         self._live = live
-        self.beside = live.config.live.log_queue
+        self.queue_size = live.config.live.log_queue
 
     def begin(self, items: Items[object]) -> None:
         """Warm up before the first frame."""
         self._live.warm_up()
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Log a result."""
         self._live.log(result)
 
@@ -509,13 +509,13 @@ class Publishing(Observer[FrameResult]):
     """Observer that publishes results to the robot, in its own thread."""
 
     name = "publishing"
-    beside = 1
+    queue_size = 1
 
     def __init__(self, publish: Callable[[FrameResult], None], notes: Notes) -> None:
         self._publish, self._notes = publish, notes
         self._failed = False
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Publish a result. Warn once if that fails."""
         try:
             self._publish(result)
@@ -537,4 +537,4 @@ class Observing(Session):
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add the anomalies of the drive, without running the later stages."""
-        return self.watch(result)
+        return self.add_anomalies(result)

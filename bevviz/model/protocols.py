@@ -94,17 +94,17 @@ class Observer(Generic[R_contra]):
 
     Attributes:
         name: label under which the run counts dropped results.
-        beside: number of results that may wait for this observer in a thread of its own. The newest win.
+        queue_size: number of results that may wait for this observer in a thread of its own. The newest win.
             None: the run waits for the observer.
     """
 
     name = ""
-    beside: int | None = None
+    queue_size: int | None = None
 
     def begin(self, items: Items[object]) -> None:
         """Prepare before the first result."""
 
-    def see(self, result: R_contra) -> None:
+    def observe(self, result: R_contra) -> None:
         """Take one result. The next one comes only after this call returns."""
 
     def end(self) -> None:

@@ -26,7 +26,7 @@ class Progress(Observer[object]):
         description = self._what or printable(items.scene.name)
         self._bar = progress.bar(total=items.total, unit=self._unit, desc=description)
 
-    def see(self, result: object) -> None:
+    def observe(self, result: object) -> None:
         """Count one result."""
         self._bar.update()
 

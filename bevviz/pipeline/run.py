@@ -186,8 +186,8 @@ class _Loop(Generic[T, R]):
                     if self._stop.is_set():
                         break
                     result = self._processor.finish(result)
-                    for see in observers:
-                        see(result)
+                    for observe in observers:
+                        observe(result)
                     self.frames += 1
         except BaseException as error:
             self.error = self.error or error
@@ -216,10 +216,10 @@ class _Loop(Generic[T, R]):
         """Begin an observer, yield the function that passes it a result, and end it."""
         observer.begin(self._items)
         try:
-            if observer.beside is None:
-                yield observer.see
+            if observer.queue_size is None:
+                yield observer.observe
             else:
-                with self._observing_in_thread(observer, observer.beside) as put:
+                with self._observing_in_thread(observer, observer.queue_size) as put:
                     yield put
         finally:
             observer.end()
@@ -234,7 +234,7 @@ class _Loop(Generic[T, R]):
         def work() -> None:
             try:
                 for result in queue:
-                    observer.see(result)
+                    observer.observe(result)
             except BaseException as error:
                 self.error = error
                 self._stop.set()

@@ -71,29 +71,29 @@ class Session:
         """Return the complete result of the next frame. The content of a frame never raises an error."""
         return self.finish(self.perceive(frame))
 
-    def alone(self, frame: Frame) -> FrameResult:
+    def run_single(self, frame: Frame) -> FrameResult:
         """Return the result of any single frame, without tracks and anomalies, which need earlier frames."""
         config, stages = self._in_force
         return add_explanations(perceive(frame, config, stages, self._memo))
 
-    def explained(self, frame: Frame) -> FrameResult:
+    def run_explained(self, frame: Frame) -> FrameResult:
         """Return the result of the next frame with explanations, without bird's-eye view and anomalies."""
         return add_explanations(self.perceive(frame), seen=False)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """Run the stages on the next frame, and update the tracks."""
         config, stages = self._in_force
-        return self.track(perceive(frame, config, stages, self._memo, network=network))
+        return self.add_tracks(perceive(frame, config, stages, self._memo, network=network))
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
-        return self.watch(add_explanations(result))
+        return self.add_anomalies(add_explanations(result))
 
-    def watch(self, result: FrameResult) -> FrameResult:
+    def add_anomalies(self, result: FrameResult) -> FrameResult:
         """Add the anomalies of the drive to the next result."""
         return replace(result, anomalies=self._anomalies.update(result, result.config.anomalies))
 
-    def track(self, result: FrameResult) -> FrameResult:
+    def add_tracks(self, result: FrameResult) -> FrameResult:
         """Add the tracks of the drive to the next result."""
         clusters, config = result.clusters, result.config.tracking
         if clusters is None or config.method == "none":

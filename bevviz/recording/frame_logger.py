@@ -228,7 +228,7 @@ class FrameLogger(Writer):
         notes: Sequence[tuple[str, str]] = (),
         late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
-        beside: Callable[[], object] | None = None,
+        log_more: Callable[[], object] | None = None,
         cloud: bool = False,
     ) -> None:
         """Log a frame. Entities that only the previous frame had are cleared.
@@ -239,7 +239,7 @@ class FrameLogger(Writer):
             notes: further lines of the log: level and text.
             late: results that the robot has published since and that belong to earlier frames.
             states: states of further lanes, by entity.
-            beside: function that logs additional data of the frame.
+            log_more: function that logs additional data of the frame.
             cloud: write the raw cloud, coloured as ground and obstacles, even without inputs.
         """
         frame = result.frame
@@ -249,8 +249,8 @@ class FrameLogger(Writer):
         self.begin(frame.index, frame.stamp, frame.received)
         self._log_stages(result, cloud)
         self._log_changes(result, health, notes, states)
-        if beside is not None:
-            beside()
+        if log_more is not None:
+            log_more()
         self.end()
 
     def _log_stages(self, result: FrameResult, cloud: bool) -> None:
@@ -405,8 +405,8 @@ class FrameLogger(Writer):
         is_user_event = bool(mark_lines(frame)) or self._config_changed
         self._watched_states, self._config_changed = watched, False
         clock, left_out = (frame.index, frame.stamp, frame.received), self._cloud_selector.left_out
-        selected = self._cloud_selector.see(
-            RawCloudFrame(clock, clouds), self._config.logging, strange=is_event, wanted=is_user_event
+        selected = self._cloud_selector.select(
+            RawCloudFrame(clock, clouds), self._config.logging, is_event=is_event, is_requested=is_user_event
         )
         if self._cloud_selector.left_out > left_out:
             text = f"logging.raw_share is reached; {self._cloud_selector.left_out} times so far"

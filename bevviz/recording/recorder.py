@@ -33,7 +33,7 @@ class Recorder(Observer[FrameResult]):
         )
         self.logger.log_static()
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Log a frame."""
         self.logger.log(result)
 
@@ -56,6 +56,6 @@ class DiskWatch(Observer[Any]):
     def __init__(self, sinks: OpenRecording) -> None:
         self._sinks = sinks
 
-    def see(self, result: object) -> None:
+    def observe(self, result: object) -> None:
         """Raise UserError if the recording can no longer be written."""
         self._sinks.check()

@@ -79,7 +79,7 @@ def sorted_rows(points: F32, scale: float, first: I64 | None = None) -> I64:
 
 @dataclass(frozen=True, slots=True)
 class RawCloudFrame:
-    """Raw clouds of a frame that may still be wanted."""
+    """Raw clouds of a frame that may still be selected."""
 
     clock: tuple[int, int, int]  # index, stamp and received
     clouds: Sequence[tuple[str, F32, NDArray[np.uint16]]]  # entity, points, class id of each point
@@ -104,20 +104,20 @@ class RawCloudSelector:
         self._count = self._kept_for_events = 0
 
     @property
-    def held(self) -> int:
+    def buffered(self) -> int:
         """Number of buffered frames."""
         return len(self._buffer)
 
-    def see(
-        self, frame: RawCloudFrame, config: LoggingConfig, *, strange: bool, wanted: bool = False
+    def select(
+        self, frame: RawCloudFrame, config: LoggingConfig, *, is_event: bool, is_requested: bool = False
     ) -> Sequence[RawCloudFrame]:
         """Return the frames whose clouds are logged now, oldest first.
 
         Args:
             frame: next frame.
             config: limits.
-            strange: whether an anomaly begins or a state changes in this frame.
-            wanted: whether a user caused an event in this frame: a mark or a new configuration.
+            is_event: whether an anomaly begins or a state changes in this frame.
+            is_requested: whether a user caused an event in this frame: a mark or a new configuration.
         """
         stamp, reach = frame.clock[1], round(config.raw_around * 1e9)
         if self._buffer and stamp < self._buffer[-1].clock[1]:
@@ -127,10 +127,10 @@ class RawCloudSelector:
         ]
         is_nth = self._count % config.raw_every == 0
         self._count += 1
-        if strange and not wanted:
-            strange = not self._kept_for_events or self._kept_for_events < config.raw_share * self._count
-            self.left_out += not strange
-        if strange or wanted:
+        if is_event and not is_requested:
+            is_event = not self._kept_for_events or self._kept_for_events < config.raw_share * self._count
+            self.left_out += not is_event
+        if is_event or is_requested:
             self._until = stamp + reach
             selected, self._buffer = [*self._buffer, frame], []
             self._kept_for_events += len(selected) - is_nth

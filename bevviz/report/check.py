@@ -169,7 +169,7 @@ class _Comparer(Observer[FrameResult]):
         self.complete = Event()
         self._interrupted, self._result = stored.info.interrupted, result
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         number = result.frame.index
         self._result.add(number, compare(self.remaining.pop(number, ()), digest(result)))
         if self._interrupted and not self.remaining:

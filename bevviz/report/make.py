@@ -225,7 +225,7 @@ class _ReportRecorder(Recorder):
         super().__init__(recording, config, network)
         self._summary, self._at, self._note, self._notes = summary, at, note, notes
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         received = result.frame.received
         lines = [f"note: {note}" for note in self._notes if note.received == received]
         if self._note and received == self._at:
@@ -284,7 +284,7 @@ class _Detections(Observer[DetectionsByImage]):
     def finish(self, detections: DetectionsByImage) -> DetectionsByImage:
         return detections
 
-    def see(self, detections: DetectionsByImage) -> None:
+    def observe(self, detections: DetectionsByImage) -> None:
         self.detections |= detections
 
 

@@ -176,7 +176,7 @@ class VersionRecorder(Observer[Version]):
         self._differences = DifferenceLogger(self._recording, ("version before", "this version"), ABOUT)
         self._logger.log_static()
 
-    def see(self, version: Version) -> None:
+    def observe(self, version: Version) -> None:
         """Log one version and its differences from the version before."""
         result, frame, save = version.result, version.result.frame, version.save
         if save.changes:

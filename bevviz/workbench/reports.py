@@ -159,7 +159,7 @@ class _ReportProgress(Observer[FrameResult]):
     def begin(self, items: Items[object]) -> None:
         self._report.total = items.total or 0
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         self._report.done += 1
         self._on_change()
 

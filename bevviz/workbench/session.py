@@ -193,7 +193,7 @@ class WorkbenchSession(Closable):
         """Let the run continue: a page shows the first frame."""
         self._go.set()
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
         findings = find_findings(result, self.truth(frame))
@@ -247,7 +247,7 @@ class WorkbenchSession(Closable):
         cloud: bool = False,
     ) -> None:
         layers: list[FindingRows] = []
-        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
+        logger.log(result, log_more=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
         self._layers[result.frame.index, tried] = layers[0]
 
     def draw_tried(self, logger: FrameLogger, result: FrameResult, findings: Sequence[Finding]) -> None:
@@ -487,8 +487,8 @@ class _RunObserver(Observer[FrameResult]):
     def begin(self, items: Items[object]) -> None:
         pass
 
-    def see(self, result: FrameResult) -> None:
-        self._workbench.see(result)
+    def observe(self, result: FrameResult) -> None:
+        self._workbench.observe(result)
 
     def end(self) -> None:
         self._workbench.end()

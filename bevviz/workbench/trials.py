@@ -159,7 +159,7 @@ class _TrialObserver(Observer[FrameResult]):
     def begin(self, items: Items[object]) -> None:
         pass
 
-    def see(self, result: FrameResult) -> None:
+    def observe(self, result: FrameResult) -> None:
         workbench, trial, frame = self._workbench, self._trial, result.frame
         before, truth = workbench.objects(frame.index), workbench.truth(frame)
         workbench.draw_tried(self._logger, result, find_findings(result, truth))

@@ -266,5 +266,5 @@ def measure(root: Path, cases: Mapping[str, Case], names: Iterable[str] | None =
     for shot in tqdm(list(shots(root, names)), unit="frame", disable=None):
         for name, case in cases.items():
             detect = oracle(shot, case.off) if case.by_labels else None
-            tallies[name].add(shot, Session(case.config, detect, loader=loader).alone(shot.frame))
+            tallies[name].add(shot, Session(case.config, detect, loader=loader).run_single(shot.frame))
     return tallies
