@@ -208,6 +208,9 @@ def _boxes(
 
 def why_unusable(row: Sequence[float]) -> str:
     """Return why centre, size and quaternion of a box cannot be used; empty if they can."""
+    is_finite = math.isfinite(sum(row)) and max(row) < LARGEST and min(row) > -LARGEST
+    if is_finite and min(row[3:6]) >= 0:  # a tenth of the time of the tests that find the reason
+        return ""
     for name, values in (("centre", row[:3]), ("size", row[3:6]), ("orientation", row[6:])):
         if not all(abs(value) < LARGEST for value in values):  # false for NaN, too
             return f"its {name} is not finite: {_numbers(values)}"

@@ -23,6 +23,7 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.annotations import point_classes
 from bevviz.stages.voxel import spread_to_points
+from bevviz.support.kernel import kernel
 
 ClassIds: TypeAlias = NDArray[np.unsignedinteger]
 
@@ -74,8 +75,8 @@ def class_ids(
         if name == "height":
             ids_by_quantity[name] = heights
         elif name == "distance":
-            distances = np.sqrt(np.einsum("ij,ij->i", points, points))
-            ids_by_quantity[name] = _scaled(distances, 0.0, entities.DEPTH_RANGE, _DISTANCE, _DEPTHS)
+            steps_per_metre = np.float32(_DEPTHS / entities.DEPTH_RANGE)
+            ids_by_quantity[name] = _distance_ids(points, steps_per_metre)
         elif (
             values := next((fields[field] for field in FIELD_NAMES[name] if field in fields), None)
         ) is None:
@@ -83,9 +84,11 @@ def class_ids(
         elif name == "intensity":
             ids_by_quantity[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
         elif name == "ring":
-            ids_by_quantity[name] = (values.astype(np.int64) % _RINGS + _RING).astype(np.uint16)
+            rings = values.astype(np.int64) if values.dtype.kind == "f" else values
+            ids_by_quantity[name] = rings.astype(np.uint16) % _RINGS + np.uint16(_RING)
         else:
-            finite = values[np.isfinite(values)]
+            is_finite = np.isfinite(values)
+            finite = values if is_finite.all() else values[is_finite]
             first, last = (finite.min(), finite.max()) if len(finite) else (0, 0)
             ids_by_quantity[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
     return ids_by_quantity
@@ -159,8 +162,38 @@ def _ramp(count: int) -> list[list[int]]:
 
 def _scaled(values: NDArray[Any], low: float, high: float, base: int, count: int) -> NDArray[np.uint8]:
     """Map values linearly to ``count`` class ids from ``base``. Large values and NaN get the last id."""
-    rows = (values - low) * np.float32(count / max(high - low, 1e-9))
+    factor = np.float32(count / max(high - low, 1e-9))
+    if values.dtype == np.float32:
+        return _scaled_ids(values, np.float32(low), factor, base, count)
+    rows = (values - low) * factor
     return (np.fmax(np.fmin(rows, np.float32(count - 1)), np.float32(0)) + np.float32(base)).astype(np.uint8)
+
+
+@kernel
+def _scaled_ids(values: F32, low: np.float32, factor: np.float32, base: int, count: int) -> NDArray[np.uint8]:
+    """Return ``_scaled`` of 32-bit values, in one pass."""
+    ids = np.empty(len(values), np.uint8)
+    first, last = np.float32(base), np.float32(count - 1)
+    for i in range(len(values)):
+        row = (values[i] - low) * factor
+        if not row < last:
+            row = last
+        ids[i] = np.uint8(max(row, np.float32(0)) + first)
+    return ids
+
+
+@kernel
+def _distance_ids(points: F32, steps_per_metre: np.float32) -> NDArray[np.uint8]:
+    """Return the class id of each point by its distance from the LiDAR."""
+    ids = np.empty(len(points), np.uint8)
+    first, last = np.float32(_DISTANCE), np.float32(_DEPTHS - 1)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        row = np.sqrt(x * x + y * y + z * z) * steps_per_metre
+        if not row < last:
+            row = last
+        ids[i] = np.uint8(row + first)
+    return ids
 
 
 def _brightest(values: NDArray[Any]) -> float:

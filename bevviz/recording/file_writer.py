@@ -16,7 +16,8 @@ from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
 from bevviz.support.files import write_all
 
-PIPE_BYTES = 1 << 20  # bytes
+PIPE_BYTES = 1 << 20
+BUFFER_BYTES = 4 << 20  # grows for longer messages
 HEADER_BYTES = 12  # bytes of a recording's header: magic, version, options
 MESSAGE_HEADER = struct.Struct("<QQ")  # kind and length of the message that follows
 
@@ -72,23 +73,24 @@ class FileWriter(Closable):
         self._handle = -1
 
     def _run(self) -> None:
-        buffer = bytearray()
-        message_end = HEADER_BYTES  # bytes up to the end of the last message seen so far
-        while piece := os.read(self._read_end, PIPE_BYTES):
-            buffer += piece
+        buffer = memoryview(bytearray(BUFFER_BYTES))
+        size, message_end = 0, HEADER_BYTES  # bytes in the buffer, and up to the end of its last known message
+        while count := os.readv(self._read_end, [buffer[size:]]):
+            size += count
             complete = 0
-            while len(buffer) >= message_end:
+            while size >= message_end:
                 complete = message_end
-                if len(buffer) < complete + MESSAGE_HEADER.size:
+                if size < complete + MESSAGE_HEADER.size:
                     break
                 _, length = MESSAGE_HEADER.unpack_from(buffer, complete)
                 message_end = complete + MESSAGE_HEADER.size + length
-            with memoryview(buffer) as view, view[:complete] as messages:
-                self._write(messages)
-            del buffer[:complete]
-            message_end -= complete
-        with memoryview(buffer) as view:
-            self._write(view)  # the footer is no message
+            self._write(buffer[:complete])
+            rest = bytes(buffer[complete:size])
+            size, message_end = len(rest), message_end - complete
+            if size + PIPE_BYTES > len(buffer):
+                buffer = memoryview(bytearray(2 * len(buffer)))
+            buffer[:size] = rest
+        self._write(buffer[:size])  # the footer is no message
 
     def _write(self, data: memoryview) -> None:
         """Write all of the data. After an error, cut the file back to its last whole write."""
