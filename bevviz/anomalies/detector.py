@@ -13,6 +13,7 @@ from typing import get_args
 import numpy as np
 
 from bevviz.anomalies.objects import ObjectWatch
+from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import AnomaliesConfig, AnomalyKind
 from bevviz.model import geometry
 from bevviz.model.frame import F32
@@ -34,6 +35,7 @@ class AnomalyDetector:
     def __init__(self) -> None:
         self._active: dict[tuple[str, str], tuple[Anomaly, int]] = {}  # with the stamp it last held at
         self._objects = ObjectWatch()
+        self._sensors = SensorWatch()
         self._alone: dict[str, list[tuple[F32, str, int]]] = {}  # camera -> box, class, frames
         self._placed: set[str] = set()  # sensors that had a transform
         self._imaged: set[str] = set()  # cameras that had an image
@@ -49,10 +51,11 @@ class AnomalyDetector:
             self._active.clear()
             self._alone.clear()
             self._objects.clear()
+            self._sensors.clear()
         self._stamp = stamp
         for anomaly in self._found(result, config):
             key = anomaly.kind, anomaly.subject
-            since = self._active[key][0].since if key in self._active else stamp
+            since = self._active[key][0].since if key in self._active else anomaly.since or stamp
             self._active[key] = replace(anomaly, since=since), stamp
         self._active = {
             key: (anomaly, last)
@@ -65,6 +68,7 @@ class AnomalyDetector:
         """Yield the anomalies of this frame from every rule."""
         if result.tracks is not None:
             yield from self._objects.update(result, result.tracks, config)
+        yield from self._sensors.update(result)
         yield from self._detections(result, config)
         yield from self._clocks(result, config)
         yield from self._transforms(result, config)

@@ -269,7 +269,7 @@ class TrackingConfig(Section):
     trail: Seconds = Field(3.0, ge=0, le=60, description="how far back the trails go")
 
 
-AnomalyKind = Literal["flicker", "jump", "one_sensor", "sync", "tf", "stage"]
+AnomalyKind = Literal["flicker", "jump", "one_sensor", "sensor", "sync", "tf", "stage"]
 
 
 class AnomaliesConfig(Section):

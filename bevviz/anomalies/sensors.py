@@ -1,0 +1,67 @@
+"""Faults of the sensors of a drive: each sensor is compared with its own recent past."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bevviz.anomalies.sensor_faults import ImageWatch, ScanWatch, SensorFault
+from bevviz.anomalies.turns import MountingWatch, ScanShape
+from bevviz.model.frame import Cloud, Frame
+from bevviz.model.results import Anomaly, FrameResult
+
+GAP = 1.0  # seconds between two frames, after which the past tells nothing
+
+
+class SensorWatch:
+    """Detector of faults of cameras, LiDARs and their mountings in consecutive frames."""
+
+    def __init__(self) -> None:
+        self._start: int | None = None
+        self._stamp = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all sensors, for a drive that starts again or has a gap."""
+        self._images: dict[str, ImageWatch] = {}
+        self._scans: dict[str, ScanWatch] = {}
+        self._mountings: dict[str, MountingWatch] = {}
+        self._shape: ScanShape | None = None
+
+    def update(self, result: FrameResult) -> Iterator[Anomaly]:
+        """Yield the faults of all sensors in this frame."""
+        frame = result.frame
+        if self._start is None or frame.stamp < self._stamp:
+            self._start = frame.stamp
+        if not 0 <= frame.stamp - self._stamp <= GAP * 1e9:
+            self.clear()
+        self._stamp = frame.stamp
+        for fault in self._faults(result):
+            name = f"{fault.sensor}: {fault.name}"
+            text = f"{name} since {1e-9 * (fault.since - self._start):.1f} s{fault.detail}"
+            yield Anomaly("sensor", name, text, "ERROR", fault.since, fault.rank)
+
+    def _faults(self, result: FrameResult) -> Iterator[SensorFault]:
+        """Yield the faults that each rule finds in this frame."""
+        frame = result.frame
+        for cloud in _clouds(frame):
+            yield from self._scans.setdefault(cloud.name, ScanWatch(f"LiDAR {cloud.name}")).update(cloud)
+        before, self._shape = self._shape, None
+        if frame.lidar and any(camera.image is not None for camera in frame.cameras):
+            self._shape = ScanShape.measure(result)
+        scene = None if before is None or self._shape is None else before.rotation_to(self._shape)
+        for camera in frame.cameras:
+            image, gray = camera.image, None
+            faults: tuple[SensorFault, ...] = ()
+            if image is not None:
+                watch = self._images.setdefault(camera.name, ImageWatch(f"camera {camera.name}"))
+                faults, gray = watch.update(image), watch.gray
+                yield from faults
+            mounting = self._mountings.setdefault(camera.name, MountingWatch(camera.name, frame.lidar))
+            yield from mounting.update(camera, gray, scene, frame.stamp, trusted=not faults)
+
+
+def _clouds(frame: Frame) -> tuple[Cloud, ...]:
+    """Return the clouds of the frame by sensor, or all points as one cloud where the source has no more."""
+    if frame.clouds or not frame.lidar:
+        return frame.clouds
+    return (Cloud(frame.stamp, frame.points_frame, frame.points, name=frame.lidar),)

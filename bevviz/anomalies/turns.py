@@ -1,0 +1,232 @@
+"""Faults of mountings: a camera or LiDAR that turned, and a transform between them that jumped.
+
+Camera and LiDAR see the same rotation of the robot. A rotation that only one of them sees, for one frame, is
+a sensor that was turned. The rotation of a camera comes from corners that are tracked from image to image
+(Shi and Tomasi 1994; Bouguet 2000). The rotation of a LiDAR comes from the mean range in each direction, and
+from the slope of the ground.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bevviz.anomalies.sensor_faults import SensorFault
+from bevviz.model.frame import F64, U8, Camera
+from bevviz.model.results import FrameResult
+
+BINS = 720  # directions in which the range is compared
+REACH = 16  # bins, largest rotation of a LiDAR from scan to scan
+UNLIKE = (
+    0.9  # ratio of the least to the usual difference of two scans, above which they show different places
+)
+FEWEST = 3  # points of a direction whose mean range is used
+GROUND = 20.0  # metres, farthest ground whose slope is measured
+LEAST_GROUND = 200  # points
+POINTS = 40_000  # most points of a scan that are used
+
+CORNERS, LEAST_CORNERS = 200, 40
+AGREE = 0.35  # least share of the corners that move together
+SPREAD = 0.1  # least spread of these corners, as a share of the image width: one object is not enough
+OUTLIER = 1.5  # pixels
+
+PAST = 10  # frames that a rotation is compared with
+LEAST_PAST = 3
+TURNED = 1.5  # degrees, least rotation that only one sensor sees
+STEADY = 0.6  # degrees, largest such rotation in the frames before and after it
+STEP, SHIFT = 0.5, 0.05  # degrees and metres, least jump of a transform
+JERK = 4.0  # ratio of a jump to the usual change of a camera that is moved on purpose
+LASTS = 30.0  # seconds for which it is told
+
+
+@dataclass(frozen=True, slots=True)
+class ScanShape:
+    """Shape of a scan, from which its rotation against the next scan is measured."""
+
+    ranges: F64  # (BINS,) mean logarithm of the range in each direction; NaN: too few points
+    slope: F64  # (2,) rise of the ground along x and along y; NaN: unknown
+
+    @staticmethod
+    def measure(result: FrameResult) -> ScanShape:
+        """Measure the scan of a frame."""
+        points = result.frame.points
+        xyz = points[:: -(-len(points) // POINTS) or 1]
+        distance = np.hypot(xyz[:, 0], xyz[:, 1])
+        elevation = xyz[:, 2] / np.maximum(distance, 1e-3)
+        # The upper half of the points lies on walls and objects, whose ranges change with the direction.
+        upper = (distance > 2) & (elevation > np.median(elevation)) if len(xyz) else np.zeros(0, np.bool_)
+        azimuth = np.arctan2(xyz[upper, 1], xyz[upper, 0])
+        bins = ((azimuth + np.pi) * BINS / (2 * np.pi)).astype(np.int64) % BINS
+        count = np.bincount(bins, minlength=BINS)
+        total = np.bincount(bins, np.log(distance[upper]), BINS)
+        ranges = np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
+        return ScanShape(ranges, _ground_slope(result))
+
+    def rotation_to(self, other: ScanShape) -> F64 | None:
+        """Return the (3,) rotation of the scene in degrees, about x, y and z of the points.
+
+        None: the two scans do not show the same place, or too few points were measured.
+        """
+        shifts = np.arange(-REACH, REACH + 1)
+        difference = np.stack([np.abs(np.roll(self.ranges, shift) - other.ranges) for shift in shifts])
+        if np.isfinite(difference).sum(axis=1).min() < BINS / 8:
+            return None
+        cost = np.nanmean(np.minimum(difference, 0.5), axis=1)
+        best = int(cost.argmin())
+        if cost[best] > UNLIKE * np.median(cost) or not 0 < best < 2 * REACH:
+            return None
+        before, here, after = cost[best - 1 : best + 2]
+        bend = before - 2 * here + after
+        fraction = 0.5 * (before - after) / bend if bend > 0 else 0.0
+        tilt = np.degrees(other.slope - self.slope)
+        # The ground rises along x where the scene turned about -y, and along y where it turned about x.
+        return np.array([tilt[1], -tilt[0], (shifts[best] + fraction) * 360 / BINS])
+
+
+def _ground_slope(result: FrameResult) -> F64:
+    """Return the (2,) slope of the near ground along x and y, NaN if it is not known."""
+    if result.ground is None or result.voxels is None:
+        return np.full(2, np.nan)
+    ground = result.voxels.points[result.ground.mask]
+    ground = ground[np.hypot(ground[:, 0], ground[:, 1]) < GROUND].astype(np.float64)
+    ground = ground[:: -(-len(ground) // POINTS) or 1]
+    if len(ground) < LEAST_GROUND:
+        return np.full(2, np.nan)
+    on_plane = np.ones(len(ground), np.bool_)
+    plane = np.zeros(3)
+    columns = np.column_stack([ground[:, :2], np.ones(len(ground))])
+    for _ in range(2):
+        kept = columns[on_plane]
+        plane = np.linalg.lstsq(kept.T @ kept, kept.T @ ground[on_plane, 2], rcond=None)[0]
+        error = np.abs(columns @ plane - ground[:, 2])
+        on_plane = error < 0.1 + 2 * np.median(error)
+    return plane[:2]
+
+
+def camera_rotation(before: U8, after: U8, camera: Camera) -> F64 | None:
+    """Return the (3,) rotation of the scene in degrees, about x, y and z of the camera.
+
+    Args:
+        before: previous image in grey.
+        after: newest image in grey, of the same size.
+        camera: the camera, for its focal length.
+
+    Returns:
+        None where too few corners move together: a dark image, or one large object in front of the camera.
+    """
+    if camera.image is None or camera.intrinsics is None or before.shape != after.shape:
+        return None
+    corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 6)
+    if corners is None or len(corners) < LEAST_CORNERS:
+        return None
+    moved, state, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)
+    tracked = state[:, 0] == 1
+    middle = np.array(before.shape[::-1], np.float32) / 2
+    start, end = corners[tracked, 0] - middle, moved[tracked, 0] - middle
+    if len(start) < LEAST_CORNERS:
+        return None
+    motion, inlier = cv2.estimateAffinePartial2D(start, end, ransacReprojThreshold=OUTLIER)
+    if motion is None or inlier.mean() < AGREE:
+        return None
+    if start[inlier[:, 0] == 1, 0].std() < SPREAD * before.shape[1]:
+        return None
+    focal = float(camera.intrinsics.K[0, 0]) * before.shape[1] / camera.intrinsics.width
+    right, down = motion[:, 2] / focal
+    return np.degrees([-down, right, np.arctan2(motion[1, 0], motion[0, 0])])
+
+
+class MountingWatch:
+    """Detector of a camera or LiDAR that turned, and of a transform between them that jumped."""
+
+    def __init__(self, camera: str, lidar: str) -> None:
+        self._camera, self._lidar = f"camera {camera}", f"LiDAR {lidar}"
+        self._stamp = 0
+        self._gray: U8 | None = None
+        self._turns: deque[tuple[F64, F64, int]] = deque(maxlen=PAST)  # of camera and LiDAR, camera's axes
+        self._turned: dict[str, tuple[F64, int]] = {}  # sensor: degrees that it is off, since when
+        self._mounting: F64 | None = None
+        self._steps: deque[float] = deque(maxlen=PAST)  # degrees by which the transform changed
+        self._before_jump: tuple[F64, int] | None = None
+
+    def update(
+        self, camera: Camera, gray: U8 | None, scene: F64 | None, stamp: int, trusted: bool
+    ) -> Iterator[SensorFault]:
+        """Yield the faults of the mounting in this frame.
+
+        Args:
+            camera: the camera in this frame.
+            gray: its image in grey.
+            scene: (3,) rotation of the scene in the axes of the points, from the last scan to this one.
+            stamp: stamp of the frame.
+            trusted: False if the image is known to be wrong.
+        """
+        mounting = camera.camera_from_points if camera.mounting is None else camera.mounting
+        yield from self._jump(mounting, stamp)
+        image = camera.image
+        if image is not None and image.stamp != self._stamp:
+            if self._gray is not None and gray is not None and scene is not None and mounting is not None:
+                turn = camera_rotation(self._gray, gray, camera) if trusted else None
+                self._compare(turn, mounting[:3, :3] @ scene, stamp)
+            self._stamp, self._gray = image.stamp, gray if trusted else None
+        for sensor, (angle, since) in list(self._turned.items()):
+            if stamp - since > LASTS * 1e9:
+                del self._turned[sensor]
+            else:
+                size = float(np.linalg.norm(np.nan_to_num(angle)))
+                other = self._lidar if sensor == self._camera else self._camera
+                detail = f", by {size:.1f} degrees against {other}"
+                yield SensorFault(sensor, "turned in its mounting", since, detail)
+
+    def _compare(self, camera: F64 | None, lidar: F64, stamp: int) -> None:
+        """Compare the newest rotations of camera and LiDAR. A rotation is judged one frame later."""
+        if camera is None:
+            self._turns.clear()
+            return
+        self._turns.append((camera, lidar, stamp))
+        if len(self._turns) < LEAST_PAST + 2:
+            return
+        alone = np.nan_to_num(np.array([camera - lidar for camera, lidar, _ in self._turns]))
+        size = np.linalg.norm(alone, axis=1)
+        if size[-2] < TURNED or max(size[-1], float(np.median(size[:-2]))) > STEADY:
+            return
+        seen = np.nan_to_num(np.array([[camera, lidar] for camera, lidar, _ in self._turns]))
+        surprise = np.linalg.norm(seen[-2] - np.median(seen[:-2], axis=0), axis=1)
+        sensor = self._camera if surprise[0] >= surprise[1] else self._lidar
+        angle, since = self._turned.pop(sensor, (np.zeros(3), self._turns[-2][2]))
+        angle = angle + alone[-2]
+        if np.linalg.norm(angle) >= TURNED:  # smaller: it was turned back
+            self._turned[sensor] = angle, since
+
+    def _jump(self, mounting: F64 | None, stamp: int) -> Iterator[SensorFault]:
+        """Yield a transform that jumped, until it is back or the new one is usual."""
+        before, self._mounting = self._mounting, mounting
+        if mounting is None or before is None:
+            return
+        degrees, metres = _difference(before, mounting)
+        usual = float(np.median(self._steps)) if self._steps else 0.0
+        if (degrees > STEP and degrees > JERK * usual) or (metres > SHIFT and degrees > JERK * usual):
+            if self._before_jump is None:
+                self._before_jump = before, stamp
+        else:
+            self._steps.append(degrees)
+        if self._before_jump is None:
+            return
+        first, since = self._before_jump
+        degrees, metres = _difference(first, mounting)
+        if (degrees <= STEP and metres <= SHIFT) or stamp - since > LASTS * 1e9:
+            self._before_jump = None
+            return
+        detail = f", by {degrees:.1f} degrees and {100 * metres:.0f} cm"
+        name = f"transform from {self._lidar} jumped"
+        yield SensorFault(self._camera, name, since, detail)
+
+
+def _difference(a: F64, b: F64) -> tuple[float, float]:
+    """Return the angle in degrees and the distance in metres between two (4, 4) transforms."""
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
+    position = -a[:3, :3].T @ a[:3, 3] + b[:3, :3].T @ b[:3, 3]
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), float(np.linalg.norm(position))
