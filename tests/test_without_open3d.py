@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bevviz.synthetic import SyntheticSource, write_bag
-from tests.waiting import PATIENCE
+from tests.support.waiting import PATIENCE
 
 COMMAND = (
     sys.executable,

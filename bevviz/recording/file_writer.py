@@ -74,7 +74,7 @@ class FileWriter(Closable):
 
     def _run(self) -> None:
         buffer = memoryview(bytearray(BUFFER_BYTES))
-        size, message_end = 0, HEADER_BYTES  # bytes in the buffer, and up to the end of its last known message
+        size, message_end = 0, HEADER_BYTES  # bytes in the buffer; end of its last whole message
         while count := os.readv(self._read_end, [buffer[size:]]):
             size += count
             complete = 0
