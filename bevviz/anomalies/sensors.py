@@ -47,7 +47,7 @@ class SensorWatch:
             yield from self._scans.setdefault(cloud.name, ScanWatch(f"LiDAR {cloud.name}")).update(cloud)
         before, self._shape = self._shape, None
         if frame.lidar and any(camera.image is not None for camera in frame.cameras):
-            self._shape = ScanShape.measure(result)
+            self._shape = ScanShape.measure(result, before)
         scene = None if before is None or self._shape is None else before.rotation_to(self._shape)
         for camera in frame.cameras:
             image, gray = camera.image, None

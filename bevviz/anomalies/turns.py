@@ -20,11 +20,12 @@ from bevviz.model.frame import F64, U8, Camera
 from bevviz.model.results import FrameResult
 
 BINS = 720  # directions in which the range is compared
+BANDS = (20, 33, 46, 59, 72, 85, 98)  # percentiles of the elevations that bound the bands of a scan
+FAR = 6.0  # metres; what is nearer moves sideways as the robot drives
 REACH = 16  # bins, largest rotation of a LiDAR from scan to scan
-UNLIKE = (
-    0.9  # ratio of the least to the usual difference of two scans, above which they show different places
-)
-FEWEST = 3  # points of a direction whose mean range is used
+UNLIKE = 0.9  # ratio of the least to the usual difference of two scans of different places
+LARGEST = 0.3  # largest difference of two mean logarithms that counts: beyond it they show two objects
+FEWEST = 2  # points of a direction whose mean range is used
 GROUND = 20.0  # metres, farthest ground whose slope is measured
 LEAST_GROUND = 200  # points
 POINTS = 40_000  # most points of a scan that are used
@@ -47,24 +48,30 @@ LASTS = 30.0  # seconds for which it is told
 class ScanShape:
     """Shape of a scan, from which its rotation against the next scan is measured."""
 
-    ranges: F64  # (BINS,) mean logarithm of the range in each direction; NaN: too few points
+    ranges: F64  # (bands, BINS) mean logarithm of the range in each direction; NaN: too few points
+    elevations: F64  # (bands + 1,) tangents of the elevations that bound the bands
     slope: F64  # (2,) rise of the ground along x and along y; NaN: unknown
 
     @staticmethod
-    def measure(result: FrameResult) -> ScanShape:
-        """Measure the scan of a frame."""
+    def measure(result: FrameResult, before: ScanShape | None = None) -> ScanShape:
+        """Measure the scan of a frame, in the bands of the scan before."""
         points = result.frame.points
         xyz = points[:: -(-len(points) // POINTS) or 1]
         distance = np.hypot(xyz[:, 0], xyz[:, 1])
-        elevation = xyz[:, 2] / np.maximum(distance, 1e-3)
-        # The upper half of the points lies on walls and objects, whose ranges change with the direction.
-        upper = (distance > 2) & (elevation > np.median(elevation)) if len(xyz) else np.zeros(0, np.bool_)
-        azimuth = np.arctan2(xyz[upper, 1], xyz[upper, 0])
-        bins = ((azimuth + np.pi) * BINS / (2 * np.pi)).astype(np.int64) % BINS
-        count = np.bincount(bins, minlength=BINS)
-        total = np.bincount(bins, np.log(distance[upper]), BINS)
-        ranges = np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
-        return ScanShape(ranges, _ground_slope(result))
+        xyz, distance = xyz[distance > FAR], distance[distance > FAR]
+        elevation = xyz[:, 2] / distance
+        bounds = np.percentile(elevation, BANDS) if len(xyz) else np.zeros(len(BANDS))
+        if before is not None:
+            bounds = before.elevations
+        inside = (elevation > bounds[0]) & (elevation < bounds[-1])
+        band = np.searchsorted(bounds, elevation[inside]) - 1
+        azimuth = np.arctan2(xyz[inside, 1], xyz[inside, 0])
+        cell = band * BINS + ((azimuth + np.pi) * BINS / (2 * np.pi)).astype(np.int64) % BINS
+        cells = (len(BANDS) - 1) * BINS
+        count = np.bincount(cell, minlength=cells)
+        total = np.bincount(cell, np.log(distance[inside]), cells)
+        ranges = np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan).reshape(-1, BINS)
+        return ScanShape(ranges, np.asarray(bounds, np.float64), _ground_slope(result))
 
     def rotation_to(self, other: ScanShape) -> F64 | None:
         """Return the (3,) rotation of the scene in degrees, about x, y and z of the points.
@@ -72,10 +79,13 @@ class ScanShape:
         None: the two scans do not show the same place, or too few points were measured.
         """
         shifts = np.arange(-REACH, REACH + 1)
-        difference = np.stack([np.abs(np.roll(self.ranges, shift) - other.ranges) for shift in shifts])
-        if np.isfinite(difference).sum(axis=1).min() < BINS / 8:
-            return None
-        cost = np.nanmean(np.minimum(difference, 0.5), axis=1)
+        cost = np.empty(len(shifts))
+        for row, shift in enumerate(shifts.tolist()):
+            difference = np.abs(np.roll(self.ranges, shift, axis=1) - other.ranges)
+            difference = difference[np.isfinite(difference)]
+            if len(difference) < BINS / 8:
+                return None
+            cost[row] = np.minimum(difference, LARGEST).mean()
         best = int(cost.argmin())
         if cost[best] > UNLIKE * np.median(cost) or not 0 < best < 2 * REACH:
             return None
