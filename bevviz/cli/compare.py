@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -15,6 +14,8 @@ from bevviz.cli.options import (
     add_selection,
     add_truth,
     collect_settings,
+    find_truth,
+    load_config,
     load_config_from,
     open_bag,
 )
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from bevviz.compare.sides import ComparedFrame
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import Config, Preset
-    from bevviz.evaluate import Truth
     from bevviz.model.frame import Frame
     from bevviz.model.protocols import Observer, Processor
 
@@ -92,12 +92,11 @@ def _configurations(options: argparse.Namespace) -> int:
     check_same_frames({"A": a, "B": b})
     decoded = common_frames([a, b])
     with open_bag(options, decoded) as source:
-        sessions = ComparedSessions(a, b, _truth(options, source))
+        sessions = ComparedSessions(a, b, find_truth(options, source))
         return _run(sessions, source, decoded, names, (a, b), options)
 
 
 def _robot(options: argparse.Namespace) -> int:
-    from bevviz.cli.options import load_config
     from bevviz.compare.sides import ComparedRobot, robot_topic
     from bevviz.pipeline.session import Session
 
@@ -107,14 +106,8 @@ def _robot(options: argparse.Namespace) -> int:
     with open_bag(options, config) as source:
         topic = robot_topic(source.roles.robot_detections_3d, options.robot)
         names = "bevviz", f"the robot's {topic}"
-        compared = ComparedRobot(Session(config), topic, _truth(options, source))
+        compared = ComparedRobot(Session(config), topic, find_truth(options, source))
         return _run(compared, source, config, names, (config, config), options)
-
-
-def _truth(options: argparse.Namespace, source: BagSource) -> Callable[[Frame], Truth | None] | None:
-    from bevviz.evaluate import truth_source
-
-    return truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
 
 
 def _run(

@@ -15,6 +15,7 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
     from bevviz.config import Config, Layer, Preset
+    from bevviz.evaluate.ground_truth import TruthLookup
     from bevviz.recording.source_lookup import RecordingSource
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -109,6 +110,17 @@ def add_truth(parser: argparse.ArgumentParser) -> None:
         metavar="FILE|DIR",
         help="label_2 of KITTI, calib beside it; one file for each scan",
     )
+
+
+def find_truth(options: argparse.Namespace, source: BagSource) -> TruthLookup | None:
+    """Return the ground truth that the options of ``add_truth`` name. None: the bag has none.
+
+    Raises:
+        UserError: as ``bevviz.evaluate.truth_source``.
+    """
+    from bevviz.evaluate import truth_source
+
+    return truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
 
 
 def add_limits(parser: argparse.ArgumentParser) -> None:

@@ -15,6 +15,7 @@ from bevviz.cli.options import (
     add_selection,
     add_truth,
     collect_settings,
+    find_truth,
     load_config_from,
     open_bag,
 )
@@ -45,7 +46,6 @@ def add(commands: Commands) -> None:
 
 def _sweep(options: argparse.Namespace) -> int:
     from bevviz.config import flatten
-    from bevviz.evaluate import truth_source
     from bevviz.pipeline.variants import common_frames
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
@@ -60,8 +60,7 @@ def _sweep(options: argparse.Namespace) -> int:
     configs = combine(parameters, configured)
     config = common_frames(configs.values())
     with open_bag(options, config) as source:
-        truth = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-        sweep = Sweep(parameters, configs, truth)
+        sweep = Sweep(parameters, configs, find_truth(options, source))
         outputs = Outputs.of(options)._replace(blueprint=layout(sweep))
         with ExitStack() as stack:
             # The run may take long. Report an output that cannot be opened before it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 
 import numpy as np
 import rerun as rr
@@ -176,34 +176,23 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
 
 def differences_page(differences: FrameDifferences) -> str:
     """Return the differences of one frame as Markdown."""
-    return "\n".join(_lines(differences))
-
-
-def _lines(differences: FrameDifferences) -> Iterator[str]:
-    yield f"### Frame {differences.index}"
-    yield ""
-    yield table.markdown([("", "A", "B"), *_totals(differences)])
+    lines = [f"### Frame {differences.index}", "", table.markdown([("", "A", "B"), *_totals(differences)])]
     if (judged := differences.judged) is not None:
         for title, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
-            if objects:
-                yield ""
-                yield f"#### {title}: {len(objects)}"
-                yield ""
-                yield from (f"- {markdown(judged.text(row))}" for row in objects)
+            lines += _section(f"{title}: {len(objects)}", [markdown(judged.text(row)) for row in objects])
     for change in (*DIFFERENT, Change.SAME):
         selected = [d for d in differences.objects if d.change is change]
-        if selected:
-            yield ""
-            yield f"#### {change[0].upper() + change[1:]}: {len(selected)}"
-            yield ""
-            yield from (f"- {markdown(_item(d))} {differences.position_of(d)}" for d in selected)
+        title = f"{change[0].upper()}{change[1:]}: {len(selected)}"
+        lines += _section(title, [f"{markdown(_item(d))} {differences.position_of(d)}" for d in selected])
     for camera, pairs in differences.images.items():
-        rows = [d for d in pairs if d.change is not Change.SAME]
-        if rows:
-            yield ""
-            yield f"#### Detections, {markdown(camera)}"
-            yield ""
-            yield from (f"- {markdown(d.text)}" for d in rows)
+        texts = [markdown(d.text) for d in pairs if d.change is not Change.SAME]
+        lines += _section(f"Detections, {markdown(camera)}", texts)
+    return "\n".join(lines)
+
+
+def _section(title: str, items: Sequence[str]) -> list[str]:
+    """Return the lines of a heading and a list. Without items, there is none."""
+    return ["", f"#### {title}", "", *(f"- {item}" for item in items)] if items else []
 
 
 def _totals(differences: FrameDifferences) -> Iterator[tuple[str, str, str]]:
