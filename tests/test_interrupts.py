@@ -57,7 +57,7 @@ def test_a_signal_ends_a_command_without_open_files(tmp_path: Path, number: sign
     script = (
         "import os, tempfile; tempfile.tempdir = os.getcwd()\n"
         "from bevviz.cli import interrupts\n"
-        "from bevviz.support.files import ScratchFolder\n"
+        "from bevviz.support.scratch_folder import ScratchFolder\n"
         "interrupts.install(); ScratchFolder().new()\n"
         "assert os.listdir()\n"
         "try:\n"

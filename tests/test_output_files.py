@@ -21,7 +21,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.support.files import ScratchFolder, atomic_write, claim_target, save_text, unfinished_files
+from bevviz.support.files import atomic_write, claim_target, save_text, unfinished_files
+from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.workbench.recording_buffer import RecordingBuffer
 from tests.support import bags
 from tests.support.commands import Capture, environment, error_of
@@ -268,7 +269,7 @@ def test_temporary_folders_are_deleted_after_their_process(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     script = (
         "import os, signal, tempfile; tempfile.tempdir = os.getcwd()\n"
-        "from bevviz.support.files import ScratchFolder\n"
+        "from bevviz.support.scratch_folder import ScratchFolder\n"
         "s = ScratchFolder(); s.new(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=PATIENCE)

@@ -17,7 +17,7 @@ import pytest
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.drivers.bitstream import Continuity, is_key
+from bevviz.drivers.video import Continuity, is_key
 from bevviz.model.frame import Frame, Image
 from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window
 from bevviz.sync import video

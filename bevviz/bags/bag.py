@@ -30,7 +30,7 @@ from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.dataset import describe_unread
 from bevviz.datasets.reader import DatasetReader
 from bevviz.drivers import ouster
-from bevviz.drivers.calibration_file import read_calibration
+from bevviz.drivers.packets import read_calibration
 from bevviz.drivers.video import VideoPacket, decode_packet, is_video
 from bevviz.errors import UserError
 from bevviz.messages import vision_msgs
@@ -42,7 +42,8 @@ from bevviz.messages.topics import NOT_LIDAR, Topic
 from bevviz.model.frame import I64
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
-from bevviz.support.files import ScratchFolder, bag_files, drive_files, full_disk_error, read_text
+from bevviz.support.files import bag_files, drive_files, full_disk_error, read_text
+from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.support.text import path_text
 
 ATTACHED = "lidar_calibration"  # name prefix of an attached calibration; the topic and the file name follow

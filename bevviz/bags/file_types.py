@@ -20,7 +20,8 @@ from bevviz.datasets.cloud_files import CLOUDS
 from bevviz.datasets.dataset import IMAGES, UNREAD
 from bevviz.errors import UserError
 from bevviz.support import progress
-from bevviz.support.files import LFS_HINT, LFS_POINTER, ScratchFolder
+from bevviz.support.files import LFS_HINT, LFS_POINTER
+from bevviz.support.scratch_folder import ScratchFolder
 
 ZSTD_FRAME = re.compile(re.escape(ZSTD))
 

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.drivers.calibration_file import read_calibration
-from bevviz.drivers.packets import ScanPackets, split
+from bevviz.drivers.packets import ScanPackets, read_calibration, split
 from bevviz.errors import UserError
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points

@@ -5,12 +5,12 @@ It reads the serialised message as an array. Deserialising up to 500,000 points 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from bevviz.drivers.packets import read_list_message
 from bevviz.messages.clouds import MOST_POINTS
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.messages.encode import encode_points
@@ -27,7 +27,6 @@ FIELDS = (
 )
 # Name of the field in the drivers' own PointCloud2, where it is a float32.
 READ = {"reflectivity": "intensity"}
-SECOND = 1_000_000_000
 
 
 def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[str, str]] = FIELDS) -> Any:
@@ -44,21 +43,12 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
     Raises:
         ValueError: the data are no CustomMsg, or end before its points.
     """
-    order = "<" if ros1 or data[1:2] != b"\0" else ">"
-    at = 4  # behind the encapsulation header of CDR, or the seq of ROS 1
-    try:
-        sec, nanosec, length = struct.unpack_from(f"{order}III", data, at)
-        frame_id = bytes(data[at + 12 : at + 12 + length]).rstrip(b"\0").decode()
-        at += 12 + length
-        at += 0 if ros1 else -(at - 4) % 8
-        at += 8 + 4 + 4  # timebase, point_num, lidar_id and three reserved bytes
-        (count,) = struct.unpack_from(f"{order}I", data, at)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{len(data)} bytes are no CustomMsg") from error
-    at += 4
+    # Skipped are timebase, point_num, and lidar_id with three reserved bytes.
+    message = read_list_message(data, ros1=ros1, alignment=8, skipped=8 + 4 + 4)
+    count, at = message.count, message.at
     if count > MOST_POINTS:
         raise ValueError(f"a cloud of {count} points is not taken: {MOST_POINTS} at most")
-    formats = [np.dtype(kind).newbyteorder("<" if order == "<" else ">") for _, kind in fields]
+    formats = [np.dtype(kind).newbyteorder(message.order) for _, kind in fields]
     offsets, size = list[int](), 0
     for kind in formats:  # CDR aligns each number to its size, and each point to that of its largest number.
         size += 0 if ros1 else -size % kind.itemsize
@@ -72,7 +62,7 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
     )
     rows = np.ndarray((complete,), point, data, at, (step,))
-    return encode_points(sec * SECOND + nanosec, frame_id, _to_points(rows), count)
+    return encode_points(message.stamp, message.frame_id, _to_points(rows), count)
 
 
 def _to_points(rows: Any) -> Any:

@@ -1,16 +1,19 @@
-"""Scans of LiDAR packets in VelodyneScan and PandarScan messages.
+"""Scans of LiDAR packets in VelodyneScan and PandarScan messages, and the calibration files of LiDARs.
 
-The serialised message is read as an array. Deserialising up to 9,000 packets a second as objects is slow.
+A serialised message is read as an array. Deserialising up to 9,000 packets a second as objects is slow.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from bevviz.model.frame import I64, U8
+from bevviz.support.files import read_text
 
 MOST_PACKETS = 100_000
 SECOND = 1_000_000_000
@@ -37,6 +40,52 @@ class ScanPackets:
     lost: int
 
 
+@dataclass(frozen=True, slots=True)
+class ListMessage:
+    """Beginning of a serialised message with a std_msgs/Header and a list.
+
+    Attributes:
+        order: byte order, as ``struct`` and numpy write it.
+        stamp: stamp of the header, nanoseconds.
+        frame_id: frame of the header.
+        count: length that the list states.
+        at: byte at which its first item begins.
+    """
+
+    order: Literal["<", ">"]
+    stamp: int
+    frame_id: str
+    count: int
+    at: int
+
+
+def read_list_message(
+    data: bytes | memoryview, *, ros1: bool, alignment: int = 4, skipped: int = 0
+) -> ListMessage:
+    """Read the beginning of a message.
+
+    Args:
+        data: serialised message.
+        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
+        alignment: bytes to which CDR aligns the field behind the header.
+        skipped: bytes of the fields between the header and the list.
+
+    Raises:
+        ValueError: the data are no such message.
+    """
+    order: Literal["<", ">"] = "<" if ros1 or data[1:2] != b"\0" else ">"
+    try:
+        # Behind the encapsulation header of CDR, or the seq of ROS 1.
+        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
+        at = 16 + length
+        frame_id = bytes(data[16:at]).rstrip(b"\0").decode()
+        at += skipped + (0 if ros1 else -(at - 4) % alignment)
+        (count,) = struct.unpack_from(f"{order}I", data, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ValueError(f"{len(data)} bytes end before the list of the message") from error
+    return ListMessage(order, sec * SECOND + nanosec, frame_id, count, at + 4)
+
+
 def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> ScanPackets:
     """Split a message into its packets.
 
@@ -51,17 +100,8 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Sc
     Raises:
         ValueError: the data are no such message, or no packet is complete.
     """
-    order = "<" if ros1 or data[1:2] != b"\0" else ">"
-    try:
-        # Behind the encapsulation header of CDR, or the seq of ROS 1.
-        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
-        frame_id = bytes(data[16 : 16 + length]).rstrip(b"\0").decode()
-        at = 16 + length
-        at += 0 if ros1 else -at % 4
-        (count,) = struct.unpack_from(f"{order}I", data, at)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{len(data)} bytes are no scan of packets") from error
-    at += 4
+    message = read_list_message(data, ros1=ros1)
+    order, count, at = message.order, message.count, message.at
     if count > MOST_PACKETS:
         raise ValueError(f"a scan of {count} packets is not taken: {MOST_PACKETS} at most")
     names, formats = ["sec", "nanosec", "data"], [f"{order}u4", f"{order}u4", f"({size},)u1"]
@@ -75,10 +115,19 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Sc
         raise ValueError(f"none of the {count} packets is whole" if count else "there are no packets in it")
     rows = np.ndarray((complete,), packet, data, at, (step,))
     return ScanPackets(
-        stamp=sec * SECOND + nanosec,
-        frame_id=frame_id,
+        stamp=message.stamp,
+        frame_id=message.frame_id,
         received=rows["sec"].astype(np.int64) * SECOND + rows["nanosec"],
         data=rows["data"],
         sizes=np.minimum(rows["size"], size).astype(np.int64) if sized else np.full(complete, size, np.int64),
         lost=count - complete,
     )
+
+
+def read_calibration(path: Path) -> str:
+    """Return the text of a file that ``source.lidar_calibration`` names.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    return read_text(path, problem=f"source.lidar_calibration: {path}: cannot be read")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bevviz.drivers import ouster
-from bevviz.drivers.calibration_file import read_calibration
+from bevviz.drivers.packets import read_calibration
 from bevviz.errors import UserError
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.topics import NOT_LIDAR, Topic

@@ -37,7 +37,7 @@ from bevviz.report.fingerprints import (
 )
 from bevviz.report.make import replay
 from bevviz.stages.detector import DEMO_MODEL
-from bevviz.support.files import ScratchFolder
+from bevviz.support.scratch_folder import ScratchFolder
 
 UNREADABLE = "cannot be read as a report"
 _SEAL = re.compile(rb'id="seal">SHA-256 of the recording: ([0-9a-f]{64})<')

@@ -8,14 +8,12 @@ import os
 import random
 import re
 import secrets
-import shutil
 import stat
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
@@ -32,7 +30,6 @@ TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: usua
 TABLE_LIMIT = 1 << 27  # a table with a line for each pose: an hour at 200 Hz is 115 MB
 LINE_LIMIT = 1 << 16  # characters of a line of a table
 SENSOR_LIMIT = 1 << 30  # a scan or an image: 100 million points without colour
-YOUNG = 60.0  # seconds in which a new temporary folder may have no lock yet
 
 
 # End of the stem of an unfinished file. It is random, so that no attacker can plant a link under that name.
@@ -444,60 +441,3 @@ def sampled_files(folder: Path) -> tuple[int, list[Path]]:
         count += len(names)
         chosen += [Path(parent, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
     return count, [file for file in chosen if file.is_file()]
-
-
-class ScratchFolder:
-    """A temporary folder, made on first use. Making it deletes folders that killed processes have left."""
-
-    PREFIX = "bevviz-scratch-"
-
-    def __init__(self) -> None:
-        self._folder: Path | None = None
-        self._lock = -1
-
-    def new(self) -> Path:
-        """Return a new empty folder inside the temporary one.
-
-        Raises:
-            UserError: no temporary folder can be made.
-        """
-        try:
-            if self._folder is None:
-                self._sweep()
-                self._folder = Path(tempfile.mkdtemp(prefix=self.PREFIX))
-                cleanup.register(self, partial(shutil.rmtree, self._folder, ignore_errors=True))
-                self._lock = os.open(self._folder, os.O_RDONLY | os.O_CLOEXEC)
-                with suppress(OSError):
-                    fcntl.flock(self._lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            return Path(tempfile.mkdtemp(dir=self._folder))
-        except OSError as error:
-            if (full := full_disk_error(error)) is not None:
-                raise full from None
-            where = tempfile.gettempdir()
-            raise UserError(
-                f"no temporary folder in {where}: {error.strerror}; TMPDIR names another"
-            ) from None
-
-    def close(self) -> None:
-        """Delete the temporary folder."""
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            os.close(self._lock)
-            self._folder = None
-            cleanup.unregister(self)
-
-    def _sweep(self) -> None:
-        """Delete this user's temporary folders without a lock. A lock ends with its process."""
-        for folder in Path(tempfile.gettempdir()).glob(f"{self.PREFIX}????????"):
-            with suppress(OSError):
-                status = folder.lstat()
-                if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
-                    continue
-                if time.time() - status.st_mtime < YOUNG:
-                    continue
-                handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(folder, ignore_errors=True)
-                finally:
-                    os.close(handle)

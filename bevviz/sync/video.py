@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from bevviz.drivers.bitstream import Continuity
-from bevviz.drivers.video import VideoPacket
+from bevviz.drivers.video import Continuity, VideoPacket
 from bevviz.errors import first_line
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.images import MOST_PIXELS
