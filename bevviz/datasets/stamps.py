@@ -36,7 +36,7 @@ class FileTimes:
     Attributes:
         frames: the values are frame numbers; else they are nanoseconds.
         values: value of each file that has one.
-        said: interpretation to report to the user; empty: it is obvious.
+        note: interpretation to report to the user; empty: it is obvious.
     """
 
     frames: bool

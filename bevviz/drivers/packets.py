@@ -42,21 +42,13 @@ class ScanPackets:
 
 @dataclass(frozen=True, slots=True)
 class ListMessage:
-    """Beginning of a serialised message with a std_msgs/Header and a list.
+    """Beginning of a serialised message with a std_msgs/Header and a list."""
 
-    Attributes:
-        order: byte order, as ``struct`` and numpy write it.
-        stamp: stamp of the header, nanoseconds.
-        frame_id: frame of the header.
-        count: length that the list states.
-        at: byte at which its first item begins.
-    """
-
-    order: Literal["<", ">"]
-    stamp: int
+    order: Literal["<", ">"]  # byte order, as struct and numpy write it
+    stamp: int  # of the header, nanoseconds
     frame_id: str
-    count: int
-    at: int
+    count: int  # length that the list states
+    at: int  # byte at which its first item begins
 
 
 def read_list_message(

@@ -26,7 +26,7 @@ from bevviz.model.frame import (
     LabelledBoxes3D,
     Scene,
 )
-from bevviz.synthetic import faults
+from bevviz.synthetic.faults import find_faults
 from bevviz.synthetic.mesh import Material
 from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, RaycastView, Scan, optical
 from bevviz.synthetic.world import World, bounds
@@ -103,7 +103,7 @@ class SyntheticSource:
             raise UserError(f"seed {seed}: a seed is 0 or above")
         self.total = frames
         self.seed = seed
-        self.faults = faults.find_scenes(plant, (frames - 1) * PERIOD * 1e-9)
+        self.faults, sensor_faults = find_faults(plant, (frames - 1) * PERIOD * 1e-9)
         self.scene = Scene(
             f"synthetic drive, seed {seed}" + "".join(f", {name}" for name in plant),
             lidar=LIDAR_FRAME,
@@ -117,7 +117,7 @@ class SyntheticSource:
         self.base_from_camera = self._base_from_true_camera  # the stated mounting
         if camera_error is not None:
             self.base_from_camera = self.base_from_camera @ camera_error
-        for fault in faults.find_sensor_faults(plant):
+        for fault in sensor_faults:
             error = np.array(fault.camera_error)
             self.base_from_camera = self.base_from_camera @ geometry.transform(error[:3], error[3:])
             image_late += fault.image_late

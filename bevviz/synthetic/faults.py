@@ -102,34 +102,25 @@ SENSOR_FAULTS: Mapping[str, SensorFault] = {
 }
 
 
-def find_sensor_faults(names: Sequence[str]) -> list[SensorFault]:
-    """Return the sensor faults among these names."""
-    return [SENSOR_FAULTS[name] for name in names if name in SENSOR_FAULTS]
-
-
-def find_scenes(names: Sequence[str], duration: float) -> list[Fault]:
-    """Return the scenes with these names.
+def find_faults(names: Sequence[str], duration: float) -> tuple[list[Fault], list[SensorFault]]:
+    """Return the scenes and the sensor faults with these names.
 
     Args:
-        names: keys of ``FAULTS``; keys of ``SENSOR_FAULTS`` are skipped.
+        names: keys of ``FAULTS`` and ``SENSOR_FAULTS``.
         duration: seconds of the drive.
 
     Raises:
         UserError: a name is unknown, or the drive ends before the fault is seen.
     """
-    scenes = []
+    known = [*FAULTS, *SENSOR_FAULTS]
     for name in names:
-        if name in SENSOR_FAULTS:
-            continue
-        if name not in FAULTS:
-            known = [*FAULTS, *SENSOR_FAULTS]
+        if name not in known:
             hint = did_you_mean(name, known, 0.4) or f"; there are {', '.join(known)}"
             raise UserError(f"plant {name}: unknown{hint}")
-        fault = FAULTS[name]
-        if fault.time > duration:
+        if name in FAULTS and FAULTS[name].time > duration:
             raise UserError(
-                f"plant {name}: it is seen after {fault.time:g} s and the drive has {duration:g} s; "
+                f"plant {name}: it is seen after {FAULTS[name].time:g} s and the drive has {duration:g} s; "
                 "give it more frames"
             )
-        scenes.append(fault)
-    return scenes
+    scenes = [FAULTS[name] for name in names if name in FAULTS]
+    return scenes, [SENSOR_FAULTS[name] for name in names if name in SENSOR_FAULTS]
