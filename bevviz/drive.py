@@ -300,7 +300,7 @@ class Drive(Closable):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.pipeline.progress_bar import Progress
+        from bevviz.pipeline.run import Progress
         from bevviz.recording.recorder import DiskWatch, Recorder
         from bevviz.recording.sinks import open_recording
 

@@ -21,7 +21,7 @@ from bevviz.config.sections import Quantity
 from bevviz.live.thinning import chosen, is_cloud, thin_cloud
 from bevviz.model.frame import F32, Scene
 from bevviz.recording import blueprints
-from bevviz.recording.color_by import ColoredPoints, annotation_context, class_ids
+from bevviz.recording.cloud import ColoredPoints, quantity_annotations, quantity_ids
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 XYZ: F32 = np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
@@ -29,12 +29,12 @@ XYZ: F32 = np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0], [0.0, 0.0, 1.0]], np.fl
 
 @cache
 def labels() -> dict[int, str]:
-    context = annotation_context().as_component_batches()[0].as_arrow_array().to_pylist()[0]
+    context = quantity_annotations().as_component_batches()[0].as_arrow_array().to_pylist()[0]
     return {one["class_id"]: one["class_description"]["info"]["label"] or "" for one in context}
 
 
 def said(quantity: Quantity, **fields: NDArray[Any]) -> list[str]:
-    found = class_ids([quantity], XYZ, np.full(3, 16, np.uint8), fields)[quantity]
+    found = quantity_ids([quantity], XYZ, np.full(3, 16, np.uint8), fields)[quantity]
     known = labels()
     return [known[number] for number in found.tolist()]
 

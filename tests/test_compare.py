@@ -32,9 +32,8 @@ from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import transform
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations
-from bevviz.pipeline.session import Session
+from bevviz.pipeline.session import Session, Variants, check_same_frames, without_motion_compensation
 from bevviz.pipeline.stage_log import Memo
-from bevviz.pipeline.variants import Variants, check_same_frames, without_motion_compensation
 from bevviz.recording import entities
 from bevviz.stages import detector
 from bevviz.synthetic import SyntheticSource, write_bag

@@ -15,7 +15,7 @@ from bevviz.model.decisions import mask_evidence
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import Detections, FrameResult, Fusion, Masks
 from bevviz.recording import entities
-from bevviz.recording.camera import log_detections
+from bevviz.recording.images import log_detections
 from bevviz.recording.writer import Writer
 from bevviz.report.fingerprints import detections_of as recorded
 from bevviz.report.fingerprints import digest, pack, unpack

@@ -43,13 +43,14 @@ from bevviz.model.results import (
     Objects,
     Tracks,
 )
+from bevviz.recording.boxes import TRACK_LANES, TrackLanes
 from bevviz.recording.cloud import round_voxels
 from bevviz.recording.decisions import decision_page
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, ClassId
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.health import FrameRates
 from bevviz.recording.sinks import open_recording
-from bevviz.recording.tracks import TRACK_LANES, TrackLanes
+from bevviz.stages.bev import bev
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 from bevviz.support.files import unfinished_files

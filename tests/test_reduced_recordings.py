@@ -16,8 +16,8 @@ import bevviz
 from bevviz.config import LoggingConfig
 from bevviz.model.frame import F32, U8
 from bevviz.recording import entities
+from bevviz.recording.rerun_cli import too_large_for_web
 from bevviz.recording.retention import RawCloudFrame, RawCloudSelector
-from bevviz.recording.saved_viewer import too_large_for_web
 from bevviz.recording.video import GOP, VideoEncoder, decode
 from tests.support import bags
 from tests.support.recordings import Recording, verify, without_nan

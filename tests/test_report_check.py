@@ -111,7 +111,7 @@ def damage_that_breaks_the_reader(recording: Path) -> None:
         verify = [rerun_cli.rerun_program(), "rrd", "verify", str(recording)]
         if subprocess.run(verify, capture_output=True, check=False).returncode > 100:
             return
-    pytest.fail("nothing breaks the reader: is there need of bevviz.recording.decoding.check_decodes?")
+    pytest.fail("nothing breaks the reader: is there need of bevviz.recording.rerun_cli.check_decodes?")
 
 
 @pytest.mark.parametrize(

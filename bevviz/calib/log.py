@@ -16,8 +16,7 @@ from bevviz.model import geometry
 from bevviz.model.colors import StateColor, color_rows
 from bevviz.model.frame import F32, F64, Bool, Intrinsics
 from bevviz.recording import entities
-from bevviz.recording.annotations import depth_annotations
-from bevviz.recording.primitives import CORNER, document, encode_image
+from bevviz.recording.primitives import CORNER, depth_annotations, document, encode_image
 from bevviz.support import table
 from bevviz.support.text import fenced, markdown
 

@@ -86,7 +86,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _configurations(options: argparse.Namespace) -> int:
     from bevviz.compare.sides import ComparedSessions
-    from bevviz.pipeline.variants import check_same_frames, common_frames
+    from bevviz.pipeline.session import check_same_frames, common_frames
 
     names, (a, b) = _sides(options)
     check_same_frames({"A": a, "B": b})

@@ -94,7 +94,7 @@ class Outputs(NamedTuple):
     def keep_serving(self, sinks: OpenRecording, what: str = "") -> None:
         """Serve until the user ends it, if a server is requested."""
         if self.serve is not None:
-            from bevviz.recording.saved_viewer import too_large_for_web
+            from bevviz.recording.rerun_cli import too_large_for_web
 
             if self.save is not None and sinks.file is not None and sinks.file.exists():
                 warn(filter(None, [too_large_for_web(self.save, sinks.file.stat().st_size)]))

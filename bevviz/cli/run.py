@@ -27,8 +27,7 @@ def run_with_progress(
     items: Items[T], processor: Processor[T, R], observers: Sequence[Observer[R]]
 ) -> RunEnd:
     """Run the frames with a progress bar. After a signal the run ends with the current frame."""
-    from bevviz.pipeline.progress_bar import Progress
-    from bevviz.pipeline.run import run
+    from bevviz.pipeline.run import Progress, run
 
     with interruptible() as ended:
         return run(items, processor, [*observers, Progress()], stop=ended)

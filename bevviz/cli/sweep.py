@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
 
 def _sweep(options: argparse.Namespace) -> int:
     from bevviz.config import flatten
-    from bevviz.pipeline.variants import common_frames
+    from bevviz.pipeline.session import common_frames
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
 

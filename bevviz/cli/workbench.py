@@ -107,15 +107,15 @@ def _open(options: argparse.Namespace) -> int:
 
 def _show(recording: Path, options: argparse.Namespace) -> int:
     """Show a recording without a bag. It can be looked at, but not asked."""
-    from bevviz.recording import saved_viewer
+    from bevviz.recording import rerun_cli
 
     say(f"{recording}: no bag behind it, shown as it is")
     if has_display():
-        saved_viewer.open_in_viewer(recording)
+        rerun_cli.open_in_viewer(recording)
         return 0
-    if larger := saved_viewer.too_large_for_web(recording, recording.stat().st_size):
+    if larger := rerun_cli.too_large_for_web(recording, recording.stat().st_size):
         warn([larger])
-    with saved_viewer.serve_in_browser(recording, options.port) as address:
+    with rerun_cli.serve_in_browser(recording, options.port) as address:
         announce_viewer(address)
         wait_for_interrupt()
     return 0

@@ -18,7 +18,7 @@ from bevviz.compare.differences import (
 from bevviz.model.colors import SIDE_COLORS, StateColor
 from bevviz.model.frame import F64
 from bevviz.recording import entities
-from bevviz.recording.camera import image_frame
+from bevviz.recording.images import image_frame
 from bevviz.recording.labels import choose_named_in_3d
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, document, transform
 from bevviz.recording.states import StateLanes

@@ -22,9 +22,9 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, Boxes3D, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.recording import entities
-from bevviz.recording.camera import log_over_shared_image
-from bevviz.recording.decoding import check_decodes, reader_errors_as_user_errors
+from bevviz.recording.images import log_over_shared_image
 from bevviz.recording.primitives import CORNER
+from bevviz.recording.rerun_cli import check_decodes, reader_errors_as_user_errors
 from bevviz.recording.writer import Writer
 
 Row = Mapping[str, Any]

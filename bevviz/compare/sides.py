@@ -18,8 +18,7 @@ from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
-from bevviz.pipeline.session import Session
-from bevviz.pipeline.variants import SessionGroup, check_same_frames
+from bevviz.pipeline.session import Session, SessionGroup, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.stages.robot_results import detections_of, in_points_frame

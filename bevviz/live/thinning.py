@@ -12,7 +12,7 @@ import rerun as rr
 
 from bevviz.config import Config
 from bevviz.model.frame import I64, Frame, LateBoxes, Scene, Source, UserMark
-from bevviz.recording.color_by import ColoredPoints
+from bevviz.recording.cloud import ColoredPoints
 
 
 class Thinned:

@@ -12,7 +12,7 @@ from rerun.recording_stream import RecordingStream
 from bevviz.config import BevConfig, Config
 from bevviz.errors import UserError
 from bevviz.model.frame import Scene
-from bevviz.recording.decoding import check_decodes
+from bevviz.recording.rerun_cli import check_decodes
 from bevviz.recording.retention import keeps_everything
 from bevviz.support.text import did_you_mean
 

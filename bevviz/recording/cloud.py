@@ -1,22 +1,29 @@
-"""Log point clouds: raw points, and voxels of ground and obstacles."""
+"""Log point clouds: raw points by several quantities, voxels of ground and obstacles, clusters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
+from bevviz.config import ClusteringConfig, LoggingConfig
 from bevviz.config.sections import Quantity
-from bevviz.model.frame import F32, Frame
-from bevviz.model.results import FrameResult
-from bevviz.recording import color_by, entities, retention
+from bevviz.model.colors import palette, turbo
+from bevviz.model.frame import F32, I32, I64, RING_FIELDS, Bool, Frame
+from bevviz.model.results import Clusters, ClusterState, FrameResult, Tracks
+from bevviz.recording import entities, retention
+from bevviz.recording.boxes import track_class_ids, track_ids_of_clusters
 from bevviz.recording.entities import ClassId
-from bevviz.recording.primitives import rounded, transform
+from bevviz.recording.primitives import OUTLINE, boxes3d, point_classes, rounded, transform
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import spread_to_points
+from bevviz.support.kernel import kernel
 
 RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each point
 
@@ -25,7 +32,7 @@ def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:
     """Log the static style of the points of each LiDAR."""
     for lidar in lidars:
         radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
-        to.static(entities.points(lidar), radii, color_by.annotation_context())
+        to.static(entities.points(lidar), radii, quantity_annotations())
         for path in (entities.ground(lidar), entities.obstacles(lidar)):
             to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
 
@@ -37,14 +44,14 @@ def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -
     """
     frame = result.frame
     log_cloud_poses(to, frame)
-    heights = color_by.height_ids(result) if "height" in quantities else np.zeros(len(frame.points), np.uint8)
+    heights = height_ids(result) if "height" in quantities else np.zeros(len(frame.points), np.uint8)
     fields = {entities.points(cloud.name): cloud.fields for cloud in frame.clouds}
     start = 0
     for path, points, class_ids in raw_clouds(result):
         end = start + len(points)
         cloud_fields = fields[path] if len(frame.clouds) > 1 else frame.fields
-        ids_by_quantity = color_by.class_ids(quantities, points, heights[start:end], cloud_fields)
-        to.put(path, color_by.ColoredPoints(rr.Points3D(points, class_ids=class_ids), ids_by_quantity))
+        ids_by_quantity = quantity_ids(quantities, points, heights[start:end], cloud_fields)
+        to.put(path, ColoredPoints(rr.Points3D(points, class_ids=class_ids), ids_by_quantity))
         start = end
 
 
@@ -70,6 +77,66 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
         if len(cloud.xyz):
             clouds.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
     return clouds
+
+
+class RawCloudLog:
+    """Logger of raw clouds for recordings that keep those of selected frames only."""
+
+    def __init__(self) -> None:
+        self._selector = retention.RawCloudSelector()
+        self._shown: set[str] = set()  # entities with the raw clouds of the previous frame
+        self._known: set[str] = set()
+        self._states: Mapping[str, str] = {}
+
+    @property
+    def left_out(self) -> int:
+        """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
+        return self._selector.left_out
+
+    def refresh(self) -> None:
+        """Clear all raw clouds that the next frame lacks."""
+        self._shown = set(self._known)
+
+    def log(
+        self,
+        to: Writer,
+        result: FrameResult,
+        config: LoggingConfig,
+        states: Mapping[str, str],
+        *,
+        is_event: bool,
+        is_requested: bool,
+    ) -> None:
+        """Log the raw clouds of a frame and of buffered earlier frames, if they are wanted.
+
+        Args:
+            to: writer of the recording.
+            result: results of the frame.
+            config: limits.
+            states: states of the pipeline and the cameras, by lane. A change selects the clouds.
+            is_event: whether an anomaly begins in this frame.
+            is_requested: see ``RawCloudSelector.select``.
+        """
+        frame, clouds = result.frame, raw_clouds(result)
+        is_event |= any(self._states.get(lane, state) != state for lane, state in states.items())
+        self._states = states
+        clock, left_out = (frame.index, frame.stamp, frame.received), self.left_out
+        selected = self._selector.select(
+            retention.RawCloudFrame(clock, clouds), config, is_event=is_event, is_requested=is_requested
+        )
+        if self.left_out > left_out:
+            text = f"logging.raw_share is reached; {self.left_out} times so far"
+            to.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {text}")])
+        for frame_clouds in selected:
+            to.set_time(*frame_clouds.clock)
+            for path, points, class_ids in frame_clouds.clouds:
+                to.write(path, rr.Points3D(points, class_ids=class_ids))
+        to.set_time(*clock)
+        shown = {path for path, _, _ in clouds} if selected else set()
+        for path in sorted(self._shown - shown):
+            to.write(path, rr.Clear(recursive=False))
+        self._shown = shown
+        self._known |= shown
 
 
 def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:
@@ -116,3 +183,265 @@ def round_voxels(points: F32, voxel_size: float) -> F32:
 def round_points(points: F32, scale: float) -> F32:
     """Round points to the nearest 1 / scale. With a scale of 0, return them unchanged."""
     return rounded(points, scale) if scale else points
+
+
+# --- quantities that colour raw points ---------------------------------------------------------
+#
+# A quantity is logged as one byte per point (two for rings). Colours and labels belong to the class ids.
+# A view maps one of these components to the points' class ids, so the positions are logged only once.
+
+ClassIds: TypeAlias = NDArray[np.unsignedinteger]
+
+COMPONENTS = "ColorBy"  # archetype of the components
+FIELD_NAMES: dict[Quantity, tuple[str, ...]] = {  # names of a quantity in clouds
+    "intensity": ("intensity", "reflectivity", "i"),
+    "ring": RING_FIELDS,
+    "time": ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset"),
+}
+HEIGHT_RANGE = 4.0  # metres above the ground, end of the colour scale
+
+_ABSENT = 3  # class id of a missing field
+_HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each scale
+_STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # ids of each scale, powers of two
+
+
+class ColoredPoints(rr.AsComponents):
+    """Points with class ids by further quantities."""
+
+    def __init__(self, points: rr.Points3D, ids_by_quantity: Mapping[Quantity, ClassIds]) -> None:
+        self._points, self._ids_by_quantity = points, ids_by_quantity
+
+    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
+        """Return the components of the points and of the further class ids."""
+        batches = self._points.as_component_batches()
+        if self._ids_by_quantity:
+            columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._ids_by_quantity.items()}
+            batches += rr.DynamicArchetype(COMPONENTS, components=columns).as_component_batches()
+        return batches
+
+
+@np.errstate(over="ignore", invalid="ignore")  # fields may hold any value
+def quantity_ids(
+    quantities: Sequence[Quantity],
+    points: F32,
+    heights: NDArray[np.uint8],
+    fields: Mapping[str, NDArray[Any]],
+) -> dict[Quantity, ClassIds]:
+    """Return class ids of each point by quantity: (N,), or (1,) if the cloud lacks the field.
+
+    Args:
+        quantities: quantities to return.
+        points: (N, 3) metres, in the LiDAR frame.
+        heights: (N,) class ids from ``height_ids``.
+        fields: further (N,) fields of the cloud.
+    """
+    ids_by_quantity: dict[Quantity, ClassIds] = {}
+    for name in quantities:
+        if name == "height":
+            ids_by_quantity[name] = heights
+        elif name == "distance":
+            steps_per_metre = np.float32(_DEPTHS / entities.DEPTH_RANGE)
+            ids_by_quantity[name] = _distance_ids(points, steps_per_metre)
+        elif (
+            values := next((fields[field] for field in FIELD_NAMES[name] if field in fields), None)
+        ) is None:
+            ids_by_quantity[name] = np.array([_ABSENT], np.uint8)
+        elif name == "intensity":
+            ids_by_quantity[name] = _scaled(values, 0.0, _brightest(values), _INTENSITY, _SHARES)
+        elif name == "ring":
+            rings = values.astype(np.int64) if values.dtype.kind == "f" else values
+            ids_by_quantity[name] = (rings.astype(np.uint16) & np.uint16(_RINGS - 1)) + np.uint16(_RING)
+        else:
+            is_finite = np.isfinite(values)
+            finite = values if is_finite.all() else values[is_finite]
+            first, last = (finite.min(), finite.max()) if len(finite) else (0, 0)
+            ids_by_quantity[name] = _scaled(values - first, 0.0, float(last - first), _TIME, _SHARES)
+    return ids_by_quantity
+
+
+def height_ids(result: FrameResult) -> NDArray[np.uint8]:
+    """Return (N,) class ids by the height of each point's voxel above the ground.
+
+    Without a ground, the height is measured from the lowest points.
+    """
+    if result.voxels is not None and result.ground is not None:
+        voxel_ids = _scaled(result.ground.height, 0.0, HEIGHT_RANGE, _HEIGHT, _STEPS)
+        return spread_to_points(voxel_ids, result.voxels.inverse)
+    z = result.frame.points[:, 2]
+    lowest = float(np.percentile(z[:: len(z) // 5_000 + 1], 1)) if len(z) else 0.0
+    return _scaled(z, lowest, lowest + HEIGHT_RANGE, _HEIGHT, _STEPS)
+
+
+def quantity_annotations() -> rr.AnnotationContext:
+    """Return colours and labels of all class ids that raw points can have."""
+    steps, shares = _ramp(_STEPS), _ramp(_SHARES)
+    depth = entities.DEPTH_RANGE / _DEPTHS
+    rings = palette().tolist()
+    scales = [
+        *(
+            _info(_HEIGHT + step, f"{step * HEIGHT_RANGE / _STEPS:.1f} m high", color)
+            for step, color in enumerate(steps)
+        ),
+        *(
+            _info(_DISTANCE + step, f"{step * depth:.0f} m away", color)
+            for step, color in enumerate(steps[::-1])
+        ),
+        *(
+            _info(_INTENSITY + step, f"intensity {100 * step // _SHARES} %", color)
+            for step, color in enumerate(shares)
+        ),
+        *(
+            _info(_TIME + step, f"{100 * step // _SHARES} % into the scan", color)
+            for step, color in enumerate(shares)
+        ),
+        *(_info(_RING + step, f"ring {step}", rings[step % len(rings)]) for step in range(_RINGS)),
+        _info(_ABSENT, "not in this cloud", (130, 130, 140)),
+    ]
+    return rr.AnnotationContext([*point_classes(), *scales])
+
+
+def quantity_visualizer(by: Quantity) -> rrb.Visualizer:
+    """Return a visualizer that colours raw points by a quantity."""
+    return rr.Points3D.from_fields().visualizer(
+        mappings=[
+            VisualizerComponentMapping(
+                "Points3D:class_ids",
+                ComponentSourceKind.SourceComponent,
+                source_component=f"{COMPONENTS}:{by}",
+            ),
+            VisualizerComponentMapping("Points3D:colors", ComponentSourceKind.AnnotationContext),
+        ]
+    )
+
+
+def _info(number: int, label: str, color: Sequence[int]) -> rr.AnnotationInfo:
+    return rr.AnnotationInfo(id=number, label=label, color=color)
+
+
+def _ramp(count: int) -> list[list[int]]:
+    """Return ``count`` colours of the turbo map, without the dark end that is invisible on black."""
+    dark = count // 10
+    ramp: list[list[int]] = turbo(count + dark)[dark:].tolist()
+    return ramp
+
+
+def _scaled(values: NDArray[Any], low: float, high: float, base: int, count: int) -> NDArray[np.uint8]:
+    """Map values linearly to ``count`` class ids from ``base``. Large values and NaN get the last id."""
+    factor = np.float32(count / max(high - low, 1e-9))
+    if values.dtype == np.float32:
+        return _scaled_ids(values, np.float32(low), factor, base, count)
+    rows = (values - low) * factor
+    return (np.fmax(np.fmin(rows, np.float32(count - 1)), np.float32(0)) + np.float32(base)).astype(np.uint8)
+
+
+@kernel
+def _scaled_ids(values: F32, low: np.float32, factor: np.float32, base: int, count: int) -> NDArray[np.uint8]:
+    """Return ``_scaled`` of 32-bit values, in one pass."""
+    ids = np.empty(len(values), np.uint8)
+    first, last = np.float32(base), np.float32(count - 1)
+    for i in range(len(values)):
+        row = (values[i] - low) * factor
+        if not row < last:
+            row = last
+        ids[i] = np.uint8(max(row, np.float32(0)) + first)
+    return ids
+
+
+@kernel
+def _distance_ids(points: F32, steps_per_metre: np.float32) -> NDArray[np.uint8]:
+    """Return the class id of each point by its distance from the LiDAR."""
+    ids = np.empty(len(points), np.uint8)
+    first, last = np.float32(_DISTANCE), np.float32(_DEPTHS - 1)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        row = np.sqrt(x * x + y * y + z * z) * steps_per_metre
+        if not row < last:
+            row = last
+        ids[i] = np.uint8(row + first)
+    return ids
+
+
+def _brightest(values: NDArray[Any]) -> float:
+    """Return the end of the intensity scale: the 99th percentile, rounded up to 1, 1.4, 2, 2.8 and so on.
+
+    The coarse steps keep the scale constant between most scans.
+    """
+    sample = values[:: len(values) // 5_000 + 1]
+    sample = sample[np.isfinite(sample)]
+    percentile = float(np.percentile(sample, 99)) if len(sample) else 0.0
+    return float(2.0 ** (np.ceil(np.log2(percentile) * 2) / 2)) if percentile > 0 else 1.0
+
+
+# --- clusters ----------------------------------------------------------------------------------
+
+
+def log_cluster_style(to: Writer, lidars: Iterable[str]) -> None:
+    """Log the static style of the clusters of each LiDAR."""
+    for lidar in lidars:
+        to.static(
+            entities.clusters(lidar),
+            rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
+            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
+        )
+        to.static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
+
+
+def log_clusters(
+    to: Writer,
+    frame: Frame,
+    clusters: Clusters,
+    tracked: Tracks | None,
+    obstacles: F32,
+    config: ClusteringConfig,
+    packed: float | None = None,
+) -> None:
+    """Log clusters in the colours of their tracks.
+
+    Args:
+        to: writer of the recording.
+        frame: frame of the clusters.
+        clusters: all clusters of the frame.
+        tracked: tracks that give the colours; None: there are no tracks.
+        obstacles: (P, 3) points, in the order of ``clusters.labels``.
+        config: parameters of the clustering.
+        packed: steps per metre to which points are rounded (0: no rounding). Points are also sorted by
+            cluster. None: points are logged unchanged.
+    """
+    boxes = clusters.boxes(config)
+    kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
+    if len(kept):
+        member = in_kept_clusters(clusters)
+        points, labels = obstacles.compress(member, axis=0), clusters.labels.compress(member)
+        if packed is not None:
+            rows = retention.sorted_rows(points, packed, labels)
+            points, labels = round_points(points.take(rows, axis=0), packed), labels.take(rows)
+        point_ids, box_ids = _cluster_colors(clusters, tracked, labels, kept)
+        to.put(
+            entities.clusters(frame.lidar),
+            rr.Points3D(points, class_ids=point_ids),
+            boxes3d(boxes, kept, [f"{row}" for row in kept], class_ids=box_ids),
+        )
+    if len(others):
+        states = [ClusterState(state) for state in clusters.state[others].tolist()]
+        to.put(
+            entities.set_aside(frame.lidar),
+            boxes3d(
+                boxes,
+                others,
+                [f"{row}: {count} points" for row, count in zip(others, clusters.count[others], strict=True)],
+                class_ids=[entities.CLUSTER_CLASS[state] for state in states],
+            ),
+        )
+
+
+def in_kept_clusters(clusters: Clusters) -> Bool:
+    """Return the (P,) mask of obstacle points in kept clusters."""
+    return np.append(clusters.kept, False).take(clusters.labels)  # the label -1 is noise
+
+
+def _cluster_colors(
+    clusters: Clusters, tracked: Tracks | None, labels: I32, kept: I64
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    """Return class ids of the points with these labels, and of the boxes of the kept clusters."""
+    colors = track_class_ids(track_ids_of_clusters(tracked, len(clusters)))
+    return colors.take(labels), colors[kept]

@@ -14,52 +14,56 @@ from bevviz.config import Config
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.annotations import log_world
-from bevviz.recording.anomalies import log_anomalies, log_anomaly_style
-from bevviz.recording.bev import log_bev, log_grid
-from bevviz.recording.camera import (
-    VideoEncoders,
-    log_camera,
-    log_camera_style,
-    log_detections,
-    log_intrinsics,
-    log_projected_points,
+from bevviz.recording.boxes import (
+    TrackLanes,
+    clear_late,
+    log_late,
+    log_object_style,
+    log_objects,
+    log_robot,
+    log_speeds,
+    log_track_style,
+    log_tracks,
+    log_truth,
+    log_truth_style,
 )
 from bevviz.recording.cloud import (
+    RawCloudLog,
+    in_kept_clusters,
     log_cloud,
     log_cloud_poses,
     log_cloud_style,
+    log_cluster_style,
+    log_clusters,
     log_ground,
     log_obstacles,
-    raw_clouds,
     round_points,
     round_voxels,
 )
-from bevviz.recording.clusters import in_kept_clusters, log_cluster_style, log_clusters
 from bevviz.recording.decisions import log_decisions
-from bevviz.recording.frustums import log_frustums
-from bevviz.recording.health import FrameRates, log_health, log_health_style
-from bevviz.recording.objects import log_object_style, log_objects
+from bevviz.recording.health import FrameRates, log_anomalies, log_anomaly_style, log_health, log_health_style
+from bevviz.recording.images import (
+    VideoEncoders,
+    log_bev,
+    log_camera,
+    log_camera_style,
+    log_detections,
+    log_frustums,
+    log_grid,
+    log_intrinsics,
+    log_projected_points,
+)
 from bevviz.recording.opinions import (
     log_fusion,
     log_opinion_style,
     log_opinions_in_bev,
     log_opinions_in_images,
 )
-from bevviz.recording.primitives import transform
+from bevviz.recording.primitives import log_world, transform
 from bevviz.recording.properties import log_run_settings
-from bevviz.recording.reference_boxes import (
-    clear_late,
-    log_late,
-    log_robot,
-    log_truth,
-    log_truth_style,
-)
 from bevviz.recording.retention import (
     CLUSTER_STEPS,
     OTHER_STEPS,
-    RawCloudFrame,
-    RawCloudSelector,
     keeps_everything,
     rounding_scale,
     sorted_rows,
@@ -74,7 +78,6 @@ from bevviz.recording.surroundings import (
     mark_lines,
     static_data_makers,
 )
-from bevviz.recording.tracks import TrackLanes, log_speeds, log_track_style, log_tracks
 from bevviz.recording.writer import Writer
 
 LATE_RESULT_LIFETIME = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
@@ -135,10 +138,7 @@ class FrameLogger(Writer):
         self._onsets = Onsets()
         self._last_frame: Frame | None = None
         self._rates = FrameRates()
-        self._videos, self._cloud_selector = VideoEncoders(), RawCloudSelector()
-        self._raw_shown: set[str] = set()  # entities with the raw clouds of the previous frame
-        self._raw_known: set[str] = set()
-        self._watched_states: dict[str, str] = {}  # state lane of the pipeline or a camera -> its state
+        self._videos, self._raw_clouds = VideoEncoders(), RawCloudLog()
         self._config_changed = False  # whether the configuration changed before this frame
         self._late_stamps: dict[str, int] = {}  # topic of late robot results -> stamp of the newest
 
@@ -154,7 +154,7 @@ class FrameLogger(Writer):
     @property
     def clouds_left_out(self) -> int:
         """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
-        return self._cloud_selector.left_out
+        return self._raw_clouds.left_out
 
     @property
     def results(self) -> frozenset[str]:
@@ -168,7 +168,7 @@ class FrameLogger(Writer):
         """
         super().refresh(known)
         self._videos.restart()
-        self._raw_shown = set(self._raw_known)
+        self._raw_clouds.refresh()
         if not self._inputs:
             self._previous_entities -= self._input_entities
 
@@ -391,36 +391,20 @@ class FrameLogger(Writer):
             log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
 
     def _log_selected_clouds(self, result: FrameResult, *, is_event: bool) -> None:
-        """Log the raw clouds of this frame and of buffered earlier frames, if they are wanted.
+        """Log the raw clouds of this frame and of earlier frames, if they are wanted.
 
         Call it after anomalies and states are logged, because changes in them select the clouds.
         """
-        frame, clouds = result.frame, raw_clouds(result)
         lanes = [
             entities.state("pipeline"),
             *(entities.state(camera.camera.name) for camera in result.cameras),
         ]
-        watched = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
-        is_event |= any(self._watched_states.get(lane, state) != state for lane, state in watched.items())
-        is_user_event = bool(mark_lines(frame)) or self._config_changed
-        self._watched_states, self._config_changed = watched, False
-        clock, left_out = (frame.index, frame.stamp, frame.received), self._cloud_selector.left_out
-        selected = self._cloud_selector.select(
-            RawCloudFrame(clock, clouds), self._config.logging, is_event=is_event, is_requested=is_user_event
+        states = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
+        is_requested = bool(mark_lines(result.frame)) or self._config_changed
+        self._config_changed = False
+        self._raw_clouds.log(
+            self, result, self._config.logging, states, is_event=is_event, is_requested=is_requested
         )
-        if self._cloud_selector.left_out > left_out:
-            text = f"logging.raw_share is reached; {self._cloud_selector.left_out} times so far"
-            self.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {text}")])
-        for frame_clouds in selected:
-            self.set_time(*frame_clouds.clock)
-            for path, points, class_ids in frame_clouds.clouds:
-                self.write(path, rr.Points3D(points, class_ids=class_ids))
-        self.set_time(*clock)
-        shown_paths = {path for path, _, _ in clouds} if selected else set()
-        for path in sorted(self._raw_shown - shown_paths):
-            self.write(path, rr.Clear(recursive=False))
-        self._raw_shown = shown_paths
-        self._raw_known |= shown_paths
 
     def _log_states(self, result: FrameResult, extra_states: Mapping[str, str]) -> None:
         states = {**states_of(result), **extra_states}

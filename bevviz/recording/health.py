@@ -1,17 +1,18 @@
-"""Log health numbers of a frame: times, rates, counts, clock errors."""
+"""Log numbers of a frame over time: times, rates, counts, clock errors, anomalies."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
 
+from bevviz.anomalies import KINDS
 from bevviz.model.colors import SERIES_COLORS
 from bevviz.model.counts import count_results
 from bevviz.model.frame import Frame
-from bevviz.model.results import FrameResult
+from bevviz.model.results import Anomaly, FrameResult
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
 
@@ -97,3 +98,27 @@ def health(result: FrameResult, last: Frame | None, rates: FrameRates) -> Iterat
     for camera in result.cameras:
         yield entities.sync_error(camera.camera.name), camera.camera.sync_error * 1e3
         yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3
+
+
+# --- anomalies ---------------------------------------------------------------------------------
+
+
+def log_anomaly_style(to: Writer) -> None:
+    """Log the static names of the anomaly count curves."""
+    to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
+
+
+def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -> None:
+    """Log new anomalies as lines, and the number of anomalies of each kind.
+
+    Args:
+        to: writer of the recording.
+        result: results of the frame.
+        started: anomalies that begin in this frame.
+    """
+    to.lines(
+        entities.ANOMALY_LOG,
+        [(new_anomaly.severity, f"{new_anomaly.kind}: {new_anomaly.text}") for new_anomaly in started],
+    )
+    count = Counter(anomaly.kind for anomaly in result.anomalies)
+    to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

@@ -14,9 +14,8 @@ from bevviz.model.counts import OPINIONS as COUNTED
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Camera
 from bevviz.model.results import FrameResult, Objects, Opinion
 from bevviz.recording import entities
-from bevviz.recording.bev import bev_pixels, ground_outlines
-from bevviz.recording.camera import image_frame
 from bevviz.recording.health import COUNTS
+from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
 from bevviz.recording.labels import (
     FROM_ABOVE,
     IN_IMAGE,

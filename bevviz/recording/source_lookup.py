@@ -27,8 +27,8 @@ from bevviz.config.pillars import is_network_file
 from bevviz.errors import UserError, first_line
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
-from bevviz.recording.decoding import check_decodes
 from bevviz.recording.provenance import model_path, names_path
+from bevviz.recording.rerun_cli import check_decodes
 from bevviz.support.files import bag_files, open_regular, sampled_files
 from bevviz.support.text import path_text
 

@@ -11,7 +11,8 @@ import rerun.blueprint as rrb
 from bevviz.config.sections import Quantity
 from bevviz.model.counts import OPINIONS
 from bevviz.model.frame import Scene
-from bevviz.recording import color_by, entities
+from bevviz.recording import entities
+from bevviz.recording.cloud import quantity_visualizer
 from bevviz.recording.health import COUNTS
 from bevviz.recording.labels import EYE, LOOK_TARGET
 
@@ -63,7 +64,7 @@ def space(
     hidden += [*name_entities] if why or not names else []
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
-        overrides |= {root + path: color_by.visualizer(by) for path in clouds}
+        overrides |= {root + path: quantity_visualizer(by) for path in clouds}
     position, target = EYE, LOOK_TARGET
     if why and scene.focus is not None:
         position, target = _eye_near(scene.focus), scene.focus

@@ -18,12 +18,11 @@ from bevviz.config import Config, Layer, changes, flat_yaml, load, object_files
 from bevviz.errors import UserError
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.progress_bar import Progress
-from bevviz.pipeline.run import run
+from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
-from bevviz.recording.decoding import check_decodes, reader_errors_as_user_errors
 from bevviz.recording.provenance import differences, file_hash, model_path, provenance
+from bevviz.recording.rerun_cli import check_decodes, reader_errors_as_user_errors
 from bevviz.report.bag_window import open_window
 from bevviz.report.facts import ReportInfo
 from bevviz.report.fingerprints import (

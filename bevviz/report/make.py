@@ -23,8 +23,7 @@ from bevviz.model.frame import Camera, Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.notes import Note
-from bevviz.pipeline.progress_bar import Progress
-from bevviz.pipeline.run import run
+from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.recording.primitives import document

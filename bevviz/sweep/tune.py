@@ -20,7 +20,7 @@ from bevviz.model.frame import Frame, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations
-from bevviz.pipeline.variants import Variants, check_same_frames
+from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.primitives import document

@@ -12,8 +12,7 @@ from bevviz.model import geometry
 from bevviz.model.colors import FATE_COLORS
 from bevviz.model.frame import F32, U8, Camera, Frame
 from bevviz.recording import entities
-from bevviz.recording.bev import bev_pixels, ground_outlines
-from bevviz.recording.camera import image_frame
+from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
 from bevviz.recording.primitives import boxes2d, document, edges, transform
 from bevviz.recording.writer import Writer
 from bevviz.why.answer import Answer

@@ -12,10 +12,10 @@ from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.results import CameraResult, FrameResult, Tracks
 from bevviz.recording import entities
+from bevviz.recording.boxes import confirmed_rows
 from bevviz.recording.labels import box_row
 from bevviz.recording.opinions import MISSED, opinion_outlines_in_bev, opinion_outlines_in_image
 from bevviz.recording.primitives import CORNER
-from bevviz.recording.tracks import confirmed_rows
 
 Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cell"]
 

@@ -13,8 +13,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.bev import bev_pixels, ground_outlines
-from bevviz.recording.camera import image_frame
+from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
 from bevviz.recording.labels import choose_named_in_3d
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, transform
 from bevviz.recording.writer import Writer

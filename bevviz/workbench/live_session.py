@@ -18,8 +18,7 @@ from bevviz.live.thinning import chosen
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations
-from bevviz.pipeline.session import Session
-from bevviz.pipeline.variants import Variants
+from bevviz.pipeline.session import Session, Variants
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION

@@ -26,7 +26,7 @@ from bevviz.model.results import FrameResult, Objects, Tracks
 from bevviz.pipeline.notes import Note, Notes
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
-from bevviz.pipeline.variants import Variants, check_same_frames
+from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import blueprints, entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION

@@ -17,8 +17,7 @@ from bevviz.model.counts import OPINIONS, count_opinions
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
-from bevviz.pipeline.session import Session
-from bevviz.pipeline.variants import check_same_frames
+from bevviz.pipeline.session import Session, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.writer import SCALAR_WAIT

@@ -1,34 +1,50 @@
-"""Log a camera: pose, intrinsics, image, detections and projected obstacle points."""
+"""Log cameras with their detections, points and frustums, and the bird's-eye view."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import rerun as rr
 
+from bevviz.config import BevConfig, Config
 from bevviz.model import geometry
 from bevviz.model.colors import class_color, color_rows
 from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import (
+    Bev,
     CameraResult,
     Decision,
     Detections,
     DetectionState,
     Explanation,
+    FrameResult,
     Masks,
 )
 from bevviz.recording import entities, retention
-from bevviz.recording.annotations import FAINT_COLOR, depth_annotations
 from bevviz.recording.labels import (
     IN_IMAGE,
     choose_named,
     log_image_box_label_style,
     log_image_box_labels,
 )
-from bevviz.recording.primitives import CORNER, boxes2d, encode_image, scored, texts_by_row, transform
+from bevviz.recording.primitives import (
+    CORNER,
+    FAINT_COLOR,
+    blob,
+    boxes2d,
+    depth_annotations,
+    edges,
+    encode_image,
+    jpeg,
+    png,
+    scored,
+    texts_by_row,
+    transform,
+)
 from bevviz.recording.writer import Writer
 
 if TYPE_CHECKING:
@@ -167,10 +183,10 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
         return
     kept, others = np.flatnonzero(detections.kept), np.flatnonzero(~detections.kept)
     if len(others):
-        to.put(entities.weak(name), _boxes(detections, others))
+        to.put(entities.weak(name), _detection_boxes(detections, others))
     if len(kept):
         colors = [class_color(detections.names[row]) for row in kept]
-        to.put(entities.detections(name), _boxes(detections, kept, colors=colors))
+        to.put(entities.detections(name), _detection_boxes(detections, kept, colors=colors))
         texts = texts_by_row(explanations, "detection", name)
         if detections.masks is not None:
             _log_masks(to, name, detections, detections.masks, kept)
@@ -223,7 +239,7 @@ def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows
         to.put(entities.masks(name), rr.LineStrips2D(lines, colors=colors))
 
 
-def _boxes(detections: Detections, rows: I64, **style: Any) -> rr.Boxes2D:
+def _detection_boxes(detections: Detections, rows: I64, **style: Any) -> rr.Boxes2D:
     return boxes2d(
         detections.xyxy[rows],
         scored((detections.names[row] for row in rows), detections.score[rows]),
@@ -253,3 +269,120 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
                 depth[rows],
             )
         to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))
+
+
+# --- frustums ----------------------------------------------------------------------------------
+
+_NEAR = 0.3  # metres from the camera
+_UNMATCHED_COLOR = (80, 80, 92)
+_UNMATCHED_DEPTH = 20.0  # metres to the far end of an unmatched detection's frustum
+
+
+def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> None:
+    """Log the frustum of every kept detection in the fixed frame. Unmatched ones are grey."""
+    strips: list[F32] = []
+    colors: list[tuple[int, ...]] = []
+    labels: list[str] = []
+    for camera in cameras:
+        pose, intrinsics = camera_pose(frame, camera), camera.camera.intrinsics
+        detections, fusion = camera.detections, camera.fusion
+        if pose is None or intrinsics is None or detections is None or fusion is None:
+            continue
+        rows = np.flatnonzero(detections.kept)
+        if len(rows) == 0:
+            continue
+        far = np.full(len(detections), _UNMATCHED_DEPTH, np.float32)
+        matched = fusion.detection_decision == Decision.MATCHED
+        pairs = fusion.pairs
+        is_best = matched[pairs.detection] & (fusion.detection_cluster[pairs.detection] == pairs.cluster)
+        far[pairs.detection[is_best]] = pairs.depth[is_best]
+        near = np.full(len(rows), _NEAR, np.float32)
+        corners = geometry.frustum(detections.xyxy[rows], intrinsics, near, far[rows])
+        corners = geometry.apply(pose, corners.reshape(-1, 3)).reshape(-1, 8, 3)
+        names = [detections.names[row] for row in rows]
+        strips.append(edges(corners))
+        colors += [
+            class_color(name) if is_matched else _UNMATCHED_COLOR
+            for name, is_matched in zip(names, matched[rows], strict=True)
+        ]
+        labels += scored(names, detections.score[rows])
+    if strips:
+        to.put(
+            entities.FRUSTUMS,
+            rr.LineStrips3D(
+                np.concatenate(strips),
+                colors=colors,
+                labels=labels,
+                radii=rr.Radius.ui_points(1.0),
+                show_labels=False,
+            ),
+        )
+
+
+# --- bird's-eye view ---------------------------------------------------------------------------
+
+_GRID_ROTATION = np.array(
+    [0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)]
+)  # rotation by -90 degrees about z, as x, y, z, w
+
+
+def log_bev(to: Writer, bev: Bev, config: Config) -> None:
+    """Log the bird's-eye image and its channels.
+
+    The reference style is logged as PNG, so that pixels equal those of the tutorial. The others are JPEG.
+    """
+    quality = config.logging.jpeg_quality if retention.keeps_everything(config) else retention.BEV_QUALITY
+    is_reference = config.bev.style == "reference"
+    to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
+    for name, grid in bev.channels.items():
+        if name != "occupancy":
+            to.put(entities.channel(name), rr.Image(grid, color_model="L"))
+
+
+def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:
+    """Log the occupancy grid on the ground. The pose of a grid map is the pose of its lower left corner.
+
+    The pose is part of the grid map, not a separate transform. The viewer keeps the transforms of the whole
+    drive, and a chunk stays in memory as a whole. A transform in the chunk would keep every grid in memory.
+    """
+    grid = bev.channels.get("occupancy")
+    if grid is None:
+        return
+    level = 0.0
+    if result.ground is not None and result.voxels is not None:
+        heights = result.voxels.points[::32, 2].compress(result.ground.mask[::32])
+        level = float(np.median(heights)) if len(heights) else 0.0
+    corner = np.array([-bev.range_x, bev.range_y, level - 0.05])
+    pose = result.frame.pose @ geometry.transform(corner, _GRID_ROTATION)
+    to.put(
+        entities.GRID,
+        _grid_style(*grid.shape, bev.resolution),
+        rr.GridMap.from_fields(
+            data=blob(grid.view(np.uint8).ravel()),
+            translation=pose[:3, 3],
+            quaternion=rr.Quaternion(xyzw=geometry.quaternion(pose)),
+        ),
+    )
+
+
+@lru_cache(maxsize=2)
+def _grid_style(rows: int, columns: int, resolution: float) -> rr.GridMap:
+    return rr.GridMap.from_fields(
+        format=rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U8"),
+        cell_size=resolution,
+        opacity=0.2,
+        colormap=rr.components.Colormap.RvizMap,
+    )
+
+
+def bev_pixels(config: BevConfig, points_from_frame: F64, positions: F32) -> F32:
+    """Project (..., 3) positions to (..., 2) pixels of the bird's-eye image."""
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    xy = geometry.apply(points_from_frame, positions.reshape(-1, 3))[:, :2]
+    pixels = ((reach - xy) / np.float32(config.resolution))[:, ::-1]
+    return np.asarray(pixels, np.float32).reshape(*positions.shape[:-1], 2)
+
+
+def ground_outlines(corners: F32) -> F32:
+    """Return (K, 5, 3) closed outlines on the ground for (K, 8, 3) box corners."""
+    return corners[:, [0, 1, 2, 3, 0]]
