@@ -50,7 +50,6 @@ from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE, TRACK_COLORS, Cla
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.health import FrameRates
 from bevviz.recording.sinks import open_recording
-from bevviz.stages.bev import bev
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.tracking import Tracker
 from bevviz.support.files import unfinished_files

@@ -23,7 +23,7 @@ from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.session import Variants
+from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
 from bevviz.support.text import printable
