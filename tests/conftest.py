@@ -28,6 +28,7 @@ REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_snap")
 FIRST = (
     *("test_workbench", "test_calib", "test_example_notebooks", "test_torture_benchmark"),
     *("test_damaged_bags", "test_live_ros", "test_live"),
+    *("test_workbench_live", "test_benchmarks", "test_batch", "test_why"),
 )
 
 
