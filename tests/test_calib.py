@@ -235,7 +235,7 @@ def test_planted_errors_are_found_in_kitti(kitti: list[Frame], planted: dict[str
 
 
 def test_repeated_views_count_as_three(kitti: list[Frame]) -> None:
-    once, often = (calibrate(shots_of(kitti[:3] * times)) for times in (1, 8))
+    once, often = (calibrate(shots_of(kitti[:3] * times)) for times in (1, 4))
     assert once.by(AxisFinding.FINE)
     assert covers(often)
     for axis, again in zip(once.axes[:TIME], often.axes[:TIME], strict=True):

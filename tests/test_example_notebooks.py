@@ -21,6 +21,8 @@ def test_every_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.Mon
     )
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "outputs are not kept: they age"
+    for cell in notebook.cells:  # it runs the drive four times, which fewer frames show as well
+        cell.source = cell.source.replace("simulate(frames=20,", "simulate(frames=14,")
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     said = "\n".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
     if path.stem == "first_look":

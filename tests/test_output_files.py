@@ -80,19 +80,21 @@ def test_only_one_process_writes_a_file() -> None:
 def test_two_runs_cannot_write_one_recording(tmp_path: Path, capsys: Capture) -> None:
     """The second ends at once, the first is what it would have been."""
     bags.write(Path("drive"), bags.small_items(scans=3))
-    command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "12", "--save", "out.rrd"]
+    command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "2", "--save", "out.rrd"]
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as first:
         try:
             deadline = time.monotonic() + 60
             while not unfinished_files(Path("out.rrd")) and time.monotonic() < deadline:
                 time.sleep(0.05)
+            first.send_signal(signal.SIGSTOP)  # it cannot end before the second is tried
             said = error_of(capsys, "bag", "drive", "--save", "out.rrd")
             assert "out.rrd: another process is writing it" in said
+            first.send_signal(signal.SIGCONT)
             assert first.wait(PATIENCE) == 0
         finally:
             first.kill()
     verify(tmp_path / "out.rrd")
-    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 12
+    assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 2
 
 
 def test_a_link_is_followed_and_a_pipe_refused() -> None:
@@ -206,9 +208,10 @@ def test_a_link_to_another_bag_is_not_followed(capsys: Capture) -> None:
 def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     """As on a full disk, writing fails from some megabytes on; what is there can be read."""
     Path("out.rrd").write_text("an older result")
-    limit = 12_000_000
+    limit, scans = 12_000_000, 80
+    bags.write(Path("drive"), bags.small_items(scans=scans, points=20_000))
     done = subprocess.run(
-        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "1000", "--save", "out.rrd"],
+        [sys.executable, "-m", "bevviz.cli", "bag", "drive", "--save", "out.rrd"],
         env=environment(),
         capture_output=True,
         text=True,
@@ -223,7 +226,7 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     assert f"what was made until then is in {left.name}" in errors[0]
     assert Path("out.rrd").read_text() == "an older result"
     frames = len(Recording(left).rows["/bev"])
-    assert 0 < frames < 1000
+    assert 0 < frames < scans
 
 
 def test_a_full_temporary_disk_names_its_folder(
