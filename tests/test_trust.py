@@ -119,7 +119,7 @@ def test_a_recording_does_not_run_the_pickle_in_its_bag(
         if through == "yaml":
             sly_yaml = 'model: "pickle:loads"'
             patch.setattr(
-                "bevviz.recording.properties.config_yaml",
+                "bevviz.recording.frame_logger.config_yaml",
                 lambda config: config_yaml(config).replace('model: ""', sly_yaml),
             )
         assert main(["bag", "bug.mcap", "--save", "bug.rrd"]) == 0

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from bevviz.config import ClusteringConfig, LoggingConfig
+from bevviz.config import ClusteringConfig
 from bevviz.config.sections import Quantity
 from bevviz.model.colors import palette, turbo
 from bevviz.model.frame import F32, I32, I64, RING_FIELDS, Bool, Frame
@@ -21,11 +21,10 @@ from bevviz.recording import entities, retention
 from bevviz.recording.boxes import track_class_ids, track_ids_of_clusters
 from bevviz.recording.entities import ClassId
 from bevviz.recording.primitives import OUTLINE, boxes3d, point_classes, rounded, transform
+from bevviz.recording.retention import RawCloud
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support.kernel import kernel
-
-RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each point
 
 
 def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:
@@ -79,66 +78,6 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
     return clouds
 
 
-class RawCloudLog:
-    """Logger of raw clouds for recordings that keep those of selected frames only."""
-
-    def __init__(self) -> None:
-        self._selector = retention.RawCloudSelector()
-        self._shown: set[str] = set()  # entities with the raw clouds of the previous frame
-        self._known: set[str] = set()
-        self._states: Mapping[str, str] = {}
-
-    @property
-    def left_out(self) -> int:
-        """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
-        return self._selector.left_out
-
-    def refresh(self) -> None:
-        """Clear all raw clouds that the next frame lacks."""
-        self._shown = set(self._known)
-
-    def log(
-        self,
-        to: Writer,
-        result: FrameResult,
-        config: LoggingConfig,
-        states: Mapping[str, str],
-        *,
-        is_event: bool,
-        is_requested: bool,
-    ) -> None:
-        """Log the raw clouds of a frame and of buffered earlier frames, if they are wanted.
-
-        Args:
-            to: writer of the recording.
-            result: results of the frame.
-            config: limits.
-            states: states of the pipeline and the cameras, by lane. A change selects the clouds.
-            is_event: whether an anomaly begins in this frame.
-            is_requested: see ``RawCloudSelector.select``.
-        """
-        frame, clouds = result.frame, raw_clouds(result)
-        is_event |= any(self._states.get(lane, state) != state for lane, state in states.items())
-        self._states = states
-        clock, left_out = (frame.index, frame.stamp, frame.received), self.left_out
-        selected = self._selector.select(
-            retention.RawCloudFrame(clock, clouds), config, is_event=is_event, is_requested=is_requested
-        )
-        if self.left_out > left_out:
-            text = f"logging.raw_share is reached; {self.left_out} times so far"
-            to.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {text}")])
-        for frame_clouds in selected:
-            to.set_time(*frame_clouds.clock)
-            for path, points, class_ids in frame_clouds.clouds:
-                to.write(path, rr.Points3D(points, class_ids=class_ids))
-        to.set_time(*clock)
-        shown = {path for path, _, _ in clouds} if selected else set()
-        for path in sorted(self._shown - shown):
-            to.write(path, rr.Clear(recursive=False))
-        self._shown = shown
-        self._known |= shown
-
-
 def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bool = False) -> None:
     """Log the ground voxels.
 
@@ -151,11 +90,7 @@ def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bo
     if result.voxels is None or result.ground is None:
         return
     ground = result.voxels.points.compress(result.ground.mask, axis=0)
-    if packed:
-        scale = retention.rounding_scale(voxel_size, retention.OTHER_STEPS)
-        ground = round_points(ground.take(retention.sorted_rows(ground, scale), axis=0), scale)
-    else:
-        ground = round_voxels(ground, voxel_size)
+    ground = packed_points(ground, voxel_size) if packed else round_voxels(ground, voxel_size)
     _log_class(to, entities.ground(result.frame.lidar), ground, ClassId.GROUND)
 
 
@@ -178,6 +113,12 @@ def round_voxels(points: F32, voxel_size: float) -> F32:
     if voxel_size == 0:
         return points
     return rounded(points, 2.0 ** np.floor(np.log2(8 / voxel_size)))
+
+
+def packed_points(points: F32, voxel_size: float) -> F32:
+    """Round and sort voxels outside of clusters, as in recordings that do not keep everything."""
+    scale = retention.rounding_scale(voxel_size, retention.OTHER_STEPS)
+    return round_points(points.take(retention.sorted_rows(points, scale), axis=0), scale)
 
 
 def round_points(points: F32, scale: float) -> F32:
@@ -410,7 +351,7 @@ def log_clusters(
     boxes = clusters.boxes(config)
     kept, others = np.flatnonzero(clusters.kept), np.flatnonzero(~clusters.kept)
     if len(kept):
-        member = in_kept_clusters(clusters)
+        member = _in_kept_clusters(clusters)
         points, labels = obstacles.compress(member, axis=0), clusters.labels.compress(member)
         if packed is not None:
             rows = retention.sorted_rows(points, packed, labels)
@@ -434,7 +375,12 @@ def log_clusters(
         )
 
 
-def in_kept_clusters(clusters: Clusters) -> Bool:
+def unclustered(obstacles: F32, clusters: Clusters) -> F32:
+    """Return the obstacle points outside of kept clusters."""
+    return obstacles.compress(~_in_kept_clusters(clusters), axis=0)
+
+
+def _in_kept_clusters(clusters: Clusters) -> Bool:
     """Return the (P,) mask of obstacle points in kept clusters."""
     return np.append(clusters.kept, False).take(clusters.labels)  # the label -1 is noise
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import Onsets
-from bevviz.config import Config
+from bevviz.config import Config, config_yaml, stated_lines
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -28,8 +29,6 @@ from bevviz.recording.boxes import (
     log_truth_style,
 )
 from bevviz.recording.cloud import (
-    RawCloudLog,
-    in_kept_clusters,
     log_cloud,
     log_cloud_poses,
     log_cloud_style,
@@ -37,8 +36,10 @@ from bevviz.recording.cloud import (
     log_clusters,
     log_ground,
     log_obstacles,
-    round_points,
+    packed_points,
+    raw_clouds,
     round_voxels,
+    unclustered,
 )
 from bevviz.recording.decisions import log_decisions
 from bevviz.recording.health import FrameRates, log_anomalies, log_anomaly_style, log_health, log_health_style
@@ -59,14 +60,14 @@ from bevviz.recording.opinions import (
     log_opinions_in_bev,
     log_opinions_in_images,
 )
-from bevviz.recording.primitives import log_world, transform
-from bevviz.recording.properties import log_run_settings
+from bevviz.recording.primitives import document, log_world, transform
+from bevviz.recording.provenance import versions
 from bevviz.recording.retention import (
     CLUSTER_STEPS,
-    OTHER_STEPS,
+    RawCloudLog,
     keeps_everything,
+    omitted_data,
     rounding_scale,
-    sorted_rows,
 )
 from bevviz.recording.states import COLORS, StateLanes, states_of, track_states
 from bevviz.recording.surroundings import (
@@ -79,6 +80,7 @@ from bevviz.recording.surroundings import (
     static_data_makers,
 )
 from bevviz.recording.writer import Writer
+from bevviz.support.text import fenced, markdown
 
 LATE_RESULT_LIFETIME = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
 
@@ -359,36 +361,23 @@ class FrameLogger(Writer):
             log_intrinsics(self, name, intrinsics)
 
     def _log_lidar_results(self, result: FrameResult) -> None:
+        """Log ground, obstacles and clusters. Unless everything is kept, each voxel is logged once."""
         frame, config, clusters = result.frame, self._config, result.clusters
-        if not keeps_everything(config):
-            self._log_packed_results(result)
+        size, obstacles = config.voxel.size, result.obstacles
+        is_packed, is_report = not keeps_everything(config), config.logging.keep == "report"
+        if not is_report:
+            log_ground(self, result, size, packed=is_packed)
+        if obstacles is None:
             return
-        log_ground(self, result, config.voxel.size)
-        if result.obstacles is None:
-            return
-        obstacles = round_voxels(result.obstacles, config.voxel.size)
-        log_obstacles(self, frame, obstacles)
+        if not is_packed:
+            obstacles = round_voxels(obstacles, size)
+            log_obstacles(self, frame, obstacles)
+        elif not is_report:
+            others = obstacles if clusters is None else unclustered(obstacles, clusters)
+            log_obstacles(self, frame, packed_points(others, size))
         if clusters is not None:
-            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering)
-
-    def _log_packed_results(self, result: FrameResult) -> None:
-        """Log each voxel once. Voxels of clusters are logged with the clusters."""
-        frame, config, clusters = result.frame, self._config, result.clusters
-        size, ground_too = config.voxel.size, config.logging.keep != "report"
-        if ground_too:
-            log_ground(self, result, size, packed=True)
-        if result.obstacles is None:
-            return
-        if ground_too:
-            unclustered = result.obstacles
-            if clusters is not None:
-                unclustered = unclustered.compress(~in_kept_clusters(clusters), axis=0)
-            scale = rounding_scale(size, OTHER_STEPS)
-            unclustered = round_points(unclustered.take(sorted_rows(unclustered, scale), axis=0), scale)
-            log_obstacles(self, frame, unclustered)
-        if clusters is not None:
-            scale = rounding_scale(size, CLUSTER_STEPS)
-            log_clusters(self, frame, clusters, result.tracks, result.obstacles, config.clustering, scale)
+            scale = rounding_scale(size, CLUSTER_STEPS) if is_packed else None
+            log_clusters(self, frame, clusters, result.tracks, obstacles, config.clustering, scale)
 
     def _log_selected_clouds(self, result: FrameResult, *, is_event: bool) -> None:
         """Log the raw clouds of this frame and of earlier frames, if they are wanted.
@@ -402,8 +391,9 @@ class FrameLogger(Writer):
         states = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
         is_requested = bool(mark_lines(result.frame)) or self._config_changed
         self._config_changed = False
+        clouds, config = raw_clouds(result), self._config.logging
         self._raw_clouds.log(
-            self, result, self._config.logging, states, is_event=is_event, is_requested=is_requested
+            self, result.frame, clouds, config, states, is_event=is_event, is_requested=is_requested
         )
 
     def _log_states(self, result: FrameResult, extra_states: Mapping[str, str]) -> None:
@@ -415,3 +405,41 @@ class FrameLogger(Writer):
         if not self.root:
             states |= diagnostic_states(result.frame)
         self._state_lanes.log(self, states)
+
+
+def log_run_settings(to: Writer, config: Config, scene: Scene, network: str = "") -> None:
+    """Log source, configuration, versions, and the device of the detector's network."""
+    settings = config_yaml(config)
+    stated = stated_lines(config, folders=False)
+    packages = [f"{name} {version}" for name, version in versions().items()]
+    lines = [*map(markdown, stated), *packages, *([f"network on {markdown(network)}"] if network else [])]
+    omitted = list(omitted_data(config.logging))
+    omissions = "".join(f"- {line}\n" for line in omitted)
+    omissions = (
+        f"## Not in this recording (keep: {config.logging.keep})\n\n{omissions}\n" if omissions else ""
+    )
+    to.static(
+        entities.CONFIG,
+        document(
+            "# How this recording was made\n\n"
+            f"Source: **{markdown(scene.name)}**, preset: **{config.preset}**\n\n"
+            f"{omissions}{fenced(settings, 'yaml')}\n\n" + "\n".join(f"- {line}" for line in lines)
+        ),
+    )
+    if not to.root:
+        to.recording.send_recording_name(scene.name)
+    fields: dict[str, Any] = {
+        "source": scene.name,
+        "preset": config.preset,
+        "config": settings,
+        "stated": stated,
+        "versions": packages,
+        "lidars": [name for name in scene.lidars or (scene.lidar,) if name],
+        "cameras": list(scene.cameras),
+        "keep": config.logging.keep,
+        "left_out": omitted,
+        "network": network,
+    }
+    # Rerun omits None and may omit or keep empty values, depending on names that its process has seen.
+    values = rr.AnyValues(**{name: value for name, value in fields.items() if value})
+    to.recording.send_property(entities.PROPERTY + to.root.replace("/", "_"), values)

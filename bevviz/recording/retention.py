@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.config import Config, LoggingConfig
-from bevviz.model.frame import F32, I64
+from bevviz.model.frame import F32, I64, Frame
+from bevviz.recording import entities
+from bevviz.recording.writer import Writer
 
 CLUSTER_STEPS = 4  # rounding steps per voxel for points of clusters, if not everything is kept
 OTHER_STEPS = 2  # the same for the ground and for points without a cluster
@@ -77,12 +81,15 @@ def sorted_rows(points: F32, scale: float, first: I64 | None = None) -> I64:
 # --- raw clouds --------------------------------------------------------------------------------
 
 
+RawCloud: TypeAlias = tuple[str, F32, NDArray[np.uint16]]  # entity, points, class id of each point
+
+
 @dataclass(frozen=True, slots=True)
 class RawCloudFrame:
     """Raw clouds of a frame that may still be selected."""
 
     clock: tuple[int, int, int]  # index, stamp and received
-    clouds: Sequence[tuple[str, F32, NDArray[np.uint16]]]  # entity, points, class id of each point
+    clouds: Sequence[RawCloud]
 
 
 class RawCloudSelector:
@@ -140,3 +147,64 @@ class RawCloudSelector:
             return [frame]
         self._buffer.append(frame)
         return []
+
+
+class RawCloudLog:
+    """Logger of raw clouds for recordings that keep those of selected frames only."""
+
+    def __init__(self) -> None:
+        self._selector = RawCloudSelector()
+        self._shown: set[str] = set()  # entities with the raw clouds of the previous frame
+        self._known: set[str] = set()
+        self._states: Mapping[str, str] = {}
+
+    @property
+    def left_out(self) -> int:
+        """Number of events without raw clouds around them, because the limit of raw clouds was reached."""
+        return self._selector.left_out
+
+    def refresh(self) -> None:
+        """Clear all raw clouds that the next frame lacks."""
+        self._shown = set(self._known)
+
+    def log(
+        self,
+        to: Writer,
+        frame: Frame,
+        clouds: Sequence[RawCloud],
+        config: LoggingConfig,
+        states: Mapping[str, str],
+        *,
+        is_event: bool,
+        is_requested: bool,
+    ) -> None:
+        """Log the raw clouds of a frame and of buffered earlier frames, if they are wanted.
+
+        Args:
+            to: writer of the recording.
+            frame: the frame.
+            clouds: its raw clouds.
+            config: limits.
+            states: states of the pipeline and the cameras, by lane. A change selects the clouds.
+            is_event: whether an anomaly begins in this frame.
+            is_requested: see ``RawCloudSelector.select``.
+        """
+        is_event |= any(self._states.get(lane, state) != state for lane, state in states.items())
+        self._states = states
+        clock, left_out = (frame.index, frame.stamp, frame.received), self.left_out
+        selected = self._selector.select(
+            RawCloudFrame(clock, clouds), config, is_event=is_event, is_requested=is_requested
+        )
+        if self.left_out > left_out:
+            text = f"logging.raw_share is reached; {self.left_out} times so far"
+            to.lines(entities.EXPLAIN_LOG, [("INFO", f"no raw clouds around what begins here: {text}")])
+        for frame_clouds in selected:
+            to.set_time(*frame_clouds.clock)
+            for path, points, class_ids in frame_clouds.clouds:
+                to.write(path, rr.Points3D(points, class_ids=class_ids))
+        to.set_time(*clock)
+        shown = {path for path, _, _ in clouds} if selected else set()
+        for path in sorted(self._shown - shown):
+            to.write(path, rr.Clear(recursive=False))
+        self._shown = shown
+        self._known |= shown
