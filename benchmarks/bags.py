@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from tqdm import tqdm
 
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.synthetic import SyntheticSource, write_bag
 
 SECOND = 1_000_000_000

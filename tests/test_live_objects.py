@@ -18,8 +18,8 @@ from rosbags.typesys.store import Typestore
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.messages import definitions
-from bevviz.messages.definitions import store_of
-from bevviz.messages.encode import encode_cloud, typestore
+from bevviz.messages.definitions import store_of, typestore
+from bevviz.messages.encode import encode_cloud
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags
 from tests.support.object_messages import (

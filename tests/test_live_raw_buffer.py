@@ -52,7 +52,8 @@ from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import Earlier, RawMessage, RawRecorder, children, define
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.source import LiveSource
-from bevviz.messages.encode import encode_transforms, typestore
+from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import encode_transforms
 
 WAIT = ["sync.max_wait=10 s", "sync.queue=100"]  # on a busy machine messages come late: they are waited for
 SECONDS = 3.0  # that the flight recorder holds: less than the run takes

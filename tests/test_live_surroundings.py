@@ -13,7 +13,7 @@ import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session

@@ -26,7 +26,7 @@ from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.decoding import MessageError, stamp_ns
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import find_roles
 from bevviz.messages.surroundings import decode_shapes

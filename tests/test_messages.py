@@ -24,10 +24,10 @@ from bevviz.live.live_message import LiveMessage
 from bevviz.messages import (
     camera_info,
     clouds,
+    definitions,
     detections,
     images,
     transforms,
-    vision_msgs,
 )
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.guard import guard
@@ -170,7 +170,7 @@ def test_any_layout_equals_unpacking_point_by_point(msg: Message) -> None:
 
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_JAZZY)}
-vision_msgs.register(STORES["ros2"])
+definitions.register(STORES["ros2"])
 TF = get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
 STORES["ros1"].register(TF)  # a bag brings the definition
 

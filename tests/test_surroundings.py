@@ -13,7 +13,8 @@ import rerun as rr
 
 from bevviz.config import SourceConfig, load
 from bevviz.messages.decoding import MessageError
-from bevviz.messages.encode import encode_cloud, encode_image, typestore
+from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import encode_cloud, encode_image
 from bevviz.messages.robot_description import mesh_file
 from bevviz.messages.roles import find_roles, surroundings_kind
 from bevviz.messages.surroundings import decode_shapes, decode_statuses
@@ -21,7 +22,7 @@ from bevviz.messages.topics import Topic
 from bevviz.model.frame import ComponentStatus, Frame, Image, PlacedShape, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.sync.surroundings import MANY, SAMPLES, SurroundingsBuffer
+from bevviz.sync.buffers import MANY, SAMPLES, SurroundingsBuffer
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.support.recordings import Recording

@@ -18,7 +18,7 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.messages.decoding import MessageError
 from bevviz.messages.roles import Roles
-from bevviz.messages.sensors import CameraRole
+from bevviz.messages.topics import CameraRole
 from bevviz.messages.transforms import StampedTransform
 from bevviz.model import geometry
 from bevviz.model.frame import (

@@ -15,8 +15,9 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
 from bevviz.datasets.kitti import read_labels
+from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
-from bevviz.messages.encode import encode_boxes_3d, typestore
+from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
 from tests.support import bags, datasets, documented_json
 

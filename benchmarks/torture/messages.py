@@ -31,8 +31,6 @@ from tqdm import tqdm
 from benchmarks.torture import fuzz
 from benchmarks.torture.worker import Outcome, Worker
 from bevviz.drivers.compressed_clouds import COMPRESSED
-from bevviz.messages import grid_map_msgs
-from bevviz.messages.decoders import register_definitions
 from tests.support import bags, videos
 
 SCANS = 52  # of a drive
@@ -109,8 +107,6 @@ def _messages() -> bags.Messages:
     from tests.support import object_messages
 
     made = bags.Messages()
-    grid_map_msgs.register(made.store)
-    register_definitions(made.store)
     for name, text in videos.DEFINITIONS.items():
         made.store.register(get_types_from_msg(text, name))
     for package, texts in (

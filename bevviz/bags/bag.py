@@ -19,11 +19,9 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores
 
 from bevviz.bags import mcap
-from bevviz.bags.file_types import open_file
-from bevviz.bags.message import RawMessage, foxglove_encoding, is_ros1
+from bevviz.bags.file_types import find_saved_bag, open_file
+from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1
 from bevviz.bags.reader import BagFile, normalized
-from bevviz.bags.sidecar import find_saved_bag
-from bevviz.bags.type_store import MessageTypes
 from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
@@ -33,9 +31,9 @@ from bevviz.drivers import ouster
 from bevviz.drivers.packets import read_calibration
 from bevviz.drivers.video import VideoPacket, decode_packet, is_video
 from bevviz.errors import UserError
-from bevviz.messages import vision_msgs
 from bevviz.messages.decoders import Serialization, reads_bytes
 from bevviz.messages.decoding import MessageError
+from bevviz.messages.definitions import deserialize_cdr
 from bevviz.messages.guard import decode_message, guard
 from bevviz.messages.surroundings import decode_mark
 from bevviz.messages.topics import NOT_LIDAR, Topic
@@ -313,7 +311,7 @@ class Recording(Closable):
         try:
             if is_ros1(connection):
                 return store.deserialize_ros1(data, msgtype)
-            return vision_msgs.deserialize(store, data, msgtype)
+            return deserialize_cdr(store, data, msgtype)
         except KeyError:
             raise MessageError(
                 f"{message.topic}: the bag does not say what a {msgtype} is made of, and neither does bevviz"

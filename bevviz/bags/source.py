@@ -22,9 +22,8 @@ from bevviz.messages.transforms import decode_transforms
 from bevviz.model.frame import F64, I64, Frame, Scene
 from bevviz.support.contexts import Closable
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.report import why_no_images
+from bevviz.sync.report import UnusableMessages, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
-from bevviz.sync.unusable_messages import UnusableMessages
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud

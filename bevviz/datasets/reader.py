@@ -10,7 +10,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe_error
 from bevviz.errors import UserError
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.model.frame import I64
 
 

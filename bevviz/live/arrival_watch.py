@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Literal
 
-from bevviz.sync.unusable_messages import UnusableMessages
+from bevviz.sync.report import UnusableMessages
 
 SILENCE = 2.0  # seconds without a message that are reported, unless five usual steps are longer
 STREAM = 5  # messages after which a topic counts as a stream that should continue

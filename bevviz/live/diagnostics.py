@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from bevviz.live.typesupport import message_type
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.messages.surroundings import LEVELS
 from bevviz.model.results import FrameResult
 

@@ -11,9 +11,8 @@ from typing import Any
 from bevviz.drivers import ouster
 from bevviz.messages.decoders import Serialization
 from bevviz.messages.decoding import read_header
-from bevviz.messages.definitions import store_of
+from bevviz.messages.definitions import deserialize_cdr, store_of
 from bevviz.messages.guard import decode_message, guard
-from bevviz.messages.vision_msgs import deserialize
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,4 +46,4 @@ class LiveMessage:
 
     def _deserialized(self, data: bytes | memoryview) -> Any:
         """Return the message as an object of its definition."""
-        return deserialize(store_of(self.type), data, self.type)
+        return deserialize_cdr(store_of(self.type), data, self.type)

@@ -40,9 +40,9 @@ from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.pipeline.run import MAX_BURST
 from bevviz.support.contexts import Closable
 from bevviz.support.queues import NewestQueue
+from bevviz.sync.buffers import MARKS
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.report import why_no_images
-from bevviz.sync.surroundings import MARKS
 from bevviz.sync.synchronizer import OVERTAKEN, Synchronizer
 
 LOOK = 0.5  # seconds between two looks at the graph

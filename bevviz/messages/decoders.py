@@ -12,9 +12,6 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from rosbags.typesys import get_types_from_msg
-from rosbags.typesys.store import Typestore
-
 from bevviz.errors import UserError, first_line
 
 GROUP = "bevviz.decoders"  # of the entry points
@@ -128,12 +125,3 @@ def reads_bytes(msgtype: str) -> bool:
     """Return whether messages of a type are decoded without their definition."""
     decoder = find_decoder(msgtype)
     return decoder is not None and decoder.from_bytes is not None
-
-
-def register_definitions(typestore: Typestore) -> None:
-    """Add the message types of all decoders to a store that has the std and sensor messages."""
-    types: dict[str, Any] = {}
-    for decoder in decoders().values():
-        for name, text in decoder.definitions.items():
-            types.update(get_types_from_msg(text, name))
-    typestore.register(types)

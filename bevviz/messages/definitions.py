@@ -8,15 +8,113 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bevviz.errors import UserError
-from bevviz.messages.encode import typestore
+from bevviz.messages.decoders import decoders
+
+# vision_msgs 4 (ROS 2 Humble to Jazzy).
+_DETECTION = "std_msgs/Header header\nObjectHypothesisWithPose[] results\n{box} bbox\nstring id\n"
+_VISION = {
+    "Point2D": "float64 x\nfloat64 y\n",
+    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
+    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    "Detection2D": _DETECTION.format(box="BoundingBox2D"),
+    "Detection3D": _DETECTION.format(box="BoundingBox3D"),
+    "Detection2DArray": "std_msgs/Header header\nDetection2D[] detections\n",
+    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+_OLDER = (
+    "std_msgs/Header header\nObjectHypothesisWithPose[] results\n{box} bbox\nsensor_msgs/{source}\n"
+    "bool is_tracking\nstring tracking_id\n"
+)
+# Version 2 (Foxy). Version 3 (Galactic) has other field names for the same bytes as version 4.
+_OLDER_VISION = _VISION | {
+    "BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
+    "ObjectHypothesisWithPose": "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n",
+    "Detection2D": _OLDER.format(box="BoundingBox2D", source="Image source_img"),
+    "Detection3D": _OLDER.format(box="BoundingBox3D", source="PointCloud2 source_cloud"),
+}
+# grid_map_msgs (ROS 2 Humble to Jazzy).
+_GRID_MAP = {
+    "GridMapInfo": "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose\n",
+    "GridMap": "std_msgs/Header header\nGridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
+    "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n",
+}
+# A vision_msgs/Detection3DArray with labels of an image, see frame.ImageLabels.
+_LABELLED = """std_msgs/Header header
+vision_msgs/Detection3D[] detections
+float32[] image_boxes
+float32[] truncated
+int32[] occluded
+float32[] dont_care
+string[] unusable
+"""
+
+
+def register(store: Typestore) -> None:
+    """Add the message types that rosbags lacks to a store that has the geometry, sensor and std messages.
+
+    Raises:
+        rosbags.typesys.TypesysError: the store has other definitions of the same names.
+    """
+    _register(store, "vision_msgs", _VISION)
+    _register(store, "grid_map_msgs", _GRID_MAP)
+    _register(store, "bevviz_msgs", {"Detection3DArray": _LABELLED})
+    types: dict[str, Any] = {}
+    for decoder in decoders().values():
+        for name, text in decoder.definitions.items():
+            types.update(get_types_from_msg(text, name))
+    store.register(types)
+
+
+def _register(store: Typestore, package: str, definitions: Mapping[str, str]) -> None:
+    types: dict[str, Any] = {}
+    for name, text in definitions.items():
+        types.update(get_types_from_msg(text, f"{package}/msg/{name}"))
+    store.register(types)
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the type store of ROS 2 Jazzy with the definitions that bevviz adds."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    register(store)
+    return store
+
+
+@cache
+def _older() -> Typestore:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    _register(store, "vision_msgs", _OLDER_VISION)
+    return store
+
+
+def deserialize_cdr(store: Typestore, data: bytes | memoryview, msgtype: str) -> Any:
+    """Deserialise a message of any type.
+
+    A message of vision_msgs that does not fit the definition is read as Foxy's. The bytes of a message that
+    is not empty fit only one of the two definitions.
+    """
+    try:
+        return store.deserialize_cdr(data, msgtype)
+    except Exception:  # rosbags' generated code raises any exception, depending on the bytes
+        if msgtype.startswith("vision_msgs/msg/") and msgtype in _older().types:
+            with suppress(Exception):
+                return _older().deserialize_cdr(data, msgtype)
+        raise
+
+
+# --- types of installed packages and publishers ---------------------------------------------------
 
 
 def definition(name: str) -> str | None:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
-from bevviz.messages import decoders, grid_map_msgs, vision_msgs
+from bevviz.messages.definitions import typestore
 from bevviz.model import geometry
 from bevviz.model.frame import (
     F32,
@@ -24,28 +21,6 @@ from bevviz.model.frame import (
     ImageLabels,
     Intrinsics,
 )
-
-# A vision_msgs/Detection3DArray with labels of an image, see frame.ImageLabels.
-_LABELLED = """std_msgs/Header header
-vision_msgs/Detection3D[] detections
-float32[] image_boxes
-float32[] truncated
-int32[] occluded
-float32[] dont_care
-string[] unusable
-"""
-
-
-@cache
-def typestore() -> Typestore:
-    """Return the type store of ROS 2 Jazzy with the definitions that bevviz adds."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    vision_msgs.register(store)
-    grid_map_msgs.register(store)
-    decoders.register_definitions(store)
-    store.register(get_types_from_msg(_LABELLED, "bevviz_msgs/msg/Detection3DArray"))
-    return store
-
 
 Hypotheses = Sequence[tuple[str, float]]  # class and score; the first one is that of the box itself
 

@@ -13,7 +13,7 @@ from rosbags.interfaces import Nodetype
 from bevviz.errors import UserError, first_line
 from bevviz.messages.decoders import Bytes, Serialization, find_decoder
 from bevviz.messages.decoding import MessageError
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.support.loggers import logger
 
 NO_FIELD = "structure_needs_at_least_one_member"  # ROS's name for the byte of an empty message

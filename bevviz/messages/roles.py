@@ -14,11 +14,14 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import check_boxes_setting
 from bevviz.messages.foxglove import foxglove_type
-from bevviz.messages.sensors import CameraRole, camera_role, find_images, find_lidars
 from bevviz.messages.topics import (
     IMAGES,
+    CameraRole,
     Topic,
+    camera_role,
     entity_name,
+    find_images,
+    find_lidars,
     names_of,
     of_kind,
     set_note,

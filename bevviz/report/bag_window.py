@@ -20,7 +20,7 @@ from bevviz.config import Config
 from bevviz.drivers.ouster import metadata_topic
 from bevviz.errors import UserError
 from bevviz.messages.roles import Roles
-from bevviz.sync.unusable_messages import UnusableMessages
+from bevviz.sync.report import UnusableMessages
 
 MILLISECOND = 1_000_000
 

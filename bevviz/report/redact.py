@@ -22,7 +22,8 @@ from bevviz.config import DetectorConfig
 from bevviz.drivers.video import decode_packet
 from bevviz.errors import UserError
 from bevviz.messages.decoding import MessageError
-from bevviz.messages.encode import encode_compressed_image, typestore
+from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import encode_compressed_image
 from bevviz.messages.foxglove import foxglove_type
 from bevviz.messages.guard import guard
 from bevviz.messages.images import decode_compressed_image, decode_image

@@ -12,12 +12,12 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.messages.roles import Roles
-from bevviz.messages.sensors import CameraRole
+from bevviz.messages.topics import CameraRole
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Image, Intrinsics
+from bevviz.sync.buffers import TopicBuffer, describe_distance
 from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
-from bevviz.sync.topic_buffer import TopicBuffer, describe_distance
 from bevviz.sync.transform_tree import TransformError
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])

@@ -15,8 +15,8 @@ from bevviz.messages.detections import decode_boxes, decode_detections_2d, decod
 from bevviz.messages.guard import TypedMessage, guard
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.messages.roles import Roles
-from bevviz.messages.sensors import CameraRole
 from bevviz.messages.surroundings import decode_mark, decode_shapes, decode_statuses
+from bevviz.messages.topics import CameraRole
 from bevviz.messages.transforms import (
     StampedTransform,
     decode_acceleration,

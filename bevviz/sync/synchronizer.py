@@ -30,13 +30,12 @@ from bevviz.model.frame import (
     LabelledBoxes3D,
     LateBoxes,
 )
+from bevviz.sync.buffers import JUMP, SurroundingsBuffer, TopicBuffer, describe_distance
 from bevviz.sync.cameras import Cameras
 from bevviz.sync.clocks import Clocks
 from bevviz.sync.gravity import VerticalEstimate
 from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
-from bevviz.sync.surroundings import SurroundingsBuffer
-from bevviz.sync.topic_buffer import JUMP, TopicBuffer, describe_distance
 from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
 

@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bevviz.messages import vision_msgs
+from bevviz.messages import definitions
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Intrinsics
 
@@ -38,7 +38,7 @@ class Messages:
     def __init__(self, ros1: bool = False) -> None:
         self.ros1 = ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
-        vision_msgs.register(self.store)
+        definitions.register(self.store)
         if ros1:
             tf2 = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(tf2, "tf2_msgs/msg/TFMessage"))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.live.typesupport import message_type
-from bevviz.messages.encode import typestore
+from bevviz.messages.definitions import typestore
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS, messages, mounting
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, IMAGE_TOPIC, LIDAR_TOPIC, PERIOD, START
