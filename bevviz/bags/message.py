@@ -187,9 +187,11 @@ class LazyTypeStore(Typestore):
 
     def get_msgdef(self, typename: str) -> Any:
         """Return a message definition that compiles its functions at first use."""
-        if typename not in self.cache:
-            self.cache[typename] = _LazyDefinition(self, typename)  # type: ignore[assignment]
-        return self.cache[typename]
+        try:  # The functions of nested types are called once for each message in a message.
+            return self.cache[typename]
+        except KeyError:
+            definition = self.cache[typename] = _LazyDefinition(self, typename)  # type: ignore[assignment]
+            return definition
 
     def whole(self, typename: str) -> Any:
         """Return the message definition of rosbags with all twelve functions."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from bevviz.messages.decoding import either, frame_name, stamp_ns
-from bevviz.messages.foreign_boxes import box_name, decode_objects, turned_boxes, why_unusable
+from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d, decode_objects
 from bevviz.model.frame import (
-    F32,
-    F64,
     Bool,
     ImageLabels,
     LabelledBoxes2D,
@@ -27,28 +26,24 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
     left out and listed in ``unusable``.
     """
 
-    def row(detection: Any) -> tuple[float, ...]:
+    def numbers(detection: Any) -> tuple[float, ...]:
         center, box = detection.bbox.center, detection.bbox
         position = getattr(center, "position", center)  # without the position up to ROS 2 Galactic
-        return position.x, position.y, center.theta, box.size_x, box.size_y
+        return position.x, position.y, center.theta, box.size_x, box.size_y, 0.0
 
-    def why(values: Sequence[float]) -> str:
-        x, y, theta, w, h = values
-        return why_unusable((x, y, theta, w, h, 0.0))
-
-    rows = _rows(msg, row, 5, why)
-    x, y, theta, w, h = rows.values.T
+    columns = box_columns(_rows(msg, numbers), 6)
+    x, y, theta, w, h, _ = columns.values.T
     cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
     return LabelledBoxes2D(
         topic=topic,
         stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id) or next(iter(rows.frames), ""),
+        frame_id=frame_name(msg.header.frame_id) or next(iter(columns.frames), ""),
         xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
-        labels=rows.labels,
-        scores=rows.scores,
+        labels=columns.labels,
+        scores=columns.scores,
         received=received,
-        unusable=rows.unusable,
+        unusable=columns.unusable,
     )
 
 
@@ -70,28 +65,20 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
     listed in ``unusable``. If the header of the array has no frame, the frames of the detections are used.
     """
 
-    def row(detection: Any) -> tuple[float, ...]:
+    def numbers(detection: Any) -> tuple[float, ...]:
         center, size = detection.bbox.center, detection.bbox.size
         p, q = center.position, center.orientation
         return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
 
-    rows = _rows(msg, row, 10, why_unusable)
+    columns = box_columns(_rows(msg, numbers), 10)
     stated = frame_name(msg.header.frame_id)
-    boxes, turns = turned_boxes(rows.values)
-    return LabelledBoxes3D(
-        topic=topic,
-        stamp=stamp_ns(msg.header.stamp) or (0 if len(boxes) else received),
-        frame_id=stated or next(iter(rows.frames), ""),
-        boxes=boxes,
-        labels=rows.labels,
-        scores=rows.scores,
-        received=received,
-        ids=rows.ids if all(rows.ids) else (),
-        image=_image_labels(msg, rows.usable),
-        turns=turns,
-        frames=rows.frames if not stated and len(set(rows.frames)) > 1 else (),
-        unusable=(*map(str, getattr(msg, "unusable", ())), *rows.unusable),
-    )
+    frame_id = stated or next(iter(columns.frames), "")
+    stamp = stamp_ns(msg.header.stamp) or (0 if len(columns.values) else received)
+    if stated:
+        columns = columns._replace(frames=())
+    boxes = boxes_3d(columns, topic, received, stamp, frame_id)
+    unusable = (*map(str, getattr(msg, "unusable", ())), *columns.unusable)
+    return replace(boxes, image=_image_labels(msg, columns.usable), unusable=unusable)
 
 
 def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
@@ -106,46 +93,9 @@ def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
     )
 
 
-class _Rows(NamedTuple):
-    """Usable detections of a message, as columns."""
-
-    values: F64  # (K, width)
-    labels: tuple[str, ...]
-    scores: F32
-    ids: tuple[str, ...]
-    frames: tuple[str, ...]
-    usable: Bool  # whether each detection is usable
-    unusable: tuple[str, ...]  # a sentence for each detection that is not
-
-
-def _rows(
-    msg: Any, row: Callable[[Any], tuple[float, ...]], width: int, why: Callable[[Sequence[float]], str]
-) -> _Rows:
-    """Read the detections of a message.
-
-    Args:
-        msg: message with a list ``detections``.
-        row: returns the ``width`` numbers of a detection.
-        width: how many numbers a detection has.
-        why: returns the reason why the numbers cannot be used; empty if they can.
-    """
-    rows = [(row(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
-    reasons = [why(values) for values, *_ in rows]
-    unusable = [
-        f"{box_name(number, label, identity)}: {reason}"
-        for number, ((_, label, _, identity, _), reason) in enumerate(zip(rows, reasons, strict=True))
-        if reason
-    ]
-    kept = [numbers for numbers, reason in zip(rows, reasons, strict=True) if not reason]
-    return _Rows(
-        np.array([values for values, *_ in kept], np.float64).reshape(-1, width),
-        tuple(label for _, label, *_ in kept),
-        np.nan_to_num(np.array([score for _, _, score, *_ in kept], np.float32)),
-        tuple(identity for *_, identity, _ in kept),
-        tuple(frame for *_, frame in kept),
-        np.array([not reason for reason in reasons], bool),
-        tuple(unusable),
-    )
+def _rows(msg: Any, numbers: Callable[[Any], tuple[float, ...]]) -> list[BoxRow]:
+    """Read the detections of a message. ``numbers`` returns the numbers of a detection."""
+    return [BoxRow(numbers(d), *_hypothesis(d.results), _identity(d), _frame(d)) for d in msg.detections]
 
 
 def _frame(detection: Any) -> str:

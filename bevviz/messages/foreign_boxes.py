@@ -6,15 +6,15 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from bevviz.errors import UserError
 from bevviz.messages.decoding import frame_name, stamp_ns
 from bevviz.messages.guard import describe_kind, field_names
-from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D
+from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes3D
 
 T = TypeVar("T")
 
@@ -108,25 +108,22 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
     known = RADAR if hasattr(msg, "tracks") else AUTOWARE
     where = Fields(**paths) if paths else known
     items = _read(list, msg, where.objects) if where.objects else list(_only_list(msg))
-    rows, labels, scores, ids = [], list[str](), list[float](), list[str]()
     header = getattr(msg, "header", None)
-    headers, unusable = list[Any](), list[str]()
-    for number, item in enumerate(items):
-        row = _row(item, where)
+    rows, headers = list[BoxRow](), list[Any]()
+    for item in items:
         label = _label(item, where.label) if where.label else ""
         identity = _identity(_follow(item, where.id)[1]) if _has(item, where.id) else ""
-        if why := why_unusable(row):
-            unusable.append(f"{box_name(number, label, identity)}: {why}")
-            continue
-        rows.append(row)
+        score = _read(float, item, where.score) if _has(item, where.score) else 1.0
+        rows.append(BoxRow(_row(item, where), label, score, identity))
         item_header = getattr(item, "header", None)
         headers.append(header if item_header is None or (header and header.frame_id) else item_header)
-        labels.append(label)
-        scores.append(_read(float, item, where.score) if _has(item, where.score) else 1.0)
-        ids.append(identity)
-    if None in headers:
+    columns = box_columns(rows, 10)
+    if None in [item_header for item_header, usable in zip(headers, columns.usable, strict=True) if usable]:
         raise ValueError("neither the message nor its objects have a header, which says the frame")
-    return _boxes(headers or [header], topic, received, rows, labels, scores, ids, unusable)
+    boxes = _boxes(columns, headers, topic, received)
+    if len(boxes.boxes) or header is None:
+        return boxes
+    return replace(boxes, stamp=stamp_ns(header.stamp), frame_id=frame_name(str(header.frame_id)))
 
 
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
@@ -155,58 +152,119 @@ def _row(item: Any, where: Fields) -> tuple[float, ...]:
 
 
 def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes3D:
-    rows, labels, ids, headers = list[tuple[float, ...]](), list[str](), list[str](), list[Any]()
-    unusable = list[str]()
     shown = [marker for marker in markers if marker.action == ADD]
     solids = [marker for marker in shown if marker.type in (CUBE, CYLINDER)]
     texts = {(marker.ns, marker.id): str(marker.text) for marker in shown if marker.type == TEXT}
     of_solids = {marker.ns for marker in solids}
     others = {number: text for (ns, number), text in texts.items() if ns not in of_solids}
+    rows = []
     for marker in solids:
-        row = *_vector(marker.pose.position), *_vector(marker.scale), *_quaternion(marker.pose.orientation)
-        identity = f"{marker.ns}/{marker.id}"
-        if why := why_unusable(row):
-            unusable.append(f"marker {identity}: {why}")
-            continue
-        rows.append(row)
-        headers.append(marker.header)
-        text = texts.get((marker.ns, marker.id)) or others.get(marker.id)
-        labels.append(text or str(marker.ns))
-        ids.append(identity)
-    return _boxes(headers, topic, received, rows, labels, [1.0] * len(rows), ids, unusable)
+        place, turn = _vector(marker.pose.position), _quaternion(marker.pose.orientation)
+        text = texts.get((marker.ns, marker.id)) or others.get(marker.id) or str(marker.ns)
+        rows.append(BoxRow((*place, *_vector(marker.scale), *turn), text, 1.0, f"{marker.ns}/{marker.id}"))
+    columns = box_columns(rows, 10, lambda number, label, identity: f"marker {identity}")
+    return _boxes(columns, [marker.header for marker in solids], topic, received)
 
 
-def _boxes(
-    headers: Sequence[Any],
-    topic: str,
-    received: int,
-    rows: list[tuple[float, ...]],
-    labels: list[str],
-    scores: list[float],
-    ids: list[str],
-    unusable: list[str],
-) -> LabelledBoxes3D:
-    """Make the result of columns. The stamp is that of the first header."""
-    boxes, turns = turned_boxes(np.array(rows, np.float64).reshape(-1, 10))
-    header = next(iter(headers), None)
-    stamp = received if header is None else stamp_ns(header.stamp)
-    frames = tuple("" if about is None else frame_name(str(about.frame_id)) for about in headers)
-    return LabelledBoxes3D(
-        topic=topic,
-        stamp=stamp,
-        frame_id=next(iter(frames), ""),
-        boxes=boxes,
-        labels=tuple(labels),
-        scores=np.nan_to_num(np.array(scores, np.float32)),
-        received=received,
-        ids=tuple(ids) if all(ids) else (),
-        turns=turns,
-        frames=frames if len(set(frames)) > 1 else (),
-        unusable=tuple(unusable),
+def _boxes(columns: BoxColumns, headers: Sequence[Any], topic: str, received: int) -> LabelledBoxes3D:
+    """Make the result of boxes with a header each. The stamp is that of the first usable box."""
+    headers = [header for header, usable in zip(headers, columns.usable, strict=True) if usable]
+    frames = tuple(frame_name(str(header.frame_id)) for header in headers)
+    stamp = stamp_ns(headers[0].stamp) if headers else received
+    return boxes_3d(columns._replace(frames=frames), topic, received, stamp, next(iter(frames), ""))
+
+
+# --- boxes as columns ----------------------------------------------------------------------------
+
+
+class BoxRow(NamedTuple):
+    """Box of a message.
+
+    Attributes:
+        numbers: centre, size and quaternion; centre, angle, size and 0 for a box in an image.
+        label: class.
+        score: score.
+        identity: identity; empty: none.
+        frame: frame of the box; empty: the message states none.
+    """
+
+    numbers: tuple[float, ...]
+    label: str
+    score: float
+    identity: str = ""
+    frame: str = ""
+
+
+class BoxColumns(NamedTuple):
+    """Usable boxes of a message, as columns.
+
+    Attributes:
+        values: (K, width) numbers of the boxes.
+        labels: classes.
+        scores: (K,) scores.
+        ids: identities.
+        frames: frames.
+        usable: whether each box of the message is usable.
+        unusable: a sentence for each box that is not.
+    """
+
+    values: F64
+    labels: tuple[str, ...]
+    scores: F32
+    ids: tuple[str, ...]
+    frames: tuple[str, ...]
+    usable: Bool
+    unusable: tuple[str, ...]
+
+
+def box_columns(
+    rows: Sequence[BoxRow], width: int, name: Callable[[int, str, str], str] | None = None
+) -> BoxColumns:
+    """Collect the usable boxes of a message. Boxes that are not finite or have a negative size are left out.
+
+    Args:
+        rows: boxes of the message.
+        width: how many numbers a box has.
+        name: returns the name of an unusable box by number, label and identity; None: ``box_name``.
+    """
+    values = np.array([row.numbers for row in rows]).reshape(-1, width)
+    usable = (np.abs(values) < LARGEST).all(axis=1) & (values[:, 3:6] >= 0).all(axis=1)
+    kept = [row for row, is_usable in zip(rows, usable, strict=True) if is_usable]
+    unusable = [
+        f"{(name or box_name)(number, rows[number].label, rows[number].identity)}: "
+        f"{_why_unusable(rows[number].numbers)}"
+        for number in np.flatnonzero(~usable).tolist()
+    ]
+    return BoxColumns(
+        values[usable].astype(np.float64),
+        tuple(row.label for row in kept),
+        np.nan_to_num(np.array([row.score for row in kept], np.float32)),
+        tuple(row.identity for row in kept),
+        tuple(row.frame for row in kept),
+        usable,
+        tuple(unusable),
     )
 
 
-def why_unusable(row: Sequence[float]) -> str:
+def boxes_3d(columns: BoxColumns, topic: str, received: int, stamp: int, frame_id: str) -> LabelledBoxes3D:
+    """Make the result of columns."""
+    boxes, turns = turned_boxes(columns.values)
+    return LabelledBoxes3D(
+        topic=topic,
+        stamp=stamp,
+        frame_id=frame_id,
+        boxes=boxes,
+        labels=columns.labels,
+        scores=columns.scores,
+        received=received,
+        ids=columns.ids if all(columns.ids) else (),
+        turns=turns,
+        frames=columns.frames if len(set(columns.frames)) > 1 else (),
+        unusable=columns.unusable,
+    )
+
+
+def _why_unusable(row: Sequence[float]) -> str:
     """Return why centre, size and quaternion of a box cannot be used; empty if they can."""
     is_finite = math.isfinite(sum(row)) and max(row) < LARGEST and min(row) > -LARGEST
     if is_finite and min(row[3:6]) >= 0:  # a tenth of the time of the tests that find the reason
