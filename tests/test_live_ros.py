@@ -23,12 +23,12 @@ from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoding import read_header
+from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
 from bevviz.messages.encode import (
     encode_boxes_3d,
     encode_camera_info,
     encode_cloud,
-    typestore,
 )
 from bevviz.messages.images import decode_image
 from bevviz.model.frame import Boxes3D, Frame, LateBoxes

@@ -10,13 +10,13 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.typesupport import message_type
+from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
     encode_boxes_2d,
     encode_boxes_3d,
     encode_cloud,
     encode_image,
     encode_markers,
-    typestore,
 )
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image

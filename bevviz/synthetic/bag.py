@@ -22,6 +22,7 @@ from rosbags.interfaces import (
 
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.errors import UserError
+from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
     encode_boxes_3d,
     encode_camera_info,
@@ -29,7 +30,6 @@ from bevviz.messages.encode import (
     encode_image,
     encode_odometry,
     encode_transforms,
-    typestore,
 )
 from bevviz.model import geometry
 from bevviz.model.frame import Frame

@@ -10,7 +10,6 @@ import numpy as np
 from backports import zstd
 
 from bevviz.drivers.compressed_clouds import COMPRESSED
-from bevviz.messages.decoders import register_definitions
 from bevviz.model.frame import F32
 from tests.support import bags
 
@@ -35,9 +34,7 @@ FIELDS = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("ring", 
 
 
 def messages(ros1: bool = False) -> bags.Messages:
-    made = bags.Messages(ros1)
-    register_definitions(made.store)
-    return made
+    return bags.Messages(ros1)
 
 
 def compressed(made: bags.Messages, cloud: Any, form: str, data: bytes) -> Any:
