@@ -161,13 +161,14 @@ def _weigh(
 
 def _no_peak(scorer: Scorer, best: Peak, error: float) -> _Judgement:
     """Return the finding for a best peak that is not clearly higher than the others."""
-    if max(best.height, LEAD * error) < FIT * scorer.edges:  # A right calibration would have a higher score.
+    shown, taken = max(round(_independent_views(best)), 1), len(scorer.shots)
+    # From two frames on, a right calibration would have a higher score.
+    if shown > 1 and max(best.height, LEAD * error) < FIT * scorer.edges:
         within = f"{np.degrees(REACH):.1f} deg"
         reason = f"the edges of image and cloud do not agree anywhere within {within} of what is stated"
         return _Judgement(
             AxisFinding.CONFLICT, f"{reason} (another camera, wrong intrinsics, or further off?)"
         )
-    shown, taken = max(round(_independent_views(best)), 1), len(scorer.shots)
     frames = frames_text(shown)
     if shown < taken:
         frames = f"{taken} frames, which show as much as {shown} different one{'s' if shown > 1 else ''},"
