@@ -222,7 +222,8 @@ class ObjectsConfig(StageSection):
     )
     sizes: Annotated[Mapping[str, ClassSize | None], BeforeValidator(with_default_sizes)] = Field(
         CLASS_SIZES,
-        description="frustum: by class, mean length, width, height in metres and the spread of each; "
+        description="frustum: by class, mean length, width, height in metres and the spread of each, "
+        "six more numbers for each further size; "
         "a class that is stated changes alone, null: it has none",
     )
 

@@ -57,7 +57,7 @@ Megabytes = Annotated[float, BeforeValidator(MEGABYTES.parse)]
 # Spreads are those of KITTI's cars, but wider across, since cars elsewhere are 2 m wide. Other spreads are
 # wider than the difference between the two data sets. Sizes below the line are our own estimates.
 CLASS_SIZES: dict[str, tuple[float, ...]] = {
-    "car": (3.88, 1.63, 1.53, 0.43, 0.15, 0.14),
+    "car": (3.88, 1.63, 1.53, 0.43, 0.15, 0.14, 5.20, 1.95, 1.75, 0.45, 0.12, 0.20),  # compact, full size
     "van": (5.07, 1.90, 2.21, 0.50, 0.15, 0.25),
     "truck": (8.50, 2.55, 3.05, 2.50, 0.25, 0.50),
     "bus": (10.50, 2.94, 3.47, 2.00, 0.25, 0.35),
@@ -92,11 +92,12 @@ def with_default_sizes(stated: Any) -> Any:
 
 
 def _check_count(size: tuple[float, ...]) -> tuple[float, ...]:
-    """Raise an error for pydantic unless a size has six numbers."""
-    if len(size) != 6:
+    """Raise an error for pydantic unless there are six numbers for each size."""
+    if not size or len(size) % 6:
         raise PydanticCustomError(
             "size",
-            "has {count} numbers, a class has six: length, width, height and the spread of each",
+            "has {count} numbers, a class has six: length, width, height and the spread of each, "
+            "and six more for each further size",
             {"count": len(size)},
         )
     return size

@@ -24,7 +24,9 @@ NO_EDGE = np.inf  # sigma of an edge without information, such as the border of 
 
 
 @kernel
-def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float) -> tuple[F64, I64]:
+def fit(
+    points: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
+) -> tuple[F64, I64, float]:
     """Fit the box, seen from above, that best explains the points of an object.
 
     Every heading is tried. Along both of its axes the box contains the points. Where they are shorter than
@@ -51,6 +53,7 @@ def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about:
     Returns:
         (5,) x and y of the centre, length, width and heading.
         (2,) sides that face the sensor, along the heading and across it: -1 lower, 1 upper, 0 none.
+        The minimised cost.
     """
     known = not np.isnan(prior[0])
     most = np.full(2, longest)
@@ -104,7 +107,7 @@ def fit(points: F64, normals: F64, edge: F64, prior: F64, longest: float, about:
                         facing[0], facing[1] = sides[0], sides[1]
         if t == HEADINGS - 1:
             coarse = box[4]
-    return box, facing
+    return box, facing, best
 
 
 @kernel

@@ -33,6 +33,11 @@ TALL_SHARE = 0.08  # sigma of a height as a share of it; the object may stand an
 HIDDEN_SIGMAS = 2.0  # sigmas: a lower height costs no more than this, because the object may be partly hidden
 HIDDEN_SIGMAS_CUT = 1.0  # the same for a box that the image border cuts
 REACH_SPREAD = 2.0  # sigmas of its size by which an object may be deeper than its class
+
+DOUBT = 0.5  # factor of the rating of a candidate that only a further size of the class explains
+RARER = 2.5  # cost of each further size of a class; the first one is the most frequent
+NO_SIDES = 1.0  # metres, mean length of a class below which objects have no flat sides: people
+BEHIND = 0.05  # metres from the median of such an object's points to its centre
 BORDER = 2.0  # pixels: a box nearer to the image border than this is cut off by it
 SAME_OBJECT_IOU = 0.7  # above it boxes of two classes show one object, because NMS works by class
 MIN_CLUSTER_SHARE = 0.1  # share of an object's points above which a cluster counts as a part of the object
@@ -109,6 +114,15 @@ class _Candidate:
     fit: float
     rows: I64
     depth: float  # metres on the ground to its front
+
+
+@dataclass(frozen=True, slots=True)
+class _FittedBox:
+    """A box on the ground, and the size of the class that it was fitted with."""
+
+    flat: F64  # (5,) centre, length, width and heading
+    facing: I64  # (2,) sides that face the camera, see ``box_fit.fit``
+    size: F64  # (6,) NaN: the class has none
 
 
 class _FrameClaims:
@@ -251,12 +265,24 @@ class _CameraFrustums:
             if (barred := _points_beside_mask(uv, self._seen, detections, d, work.config, work.fewest))
             is not None
         }
-        sizes = [work.sizes.get(name.lower()) for name in detections.names]
-        self._size = np.array([size or (np.nan,) * 6 for size in sizes], np.float64).reshape(-1, 6)
+        unknown = (np.nan,) * 6
+        self._sizes = [  # (M, 6) sizes of each detection's class
+            np.array(work.sizes.get(name.lower()) or unknown, np.float64).reshape(-1, 6)
+            for name in detections.names
+        ]
 
     def best(self, d: int) -> _Candidate:
-        """Return the best rated candidate among the free points in a detection's frustum."""
-        config, (length, width, height, *spread) = self._work.config, self._size[d].tolist()
+        """Return the best rated candidate among the free points in a detection's frustum, for any size."""
+        best = self._best_of_size(d, self._sizes[d][0].tolist())
+        for size in self._sizes[d][1:].tolist():
+            candidate = self._best_of_size(d, size)
+            if DOUBT * candidate.fit > best.fit:
+                best = replace(candidate, fit=DOUBT * candidate.fit)
+        return best
+
+    def _best_of_size(self, d: int, size: Sequence[float]) -> _Candidate:
+        """Return the best rated candidate for one size of a detection's class."""
+        config, (length, width, height, *spread) = self._work.config, size
         rows, rating, depth = choose_candidate(
             self._work.points,
             self._place,
@@ -270,7 +296,7 @@ class _CameraFrustums:
             self._tall[d],
             height,
             math.hypot(spread[2], TALL_SHARE * height),
-            HIDDEN_SIGMAS_CUT if self._cut[d, 1] or self._cut[d, 3] else HIDDEN_SIGMAS,
+            self._lowest(d),
             self._work.fewest,
             config.min_iou,
         )
@@ -284,7 +310,7 @@ class _CameraFrustums:
         """Return the object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
         if not grow:
-            return rows, *self._upright_box(d, rows, *self._fit(d, rows, candidate.depth))
+            return rows, *self._upright_box(rows, self._fit(d, rows, candidate.depth))
         # The object's clusters may continue beyond the image border that cuts the box, and beside a tight
         # box.
         counts = np.bincount(work.clusters.labels[rows] + 1)
@@ -296,9 +322,9 @@ class _CameraFrustums:
         if cut[0] or cut[2]:
             beyond = kin[np.isnan(self._uv[kin, 0])]
             away = work.points[beyond, :2] - work.points[rows, :2].mean(axis=0)
-            long = np.nan_to_num(self._size[d, 0], nan=candidate.depth * self._wide[d])
+            long = np.nan_to_num(self._sizes[d][:, 0].max(), nan=candidate.depth * self._wide[d])
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
-        flat, _ = self._fit(d, rows, candidate.depth)
+        flat = self._fit(d, rows, candidate.depth).flat
         inside = points_inside(
             work.points,
             self._uv,
@@ -311,27 +337,51 @@ class _CameraFrustums:
             cut.any(),
         )
         rows = inside if len(inside) >= work.fewest else candidate.rows
-        flat, facing = self._fit(d, rows, candidate.depth, about=flat[4])
-        box, seen = self._upright_box(d, rows, flat, facing)
+        fitted = self._fit(d, rows, candidate.depth, about=flat[4])
+        box, seen = self._upright_box(rows, fitted)
         for points in free_rows:
-            rest = cluster_remainder(work.points, points, rows, flat, work.smallest)
+            rest = cluster_remainder(work.points, points, rows, fitted.flat, work.smallest)
             rows = np.concatenate([rows, rest]) if len(rest) else rows
         return rows, box, seen
 
-    def _fit(self, d: int, rows: I64, depth: float, about: float = np.nan) -> tuple[F64, I64]:
-        """Return centre, length, width and heading on the ground, and the sides that face the camera."""
-        prior = self._size[d, [0, 3, 1, 4]]
+    def _fit(self, d: int, rows: I64, depth: float, about: float = np.nan) -> _FittedBox:
+        """Fit a box of each size of the class on the ground, and return the one that explains most.
+
+        The costs of two sizes are compared as negative log-likelihoods: with the logarithms of the spreads,
+        and with the height of the image box at this distance.
+        """
         longest = max(self._wide[d], self._tall[d]) * depth
         edge = self._edge[d] * depth
-        return fit_from(self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about)
+        best, least = None, np.inf
+        for number, size in enumerate(self._sizes[d]):
+            prior = size[[0, 3, 1, 4]]
+            flat, facing, cost = fit_from(
+                self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about
+            )
+            if len(self._sizes[d]) > 1:
+                cost += self._size_cost(d, size, depth) + number * RARER
+            if best is None or cost < least:
+                best, least = _FittedBox(flat, facing, size), cost
+        assert best is not None
+        return best
 
-    def _upright_box(self, d: int, rows: I64, flat: F64, facing: I64) -> tuple[F64, Bool]:
+    def _size_cost(self, d: int, size: F64, depth: float) -> float:
+        """Return the cost of one size of the class, from its spreads and from the height of the image box."""
+        height, spread = size[2], math.hypot(size[5], TALL_SHARE * size[2])
+        z = max((self._tall[d] * depth - height) / spread, -self._lowest(d))
+        return float(np.log(size[3:]).sum() + 0.5 * z * z)
+
+    def _lowest(self, d: int) -> float:
+        """Return the sigmas beyond which a lower height costs no more."""
+        return HIDDEN_SIGMAS_CUT if self._cut[d, 1] or self._cut[d, 3] else HIDDEN_SIGMAS
+
+    def _upright_box(self, rows: I64, fitted: _FittedBox) -> tuple[F64, Bool]:
         """Return the box (centre, size, heading) and which sides are seen.
 
         The box of a detection without class size has length >= width.
         """
-        work, (x, y, length, width, heading) = self._work, flat.tolist()
-        has_size = not math.isnan(self._size[d, 0])
+        work, facing, (x, y, length, width, heading) = self._work, fitted.facing, fitted.flat.tolist()
+        has_size = not math.isnan(fitted.size[0])
         seen = [facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0]
         if not has_size and width > length:
             length, width, heading = width, length, heading - math.pi / 2
@@ -339,13 +389,22 @@ class _CameraFrustums:
         if not -math.pi / 2 < heading <= math.pi / 2:
             heading += math.pi if heading < 0 else -math.pi
             seen = [seen[1], seen[0], seen[3], seen[2]]
+        if fitted.size[0] < NO_SIDES:
+            x, y = self._middle(rows)
+            length, width = fitted.size[0], fitted.size[1]
         z = work.points[rows, 2]
         low, high = float(z.min()), float(z.max())
         if has_size and work.height is not None:
             low = float(np.partition(z - work.height[rows], len(z) // 2)[len(z) // 2])
-            high = max(high, low + self._size[d, 2] - self._size[d, 5])
+            high = max(high, low + fitted.size[2] - fitted.size[5])
         length, width, tall = (max(side, MIN_SIZE) for side in (length, width, high - low))
         return np.array([x, y, (low + high) / 2, length, width, tall, heading]), np.array(seen)
+
+    def _middle(self, rows: I64) -> F64:
+        """Return the (2,) centre of an object without flat sides. Its points lie on the half that is seen."""
+        seen = np.median(self._work.points[rows, :2], axis=0).astype(np.float64)
+        away = seen - self._place
+        return seen + BEHIND * away / max(float(np.hypot(*away)), 1e-6)
 
 
 def _points_beside_mask(

@@ -167,15 +167,15 @@ def choose_candidate(
 @kernel
 def fit_from(
     points: F32, rows: I64, place: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
-) -> tuple[F64, I64]:
+) -> tuple[F64, I64, float]:
     """Fit a box with ``box_fit.fit`` to points seen from a place."""
     xy = np.empty((len(rows), 2))
     for k, i in enumerate(rows):
         xy[k, 0], xy[k, 1] = points[i, 0] - place[0], points[i, 1] - place[1]
-    flat, facing = fit(xy, normals, edge, prior, longest, about)
+    flat, facing, cost = fit(xy, normals, edge, prior, longest, about)
     flat[0] += place[0]
     flat[1] += place[1]
-    return flat, facing
+    return flat, facing, cost
 
 
 @kernel

@@ -5,8 +5,8 @@ It shares no code with what it judges: labels are read here, and boxes are compa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,8 @@ from shapely import Polygon
 from tqdm import tqdm
 
 from bevviz.config import Config
-from bevviz.model.frame import Camera, Frame, Image, Intrinsics
+from bevviz.model import geometry
+from bevviz.model.frame import Boxes3D, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
@@ -140,6 +141,40 @@ def oracle(shot: Shot, off: float = 0.0) -> DetectFunction:
         overlap=np.zeros(n, np.float32),
     )
     return lambda camera: found
+
+
+def enlarge_cars(shot: Shot, factors: Sequence[float] = (1.38, 1.2, 1.2)) -> Shot:
+    """Stretch the cars of a frame along, across and upwards: their points, labels and image boxes."""
+    scale = np.array(factors)
+    camera, points, labels = shot.frame.cameras[0], shot.frame.points.copy(), []
+    intrinsics, camera_from_points = camera.intrinsics, camera.camera_from_points
+    assert intrinsics is not None and camera_from_points is not None
+
+    def rectangle(center: np.ndarray, size: np.ndarray, yaw: float) -> np.ndarray:
+        box = Boxes3D(*(np.array([value], np.float32) for value in (center, size, yaw)))
+        corners = geometry.corners(box).reshape(-1, 3)
+        uv, _ = geometry.project(geometry.apply(camera_from_points, corners), intrinsics)
+        return np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+
+    for label in shot.labels:
+        if label.kind != "Car":
+            labels.append(label)
+            continue
+        c, s = np.cos(label.yaw), np.sin(label.yaw)
+        car_from_lidar = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        up = np.array([0, 0, 0.5])
+        bottom = label.center - up * label.size
+        local = (shot.frame.points - bottom) @ car_from_lidar.T
+        body = (np.abs(local[:, :2]) <= label.size[:2] / 2 + 0.05).all(axis=1)
+        body &= (local[:, 2] > 0.15) & (local[:, 2] < label.size[2] + 0.1)  # the ground below stays
+        points[body] = (local[body] * scale) @ car_from_lidar + bottom
+        size = label.size * scale
+        center = bottom + up * size
+        change = rectangle(center, size, label.yaw) - rectangle(label.center, label.size, label.yaw)
+        limit = [intrinsics.width - 1, intrinsics.height - 1] * 2
+        xyxy = np.clip(label.xyxy + np.nan_to_num(change), 0, limit)
+        labels.append(replace(label, center=center, size=size, xyxy=xyxy))
+    return replace(shot, frame=replace(shot.frame, points=points), labels=tuple(labels))
 
 
 def outline(center: np.ndarray, size: np.ndarray, yaw: float) -> Polygon:
