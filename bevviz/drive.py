@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from bevviz.config import Config, ParameterChange, Preset, load
+from bevviz.config import Config, ParameterChange, Preset, changed_config, load
+from bevviz.config.trust import USER
 from bevviz.errors import UserError
 from bevviz.model.frame import F64, Frame, Scene
 from bevviz.model.protocols import FrameSource, Observer
@@ -240,9 +242,6 @@ class Drive(Closable):
         Raises:
             UserError: an unknown key or a wrong value. No parameter is changed then.
         """
-        from bevviz.config import changed_config
-        from bevviz.config.trust import USER
-
         return self.session.configure(changed_config(self.config, [*settings, *_settings(more)], USER))
 
     def _number(self, time: str | float | None, frame: int | None) -> int:
@@ -285,8 +284,7 @@ class Drive(Closable):
         from bevviz.evaluate.evaluation import Evaluation
         from bevviz.evaluate.ground_truth import truth_in
 
-        labels = None if kitti_labels is None else Path(kitti_labels)
-        evaluation = Evaluation(truth_in(self.frames, truth, labels))
+        evaluation = Evaluation(truth_in(self.frames, truth, _path(kitti_labels)))
         self.run([evaluation])
         return evaluation
 
@@ -390,11 +388,11 @@ def open_drive(
 
         recorded = find_source(paths[0], [] if bag is None else [Path(bag)], settings)
         paths, notes = list(recorded.paths), recorded.warnings
-        loaded = recorded.load(_file(config), settings, preset)
+        loaded = recorded.load(_path(config), settings, preset)
     elif bag is not None:
         raise UserError(f"bag={bag}: is where the bag of a recording lies, and {paths[0]} is none")
     else:
-        loaded = load(_file(config), settings, preset)
+        loaded = load(_path(config), settings, preset)
     times = {"start": None if start is None else str(start), "end": None if end is None else str(end)}
     source = BagSource(paths, loaded, every=every, frames=frames, **times)
     try:
@@ -431,7 +429,7 @@ def simulate(
     from bevviz.synthetic import SyntheticSource
 
     return Drive(
-        SyntheticSource(frames, seed, plant=plant), load(_file(config), _all_settings(model, set), preset)
+        SyntheticSource(frames, seed, plant=plant), load(_path(config), _all_settings(model, set), preset)
     )
 
 
@@ -441,14 +439,12 @@ def _all_settings(model: str | PathLike[str], settings: Settings) -> list[str]:
     return [*([f"detector.model={model}"] if model else []), *tree_settings]
 
 
-def _file(config: str | PathLike[str] | None) -> Path | None:
-    return None if config is None else Path(config)
+def _path(path: str | PathLike[str] | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 def _settings(tree: Mapping[str, Any]) -> list[str]:
     """Return dotted keys, or keys in sections, as ``key=value`` for ``--set``."""
-    import json
-
     flat: list[str] = []
     for key, value in tree.items():
         if isinstance(value, Mapping) and "." not in key:
