@@ -18,9 +18,9 @@ from bevviz.live.runtime import Live, Outputs
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.synthetic import SyntheticSource
+from bevviz.workbench.buffers import PageState
 from bevviz.workbench.live_buffer import AHEAD, WHOLE
-from bevviz.workbench.live_session import LiveSession
-from bevviz.workbench.routes import PageState
+from bevviz.workbench.running_robot import RunningRobot
 from tests.support.live_sessions import live_bench
 from tests.support.recordings import Recording
 
@@ -35,13 +35,13 @@ def results() -> list[FrameResult]:
 
 
 @pytest.fixture
-def bench(results: list[FrameResult]) -> Iterator[LiveSession]:
+def bench(results: list[FrameResult]) -> Iterator[RunningRobot]:
     with live_bench(results, f"live.viewer_points={LIMIT}") as bench:
         yield bench
 
 
 def test_viewers_get_fewer_points_and_files_all(
-    bench: LiveSession, results: list[FrameResult], tmp_path: Path
+    bench: RunningRobot, results: list[FrameResult], tmp_path: Path
 ) -> None:
     live, result = bench.live, results[0]
     frame = result.frame
@@ -75,14 +75,14 @@ def test_viewers_get_fewer_points_and_files_all(
         "nothing else is left out"
     )
 
-    bench._see(result)  # a click on a point is on that one
+    bench.see(result)  # a click on a point is on that one
     for row in (0, 7, LIMIT - 1):
-        found = bench.picked(frame.index, (), path, row, [])
-        assert found is not None and found.place == pytest.approx(few[row])
-    assert bench.picked(frame.index, (), path, LIMIT, []) is None
+        found = bench.select(frame.index, (), path, row, [])
+        assert found is not None and found.point == pytest.approx(few[row])
+    assert bench.select(frame.index, (), path, LIMIT, []) is None
 
 
-def test_what_is_held_to_be_saved_has_all_points(bench: LiveSession, results: list[FrameResult]) -> None:
+def test_what_is_held_to_be_saved_has_all_points(bench: RunningRobot, results: list[FrameResult]) -> None:
     live = bench.live
     packet = live.encoder.encode(results[0], live.scene, {}, ())
     flight = FlightRecorder(live.config.live, live.encoder, live._indexer)
@@ -92,7 +92,7 @@ def test_what_is_held_to_be_saved_has_all_points(bench: LiveSession, results: li
 
 
 def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
-    bench: LiveSession, monkeypatch: pytest.MonkeyPatch
+    bench: RunningRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
     monkeypatch.setattr(bench.live.encoder, "clock", lambda: now)
@@ -116,7 +116,7 @@ def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
     assert film.lag is None
 
 
-def test_what_a_page_was_too_slow_for_is_counted(bench: LiveSession, results: list[FrameResult]) -> None:
+def test_what_a_page_was_too_slow_for_is_counted(bench: RunningRobot, results: list[FrameResult]) -> None:
     film, encoder = bench.film, bench.live.encoder
     packet = encoder.encode(results[0], bench.live.scene, {}, ())
     film._take(packet, True)
@@ -131,7 +131,7 @@ def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
     settings = ReloadableConfig(None, ["detector.model=demo", "live.viewer_rate=1"])
     live = Live(source, settings, Outputs(), Notes(lambda line: None))
-    with LiveSession(live) as bench:
+    with RunningRobot(live) as bench:
         whole = live.encoder.encode(results[0], live.scene, {}, ())
         for packet in (whole, Packet(b"", False, whole.context, 0.0), whole):
             bench.film._take(packet, False)

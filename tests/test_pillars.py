@@ -30,7 +30,7 @@ from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import anchor_boxes, decode_boxes
 from bevviz.stages.pillars.nms import survivors
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.controls import controls
+from bevviz.workbench.page_messages import controls
 from tests.support.onnx_networks import FLOAT, node, save
 from tests.support.pillar_networks import (
     HIGH_Z,

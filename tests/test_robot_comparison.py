@@ -41,11 +41,10 @@ from bevviz.sweep.run import SweepOutcome
 from bevviz.synthetic import SyntheticSource
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection_of
 from bevviz.why.stage_owner import owner_of
 from bevviz.why.verdict import Reason
-from bevviz.workbench.controls import controls
 from bevviz.workbench.findings import find_findings
+from bevviz.workbench.page_messages import controls
 from bevviz.workbench.trials import trial_effects
 from tests.support.recordings import Recording
 
@@ -581,14 +580,14 @@ def test_the_list_contains_doubtful_objects() -> None:
     assert result.opinions is not None and result.objects is not None
     found = find_findings(result, None)
     [denied] = [find for find in found if find.what == "contradicted"]
-    assert (denied.name, denied.pick) == ("car", Pick("object", 1)) and abs(denied.distance - 12) < 0.1
-    lost = [find.pick for find in found if find.what == "lost"]
+    assert (denied.name, denied.selection) == ("car", Selection(object=1)) and abs(denied.distance - 12) < 0.1
+    lost = [find.selection for find in found if find.what == "lost"]
     fused, missed = result.opinions.fused, result.opinions.missed
     near = missed & (np.hypot(*fused.boxes.center[:, :2].T) <= 40)
     assert lost and len(lost) == near.sum()
     questioner = FrameExplainer(result, classes=KNOWN)
     for asked in lost:
-        [answer] = questioner.ask(selection_of(asked))
+        [answer] = questioner.ask(asked)
         assert "our fusion has it" in answer.verdict.text
     assert not [find for find in find_findings(ours(), None) if find.what in ("contradicted", "lost")]
 

@@ -28,13 +28,15 @@ from bevviz.pipeline.notes import Note, Notes
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.stages.robot_results import in_points_frame
+from bevviz.why import Selection
 from bevviz.why.pick import Pick, pick
 from bevviz.why.subject import projected_box, single_box
-from bevviz.workbench.controls import controls
+from bevviz.workbench.access import persistent_token
+from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.findings import find_findings
-from bevviz.workbench.recording_buffer import RecordingBuffer
+from bevviz.workbench.page_messages import controls, parse_selection, selection_text
+from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.session import WorkbenchSession
-from bevviz.workbench.token import persistent_token
 from tests.support.small_disk import small_disk
 from tests.support.waiting import PATIENCE
 from tests.support.workbench_pages import FRAMES, POLL, chromium, demo_bag, serving, state, until, verdict
@@ -157,10 +159,11 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     assert result.frame.truth is not None
     (camera,), boxes = result.frame.cameras, in_points_frame(result.frame, result.frame.truth)
     around = {
-        str(find.pick): [float(p) for p in box]
+        selection_text(find.selection): [float(p) for p in box]
         for find in find_findings(result, truth_of(result.frame, result.frame.truth))
         if find.what == "missed"
-        and (box := projected_box(single_box(boxes, find.pick.row), camera)) is not None
+        and find.selection.truth is not None
+        and (box := projected_box(single_box(boxes, find.selection.truth), camera)) is not None
     }
     inside = [pick for pick, box in around.items() if box[0] > 20 and box[2] < 620]
     # The one whose left line is farthest from every other line.
@@ -654,16 +657,22 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
 
 
 @pytest.mark.parametrize(
-    "one", [Pick("truth", 3), Pick("detection", 0, "a/b"), Pick("pixel", camera="zed", place=(1.5, 2.0))]
+    "one",
+    [
+        Selection(truth=3),
+        Selection(detection=0, camera="a/b"),
+        Selection(box=(1.5, 2.0), camera="zed"),
+        Selection(cell=(3, 12)),
+    ],
 )
-def test_picks_stand_in_an_address(one: Pick) -> None:
-    assert Pick.parse(str(one)) == one
+def test_selections_stand_in_an_address(one: Selection) -> None:
+    assert parse_selection(selection_text(one)) == one
 
 
 @pytest.mark.parametrize("text", ["", "car", "truth//", "truth//nan", "pixel/zed/1", "point//1,2", "x//1"])
 def test_an_invalid_pick_is_one_line(text: str) -> None:
     with pytest.raises(UserError, match="nothing that can be asked"):
-        Pick.parse(text)
+        parse_selection(text)
 
 
 # --- what is worth a look -----------------------------------------------------------------------
@@ -675,7 +684,7 @@ def test_objects_missed_against_the_truth_are_listed(result: FrameResult) -> Non
     assert frame.truth is not None
     assert result.objects is not None
     truth = truth_of(frame, frame.truth)
-    missed = {find.pick.row for find in find_findings(result, truth) if find.what == "missed"}
+    missed = {find.selection.truth for find in find_findings(result, truth) if find.what == "missed"}
     assert missed
     for row, (label, must) in enumerate(zip(truth.labels, truth.must, strict=True)):
         near = [
@@ -707,11 +716,12 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     from rerun.chunk import RrdReader
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
-        bench = WorkbenchSession(drive, again.frames, [bag])
+        bench = RecordedDrive(drive, again.frames)
+        session = WorkbenchSession(bench)
         bench.observe(drive.at(frame=0))
-        told = bench.attempt(0, ("clustering.min_cluster_points=100000",))
-        recoloured = bench.attempt(0, ("ground.distance_threshold=0.5",))
-        bench.attempt(0, ("detector.conf_threshold=0.9",))
+        told = session.try_values(0, ("clustering.min_cluster_points=100000",))
+        recoloured = session.try_values(0, ("ground.distance_threshold=0.5",))
+        session.try_values(0, ("detector.conf_threshold=0.9",))
         result = drive.at(frame=0)
         pieces = [film[row] for film in (bench.film, bench.desk) for row in range(len(film))]
         bench.close()
@@ -742,10 +752,10 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
     """A page that is opened again asks for what it showed, long before the run is there."""
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         stamps = [drive.raw(number).stamp for number in range(FRAMES)]
-        bench = WorkbenchSession(drive, again.frames, [bag], first=2)
+        bench = RecordedDrive(drive, again.frames, first=2)
         with pytest.raises(UserError, match="no frame"):
             bench.number_at(stamps[0])
-        bench._show(bench.look(2), ())
+        bench.show(bench.look(2), ())
         for ran in range(3):
             assert [bench.number_at(stamp) for stamp in stamps] == list(range(FRAMES)), f"{ran} were run"
             middle = (stamps[3] + stamps[4]) // 2
@@ -777,8 +787,8 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         results = [drive.at(frame=number) for number in range(4)]
         seen = entities.detections(results[0].cameras[0].camera.name)
-        bench = WorkbenchSession(drive, again.frames, [bag], first=3)
-        bench._show(blind(results[3]), ())
+        bench = RecordedDrive(drive, again.frames, first=3)
+        bench.show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):
             bench.observe(result)
         first, *others = [bench.film[row] for row in range(len(bench.film))]
@@ -794,7 +804,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
 def test_pieces_of_a_recording_are_read_back_unchanged() -> None:
     told = []
     with RecordingBuffer() as film:
-        end = film.listen(lambda: told.append(len(film)))
+        end = film.news.listen(lambda: told.append(len(film)))
         for piece in (b"one", b"", None, b"two" * 1000):
             film.add(piece)
         end()

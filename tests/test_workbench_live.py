@@ -22,9 +22,10 @@ from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.why.pick import Pick
+from bevviz.why import Selection
 from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
-from bevviz.workbench.live_session import KEPT, LiveSession
+from bevviz.workbench.running_robot import KEPT, RunningRobot
+from bevviz.workbench.session import WorkbenchSession
 from tests.support.live_sessions import live_bench
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
@@ -84,6 +85,7 @@ class Channel:
         self._open = ExitStack()
         self._socket = self._open.enter_context(connect(url, origin=origin, max_size=None))
         self._number = 0
+        self.entries = deque[list[dict[str, Any]]]()  # those that came before another message was awaited
 
     def send(self, **message: Any) -> int:
         self._number += 1
@@ -101,6 +103,8 @@ class Channel:
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             message: dict[str, Any] = json.loads(self._socket.recv(timeout=PATIENCE))
+            if message["type"] == "entries" and kind != "entries":
+                self.entries.append(message["entries"])
             if message["type"] in (kind, "error") and number in (None, message.get("id")):
                 return message
         raise AssertionError(f"no {kind}")
@@ -141,7 +145,7 @@ def nearest_missed(talk: Channel, frame: int) -> str:
     """Return the pick of the nearest missed object in the next list, which is of one frame only."""
     entries: list[dict[str, Any]] = []
     while not entries:  # those of the frame that was held before may go first
-        entries = talk.until("entries")["entries"]
+        entries = talk.entries.popleft() if talk.entries else talk.until("entries")["entries"]
     assert {sight[0] for entry in entries for sight in entry["sights"]} == {frame}
     missed = [entry["sights"][0] for entry in entries if entry["what"] == "missed"]
     return str(min(missed, key=lambda sight: sight[2])[3])
@@ -150,14 +154,14 @@ def nearest_missed(talk: Channel, frame: int) -> str:
 def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     """From the newest frame to a held one, its answer, a parameter for all to come, a mark, a snapshot."""
     address, folder = robot
-    talk, orders, shown = Channel(address, "/talk"), Channel(address, "/live"), Shown(address, folder)
+    talk, shown = Channel(address, "/talk"), Shown(address, folder)
     welcome = talk.until("welcome")
     assert welcome["detector"]
     assert any(control["key"] == "clustering.eps" for control in welcome["controls"])
     shown.until(lambda: shown.stamp)
 
-    orders.send(type="hold", time=shown.stamp)
-    held = orders.until("held")
+    talk.send(type="hold", time=shown.stamp)
+    held = talk.until("held")
     stamp = int(held["stamp"])
     near = nearest_missed(talk, held["frame"])
     number = talk.send(type="ask", time=stamp, pick=near, set=[])
@@ -174,8 +178,8 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     shown.until(lambda: any("clustering.min_cluster_points 10 -> 100000" in t for t in shown.texts))
     told = shown.stamp  # of a frame that may have been made before
     shown.until(lambda: shown.stamp > told + 10**9)
-    orders.send(type="hold", time=shown.stamp)
-    later = orders.until("held")
+    talk.send(type="hold", time=shown.stamp)
+    later = talk.until("held")
     assert later["frame"] > held["frame"]
     near = nearest_missed(talk, later["frame"])
     number = talk.send(type="ask", time=int(later["stamp"]), pick=near, set=[])
@@ -187,16 +191,16 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     number = talk.send(type="report", time=stamp, text="", before=1, after=1)
     assert "a drive that is over" in talk.until("report", number)["text"]
 
-    orders.send(type="mark", time=stamp, text="odd")
-    said = orders.until("said")["text"]
+    talk.send(type="mark", time=stamp, text="odd")
+    said = talk.until("said")["text"]
     assert said == f"mark at frame {held['frame']}: odd"
     shown.until(lambda: said in shown.texts)
-    orders.send(type="snap")
-    saved = orders.until("said")["text"].removeprefix("saved in ")
+    talk.send(type="snap")
+    saved = talk.until("said")["text"].removeprefix("saved in ")
     assert (folder / saved).stat().st_size > 100_000
-    orders.send(type="dance")
-    assert orders.until("said")["wrong"]
-    for channel in (talk, orders, shown.channel):
+    talk.send(type="dance")
+    assert "cannot be understood" in talk.until("said")["text"]
+    for channel in (talk, shown.channel):
         channel.close()
 
 
@@ -210,22 +214,22 @@ def results() -> list[FrameResult]:
 
 
 @pytest.fixture
-def bench(results: list[FrameResult]) -> Iterator[LiveSession]:
+def bench(results: list[FrameResult]) -> Iterator[RunningRobot]:
     with live_bench(results, f"live.held={HELD}") as bench:
         yield bench
 
 
 def test_only_the_newest_frames_and_those_held_are_there(
-    bench: LiveSession, results: list[FrameResult]
+    bench: RunningRobot, results: list[FrameResult]
 ) -> None:
     with pytest.raises(UserError, match="no frame has come yet"):
         bench.number_at(0)
     for result in results[:HELD]:
-        bench._see(result)
+        bench.see(result)
     first = bench.hold(results[1].frame.stamp)
     assert first is results[1]
     for result in results[HELD:]:
-        bench._see(result)
+        bench.see(result)
     assert bench.look(1) is first
     assert bench.number_at(results[-1].frame.stamp + 10**7) == results[-1].frame.index
     with pytest.raises(UserError, match=f"the newest {HELD} can be asked about"):
@@ -240,11 +244,11 @@ def test_only_the_newest_frames_and_those_held_are_there(
     assert len(bench._held()) == HELD + KEPT
 
 
-def test_a_held_frame_can_be_asked_with_other_values(bench: LiveSession, results: list[FrameResult]) -> None:
+def test_a_held_frame_can_be_asked_with_other_values(bench: RunningRobot, results: list[FrameResult]) -> None:
     for result in results[:2]:
-        bench._see(result)
+        bench.see(result)
     assert results[1].objects is not None and len(results[1].objects)
-    assert "was reported" in bench.ask(1, (), Pick("object", 0))[0].verdict.text
+    assert "was reported" in WorkbenchSession(bench).ask(1, (), Selection(object=0))[0].verdict.text
     tried = bench.look(1, ("clustering.min_cluster_points=100000",))
     assert tried.objects is not None and not len(tried.objects)
     assert bench.live.config == results[1].config.model_copy(update={"live": bench.live.config.live})
@@ -264,7 +268,7 @@ def detect(points, params):
 @pytest.fixture
 def bench_with_network(
     results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[LiveSession]:
+) -> Iterator[RunningRobot]:
     """Yield a run whose user has named a function and then our own method. A page may switch between them."""
     (tmp_path / "network.py").write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
@@ -274,33 +278,34 @@ def bench_with_network(
 
 
 def test_the_objects_method_is_changed_there_and_back(
-    bench_with_network: LiveSession, results: list[FrameResult]
+    bench_with_network: RunningRobot, results: list[FrameResult]
 ) -> None:
     """Ours, a function with parameters of its own, the robot's topic, and ours again."""
     bench = bench_with_network
-    bench._see(results[0])
+    session = WorkbenchSession(bench)
+    bench.see(results[0])
     theirs = ("objects.method=network:detect", "objects.params.ahead=14", "opinions.min_height=400")
-    told = bench.attempt(0, theirs)
+    told = session.try_values(0, theirs)
     assert told["changes"]["objects.params.ahead"] == "absent -> 14.0"
     assert told["opinions"]["unseen"] == [None, 1] and told["opinions"]["missed"][1] > 0
     assert bench.live.session.stages.objects is not None
     said = [text for _, text in bench.live.notes.take()]
     assert not [text for text in said if "absent" in text], "what comes with a method is not told one by one"
     assert "configuration: objects.method frustum -> network:detect" in said
-    told = bench.attempt(0, ("objects.method=topic:/nobody",))
+    told = session.try_values(0, ("objects.method=topic:/nobody",))
     assert told["failures"] == ["objects: the robot published no boxes on /nobody at the time of this scan"]
     assert bench.live.config.opinions.min_height == 25 and not bench.live.config.objects.params
     with pytest.raises(UserError, match=r"start bevviz with --set objects\.method=nowhere:detect"):
-        bench.attempt(0, ("objects.method=nowhere:detect",))
+        session.try_values(0, ("objects.method=nowhere:detect",))
     assert bench.live.config.objects.method == "topic:/nobody"
-    told = bench.attempt(0, ())
+    told = session.try_values(0, ())
     assert not told["changes"] and not told["opinions"] and not any(told["effects"].values())
     again = bench.live.session.run_single(results[0].frame)
     assert again.opinions is None and again.objects is not None and results[0].objects is not None
     assert again.objects.names == results[0].objects.names
 
 
-def test_pages_begin_at_a_whole_frame_and_miss_none(bench: LiveSession, results: list[FrameResult]) -> None:
+def test_pages_begin_at_a_whole_frame_and_miss_none(bench: RunningRobot, results: list[FrameResult]) -> None:
     encoder: Encoder = bench.live.encoder
     film: LiveBuffer = bench.film
     assert film.since(None) == ([], -1)

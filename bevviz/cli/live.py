@@ -333,13 +333,14 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
     if options.workbench is None:
         return nullcontext()
     try:
-        from bevviz.workbench.live_page import LivePage
-        from bevviz.workbench.live_session import LiveSession
+        from bevviz.workbench.running_robot import RunningRobot
+        from bevviz.workbench.server import LivePage
+        from bevviz.workbench.session import WorkbenchSession
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    page = LivePage(LiveSession(live), options.workbench or None)
+    page = LivePage(WorkbenchSession(RunningRobot(live)), options.workbench or None)
     say(f"workbench at {page.address}", always=True)
     return page
 

@@ -62,15 +62,14 @@ def _open(options: argparse.Namespace) -> int:
         return _show(recording, options)
     try:
         from bevviz.workbench.server import serve
+        from bevviz.workbench.startup import LabelledSource
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
     config = load_config(options)
     with ExitStack() as stack:
-        from bevviz.bags.source import BagSource
-
-        source, second_source = (stack.enter_context(BagSource(options.paths, config)) for _ in range(2))
+        source, second_source = (stack.enter_context(LabelledSource(options.paths, config)) for _ in range(2))
         number = options.at_frame or 0
         first = source.checked(number) if options.at is None else source.number_at(options.at)
         warn(source.warnings)
@@ -80,16 +79,12 @@ def _open(options: argparse.Namespace) -> int:
             print_hints(source.scene, config)
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
-            from bevviz.workbench.session import WorkbenchSession
-            from bevviz.workbench.truth_frames import LabelledFrames
+            from bevviz.workbench.recorded_drive import recorded_session
 
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-            if truth_of is None or (options.truth is None and options.kitti_labels is None):
-                return WorkbenchSession(Drive(source, config), second_source, options.paths, truth_of, first)
-            labelled, second_labelled = (
-                LabelledFrames(frames, truth_of) for frames in (source, second_source)
-            )
-            return WorkbenchSession(Drive(labelled, config), second_labelled, options.paths, truth_of, first)
+            if options.truth is not None or options.kitti_labels is not None:
+                source.truth_of = second_source.truth_of = truth_of
+            return recorded_session(Drive(source, config), second_source, options.paths, truth_of, first)
 
         def ready(address: str) -> None:
             say(f"workbench at {address}", always=True)

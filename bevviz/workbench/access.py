@@ -1,9 +1,17 @@
-"""Access to the page: a request needs the token and must not come from another site."""
+"""Access to the page: a request needs the token and must not come from another site.
+
+A file keeps the token while the server runs, so that pages survive a crash of the server.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
 from urllib.parse import parse_qs
 
 from starlette.requests import HTTPConnection
@@ -66,3 +74,46 @@ def _cookie(request: HTTPConnection, name: str) -> str:
     except CookieError:
         return ""
     return cookie.value if cookie is not None else ""
+
+
+@contextmanager
+def persistent_token(port: int, drive: str) -> Iterator[str]:
+    """Yield the token for the server of a drive at a port.
+
+    A token that a killed server of the same drive left at the same port is used again. Otherwise the token is
+    new. Only this user can read its file. If the file cannot be written, every start makes a new token.
+
+    Args:
+        port: port of the server, which listens there already. So no other server uses the file.
+        drive: paths of the drive.
+    """
+    path = _token_folder() / f"workbench-{port}.json"
+    token = _leftover_token(path, drive) or secrets.token_urlsafe(16)
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            json.dump({"drive": drive, "token": token}, file)
+    try:
+        yield token
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _token_folder() -> Path:
+    """Return the folder of the token files."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME")
+    return Path(runtime or Path.home() / ".cache") / "bevviz"
+
+
+def _leftover_token(path: Path, drive: str) -> str:
+    """Return the token that a killed server left. Empty: there is none that can be used."""
+    try:
+        status = path.lstat()
+        if status.st_uid != os.getuid() or status.st_mode & 0o077:
+            return ""
+        content = json.loads(path.read_text())
+        return str(content["token"]) if content["drive"] == drive and len(content["token"]) >= 16 else ""
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""

@@ -1,20 +1,32 @@
-"""Findings in a frame: missed objects, false objects, and unexplained detections and clusters."""
+"""Findings: missed, false and unexplained objects of a frame, and the list of them over the drive.
+
+A finding that lasts several frames is one group of the list.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+import math
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from bevviz.evaluate import RANGE, Truth, match
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64
-from bevviz.model.results import Decision, FrameResult, Opinion
+from bevviz.model.frame import F32, Frame
+from bevviz.model.results import Anomaly, Decision, FrameResult, Opinion
+from bevviz.pipeline.session import Session
 from bevviz.why import FrameExplainer, Selection
-from bevviz.why.pick import Pick
+from bevviz.workbench.page_messages import selection_text
 
 FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
+
+REACH = 2.5  # metres that an object may have moved since the last frame with this finding
+GAP = 5  # frames without the finding after which a new group begins
+SAME_BOX = 0.3  # IoU of the image boxes of one detection in two frames
+
 
 Position = tuple[float, float, float]
 
@@ -29,7 +41,7 @@ class Finding:
         what: missed, false, contradicted, lost, unmatched or unnamed.
         name: name of the class, or "cluster".
         distance: horizontal distance in metres. NaN: unknown.
-        pick: pick that asks about it.
+        selection: selection that asks about it.
         reason: short reason.
         position: position in the fixed frame, if known.
         box: (4,) box in the image, for a detection without position.
@@ -40,7 +52,7 @@ class Finding:
     what: str
     name: str
     distance: float
-    pick: Pick
+    selection: Selection
     reason: str = ""
     position: Position | None = None
     box: F32 | None = None
@@ -66,21 +78,37 @@ def find_findings(result: FrameResult, truth: Truth | None) -> list[Finding]:
     )
 
 
-def with_reasons(
-    findings: Sequence[Finding], result: FrameResult, questioner: FrameExplainer
-) -> list[Finding]:
-    """Return the findings with the reason of the verdict at each missed object."""
-    reasons = {}
-    for finding in findings:
-        if finding.what == "missed":
-            answers = questioner.ask(Selection(truth=finding.pick.row))
-            reasons[finding.pick] = answers[0].verdict.reason.value if answers else ""
-    return [replace(finding, reason=reasons.get(finding.pick, finding.reason)) for finding in findings]
+def with_reasons(findings: Sequence[Finding], result: FrameResult, session: Session) -> list[Finding]:
+    """Return the findings with the reason of the verdict at each missed object.
+
+    Args:
+        findings: findings of the frame.
+        result: result of the frame.
+        session: session with the loaded stages.
+    """
+    if not any(finding.what == "missed" for finding in findings):
+        return list(findings)
+    explainer = FrameExplainer(result, session.loader, session.stages.class_names)
+
+    def with_reason(finding: Finding) -> Finding:
+        answers = explainer.ask(finding.selection) if finding.what == "missed" else []
+        return replace(finding, reason=answers[0].verdict.reason.value) if answers else finding
+
+    return [with_reason(finding) for finding in findings]
+
+
+def finding_at(
+    frame: Frame, kind: str, name: str, center: F32, selection: Selection, reason: str = ""
+) -> Finding:
+    """Return a finding at a centre in the frame of the points."""
+    x, y, z = geometry.apply(frame.pose, np.asarray(center, np.float32)[None])[0].tolist()
+    distance = float(np.hypot(*center[:2]))
+    return Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z))
 
 
 def _judged(result: FrameResult, truth: Truth) -> Iterator[Finding]:
     """Yield the false and the missed objects by ground truth."""
-    frame_ids, objects, pose = (result.frame.index, result.frame.stamp), result.objects, result.frame.pose
+    frame, objects = result.frame, result.objects
     unmatched = truth.must.copy()
     if objects is not None and len(objects):
         partner, _ = match(objects, truth)
@@ -89,53 +117,30 @@ def _judged(result: FrameResult, truth: Truth) -> Iterator[Finding]:
         for row in np.flatnonzero(partner < 0).tolist():
             name, center = objects.names[row], objects.boxes.center[row]
             if name.lower() in judged:
-                distance = float(np.hypot(*center[:2]))
-                yield Finding(
-                    *frame_ids,
-                    "false",
-                    name,
-                    distance,
-                    Pick("object", row),
-                    position=fixed_position(pose, center),
-                )
+                yield finding_at(frame, "false", name, center, Selection(object=row))
     for row in np.flatnonzero(unmatched).tolist():
-        center = truth.boxes.center[row]
-        name, distance = truth.labels[row].lower(), float(np.hypot(*center[:2]))
-        yield Finding(
-            *frame_ids, "missed", name, distance, Pick("truth", row), position=fixed_position(pose, center)
-        )
+        name, center = truth.labels[row].lower(), truth.boxes.center[row]
+        yield finding_at(frame, "missed", name, center, Selection(truth=row))
 
 
 def _doubted(result: FrameResult) -> Iterator[Finding]:
     """Yield the findings about objects of another perception: contradicted by a camera, or lost."""
-    opinions, objects = result.opinions, result.objects
+    frame, opinions, objects = result.frame, result.opinions, result.objects
     if opinions is None or objects is None:
         return
-    frame_ids, pose, fused = (result.frame.index, result.frame.stamp), result.frame.pose, opinions.fused
     for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
-        center, pick = objects.boxes.center[row], Pick("object", row)
-        distance, reason = float(np.hypot(*center[:2])), f"by {opinions.camera[row]}"
-        yield Finding(
-            *frame_ids,
-            "contradicted",
-            objects.names[row],
-            distance,
-            pick,
-            reason,
-            fixed_position(pose, center),
-        )
+        name, center, reason = objects.names[row], objects.boxes.center[row], f"by {opinions.camera[row]}"
+        yield finding_at(frame, "contradicted", name, center, Selection(object=row), reason)
+    fused = opinions.fused
     for row in np.flatnonzero(opinions.missed).tolist():
-        center, camera = fused.boxes.center[row], fused.camera[row]
-        pick = Pick("detection", int(fused.detection[row]), camera)
-        distance, reason = float(np.hypot(*center[:2])), f"{fused.score[row]:.2f} in {camera}"
-        yield Finding(
-            *frame_ids, "lost", fused.names[row], distance, pick, reason, fixed_position(pose, center)
-        )
+        camera, reason = fused.camera[row], f"{fused.score[row]:.2f} in {fused.camera[row]}"
+        selection = Selection(detection=int(fused.detection[row]), camera=camera)
+        yield finding_at(frame, "lost", fused.names[row], fused.boxes.center[row], selection, reason)
 
 
 def _unexplained(result: FrameResult) -> Iterator[Finding]:
     """Yield the detections without a cluster and the clusters without a detection."""
-    frame_ids, clusters, pose = (result.frame.index, result.frame.stamp), result.clusters, result.frame.pose
+    frame, clusters = result.frame, result.clusters
     named = np.zeros(0 if clusters is None else len(clusters), bool)
     in_view = named.copy()
     for camera in result.cameras:
@@ -146,31 +151,150 @@ def _unexplained(result: FrameResult) -> Iterator[Finding]:
         in_view |= fusion.cluster_decision == Decision.NO_DETECTION
         for row in np.flatnonzero(detections.kept & (fusion.detection_decision != Decision.MATCHED)).tolist():
             reason = Decision(int(fusion.detection_decision[row])).name.lower().replace("_", " ")
-            distance, name, position = float("nan"), detections.names[row], None
+            name, selection = detections.names[row], Selection(detection=row, camera=camera.camera.name)
             if (cluster := int(fusion.detection_cluster[row])) >= 0 and clusters is not None:
-                distance = float(np.hypot(*clusters.centroid[cluster, :2]))
-                position = fixed_position(pose, clusters.centroid[cluster])
-            pick = Pick("detection", row, camera.camera.name)
-            yield Finding(
-                *frame_ids, "unmatched", name, distance, pick, reason, position, detections.xyxy[row]
-            )
+                center = clusters.centroid[cluster]
+                finding = finding_at(frame, "unmatched", name, center, selection, reason)
+            else:
+                finding = Finding(frame.index, frame.stamp, "unmatched", name, math.nan, selection, reason)
+            yield replace(finding, box=detections.xyxy[row])
     if clusters is None:
         return
     for row in np.flatnonzero(in_view & ~named & clusters.kept & (clusters.count >= FEW)).tolist():
-        center = clusters.centroid[row]
-        distance, reason = float(np.hypot(*center[:2])), f"{clusters.count[row]} points, no detection"
-        yield Finding(
-            *frame_ids,
-            "unnamed",
-            "cluster",
-            distance,
-            Pick("cluster", row),
-            reason,
-            fixed_position(pose, center),
-        )
+        reason = f"{clusters.count[row]} points, no detection"
+        center, selection = clusters.centroid[row], Selection(cluster=row)
+        yield finding_at(frame, "unnamed", "cluster", center, selection, reason)
 
 
-def fixed_position(pose: F64, center: F32) -> Position:
-    """Return a point in the fixed frame."""
-    x, y, z = geometry.apply(pose, np.asarray(center, np.float32)[None])[0].tolist()
-    return x, y, z
+# --- list over the drive -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FindingFrame:
+    """One frame of a finding.
+
+    Attributes:
+        frame: number of the scan.
+        stamp: stamp of the scan, in nanoseconds.
+        distance: distance in metres. NaN: unknown.
+        pick: text of the selection that asks about it. Empty: there is nothing to ask.
+        tried: whether the tried side shows it, rather than the drive as it was opened.
+        text: reason in this frame.
+    """
+
+    frame: int
+    stamp: int
+    distance: float
+    pick: str
+    tried: bool = False
+    text: str = ""
+
+    def as_list(self) -> list[Any]:
+        """Return the values for the page. The stamp is text: JavaScript numbers cannot hold it."""
+        distance = None if math.isnan(self.distance) else round(self.distance, 1)
+        return [self.frame, str(self.stamp), distance, self.pick, self.tried, self.text]
+
+
+@dataclass(slots=True)
+class FindingGroup:
+    """One finding in all of its frames."""
+
+    number: int
+    what: str
+    name: str
+    frames: list[FindingFrame] = field(default_factory=list)
+    position: Position | None = None  # position in the last frame
+    box: F32 | None = None
+
+
+class FindingList:
+    """All groups of findings. One thread at a time may add to it, any thread may read it."""
+
+    def __init__(self) -> None:
+        self._groups: dict[int, FindingGroup] = {}
+        self._recent: dict[tuple[str, str], list[FindingGroup]] = {}
+        self._number = 0
+        self._lock = threading.Lock()
+
+    def add(self, findings: Iterable[Finding], *, tried: bool = False) -> None:
+        """Add the findings of the next frame.
+
+        A finding near a recent one of the same kind and name joins its group.
+        """
+        with self._lock:
+            taken_groups: set[int] = set()
+            for finding in findings:
+                group = self._same(finding, taken_groups) or self._new(finding.what, finding.name)
+                taken_groups.add(group.number)
+                group.position, group.box = finding.position, finding.box
+                pick = selection_text(finding.selection)
+                group.frames.append(
+                    FindingFrame(finding.frame, finding.stamp, finding.distance, pick, tried, finding.reason)
+                )
+
+    def _same(self, finding: Finding, taken_groups: set[int]) -> FindingGroup | None:
+        groups = self._recent.get((finding.what, finding.name), [])
+        groups[:] = [group for group in groups if 0 <= finding.frame - group.frames[-1].frame <= GAP]
+        candidates = [
+            (_relative_distance(group, finding), group.number)
+            for group in groups
+            if group.number not in taken_groups
+        ]
+        best, number = min(candidates, default=(math.inf, -1))
+        return self._groups[number] if best <= 1 else None
+
+    def _new(self, kind: str, name: str) -> FindingGroup:
+        self._number += 1
+        group = FindingGroup(self._number, kind, name)
+        self._groups[group.number] = group
+        self._recent.setdefault((kind, name), []).append(group)
+        return group
+
+    def add_anomalies(self, frame: int, stamp: int, anomalies: Sequence[Anomaly]) -> None:
+        """Add the anomalies that begin in a frame."""
+        with self._lock:
+            for anomaly in anomalies:
+                kind = anomaly.kind.replace("_", " ")
+                finding_frame = FindingFrame(frame, stamp, math.nan, "", text=anomaly.text)
+                self._new("anomaly", kind).frames.append(finding_frame)
+
+    def replace(self, kinds: Sequence[str]) -> None:
+        """Remove all findings of these kinds, before new ones are added."""
+        with self._lock:
+            for number in [number for number, group in self._groups.items() if group.what in kinds]:
+                del self._groups[number]
+            for key in [key for key in self._recent if key[0] in kinds]:
+                del self._recent[key]
+
+    def news(self, sent_counts: dict[int, int]) -> Iterator[dict[str, Any]]:
+        """Yield the news for a page. ``sent_counts`` counts the frames that it has of each group."""
+        with self._lock:
+            gone = [number for number in sent_counts if number not in self._groups]
+            changed_groups = [
+                group
+                for group in self._groups.values()
+                if len(group.frames) > sent_counts.get(group.number, 0)
+            ]
+            new_items = [
+                {
+                    "number": group.number,
+                    "what": group.what,
+                    "name": group.name,
+                    "sights": [frame.as_list() for frame in group.frames[sent_counts.get(group.number, 0) :]],
+                }
+                for group in changed_groups
+            ]
+            sent_counts.update((group.number, len(group.frames)) for group in changed_groups)
+        for number in gone:
+            del sent_counts[number]
+        if gone or new_items:
+            yield {"type": "entries", "entries": new_items, "gone": gone}
+
+
+def _relative_distance(group: FindingGroup, finding: Finding) -> float:
+    """Return the distance from the last position of a group, divided by the largest allowed distance."""
+    if group.position is not None and finding.position is not None:
+        return float(np.linalg.norm(np.subtract(group.position, finding.position))) / REACH
+    if group.box is not None and finding.box is not None:
+        return 1.0 if geometry.iou(group.box[None], finding.box[None])[0, 0] >= SAME_BOX else math.inf
+    return math.inf

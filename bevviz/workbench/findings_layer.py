@@ -91,13 +91,13 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
 
 def _box(result: FrameResult, finding: Finding) -> Boxes3D:
     """Return the box of a finding in the frame of the points, as one row."""
-    row = finding.pick.row
-    if finding.pick.kind == "object" and result.objects is not None:
-        return single_box(result.objects.boxes, row)
-    if finding.pick.kind == "cluster" and result.clusters is not None:
-        return single_box(result.clusters.boxes(result.config.clustering), row)
-    assert result.frame.truth is not None
-    return single_box(in_points_frame(result.frame, result.frame.truth), row)
+    selection = finding.selection
+    if selection.object is not None and result.objects is not None:
+        return single_box(result.objects.boxes, selection.object)
+    if selection.cluster is not None and result.clusters is not None:
+        return single_box(result.clusters.boxes(result.config.clustering), selection.cluster)
+    assert selection.truth is not None and result.frame.truth is not None
+    return single_box(in_points_frame(result.frame, result.frame.truth), selection.truth)
 
 
 def _log_above(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from bevviz.live.runtime import Live
 from bevviz.recording import blueprints
 from bevviz.recording.frame_logger import RecordingContext
 from bevviz.recording.sinks import APPLICATION
-from bevviz.workbench.routes import PageState
+from bevviz.workbench.buffers import News, PageState
 
 AHEAD = 10  # pieces that may be sent before the page's viewer has drawn the first of them
 WHOLE = 3  # self-contained packets that are kept, with all packets after the oldest of them
@@ -31,19 +31,32 @@ class _Piece:
     context: RecordingContext | None  # only for a piece that a page can begin with
 
 
-class PageProgress:
-    """Progress of a page: how many pieces it was sent, and how many its viewer has drawn.
+class LiveReader:
+    """Reader of one page. It knows how many pieces the page was sent, and how many its viewer has drawn.
 
     Args:
+        buffer: the buffer.
         state: state of the page, with its acknowledgements.
         clock: returns the time in seconds.
     """
 
-    def __init__(self, state: PageState, clock: Callable[[], float]) -> None:
-        self._state, self._clock = state, clock
+    def __init__(self, buffer: LiveBuffer, state: PageState, clock: Callable[[], float]) -> None:
+        self._buffer, self._state, self._clock = buffer, state, clock
+        self.news = buffer.news
+        self._next: int | None = None  # number of the next piece. None: the page has nothing yet
         self._sent: deque[float] = deque()  # send times of the pieces that are not drawn yet
         self._drawn = 0
         self._lock = threading.Lock()
+
+    def take(self) -> Sequence[bytes]:
+        """Return the pieces to send now, if the page can take some."""
+        if not self.ready:
+            return ()
+        pieces, following = self._buffer.since(self._next)
+        self._next = None if following < 0 else following
+        for _ in pieces:
+            self.send()
+        return pieces
 
     def send(self) -> None:
         """Count a piece that is sent."""
@@ -76,18 +89,21 @@ class LiveBuffer(Output):
     Args:
         live: the live run.
         queue: number of packets that may wait.
+
+    Attributes:
+        news: tells of each new piece.
     """
 
     def __init__(self, live: Live, queue: int) -> None:
         super().__init__("page", queue)
         self._encoder = live.encoder
         self._sparse = live.config.live.viewer_rate is not None
-        self._pages: list[PageProgress] = []
+        self._pages: list[LiveReader] = []
         self._missed = 0  # pieces that slow pages have skipped
         self._pieces: deque[_Piece] = deque()
         self._next = 0
         self._lock = threading.Lock()
-        self._listeners: list[Callable[[], None]] = []
+        self.news = News()
         self._thread.start()
 
     def close(self) -> None:
@@ -106,19 +122,14 @@ class LiveBuffer(Output):
         return max((page.lag for page in self._pages.copy()), default=None)
 
     @contextmanager
-    def shown(self, state: PageState) -> Iterator[PageProgress]:
+    def shown(self, state: PageState) -> Iterator[LiveReader]:
         """Return a context in which a page is connected."""
-        page = PageProgress(state, self._encoder.clock)
+        page = LiveReader(self, state, self._encoder.clock)
         self._pages.append(page)
         try:
             yield page
         finally:
             self._pages.remove(page)
-
-    def listen(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call the listener, from any thread, for each new piece. Return a function that ends this."""
-        self._listeners.append(listener)
-        return lambda: self._listeners.remove(listener)
 
     def add(self, data: bytes | None) -> None:
         """Append data of a further stream into the same recording. None is ignored."""
@@ -168,5 +179,4 @@ class LiveBuffer(Output):
             self._next += 1
             while sum(piece.context is not None for piece in self._pieces) > WHOLE:
                 self._pieces.popleft()
-        for listener in tuple(self._listeners):
-            listener()
+        self.news.tell()

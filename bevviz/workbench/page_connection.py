@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -16,11 +15,12 @@ from bevviz.errors import UserError, first_line
 from bevviz.support.loggers import logger
 
 if TYPE_CHECKING:
-    from bevviz.why import Answer
-    from bevviz.why.pick import Pick
-    from bevviz.workbench.session import Settings, WorkbenchSession
+    from bevviz.model.results import FrameResult
+    from bevviz.why import Answer, Selection
+    from bevviz.workbench.buffers import News
+    from bevviz.workbench.session import WorkbenchSession
+    from bevviz.workbench.source import Message, Settings
 
-BESIDE = 6  # further answers that are listed
 TOGETHER = 0.05  # seconds in which news are collected before they are sent
 
 _log = logger(__name__)
@@ -39,7 +39,8 @@ class PageConnection:
     def __init__(
         self, workbench: WorkbenchSession, socket: WebSocket, desk: ThreadPoolExecutor, run: str
     ) -> None:
-        self._workbench, self._socket, self._desk, self._run = workbench, socket, desk, run
+        self._workbench, self._source = workbench, workbench.source
+        self._socket, self._desk, self._run = socket, desk, run
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._newest = 0
@@ -57,7 +58,7 @@ class PageConnection:
 
     async def stay(self) -> None:
         """Serve the page until it disconnects."""
-        with news_event(self._workbench.listen) as news:
+        with news_event(self._source.news) as news:
             await self._send(self._welcome())
             sender = asyncio.ensure_future(self._tell(news))
             try:
@@ -71,35 +72,35 @@ class PageConnection:
     # --- messages to the page ------------------------------------------------------------------
 
     def _welcome(self) -> dict[str, Any]:
-        from bevviz.workbench.controls import controls
+        from bevviz.workbench.page_messages import controls
 
-        workbench = self._workbench
-        self._opened = workbench.drive.config
+        source = self._source
+        self._opened = source.pipeline.config
         self._controls = controls(self._opened)
         return {
             "type": "welcome",
             "run": self._run,
-            "bag": workbench.drive.scene.name,
-            "scans": len(workbench.drive),
-            "truth": workbench.truth_of is not None,
-            "detector": bool(workbench.drive.config.detector.model),
+            "bag": source.title,
+            "scans": source.scans,
+            "truth": source.truth_of is not None,
+            "detector": bool(self._opened.detector.model),
             "controls": self._controls,
         }
 
     async def _tell(self, news: asyncio.Event) -> None:
         """Send news of the run whenever there are any."""
         sent_counts: dict[int, int] = {}
-        opening_sent, notes_version, workbench = False, -1, self._workbench
+        opening_sent, notes_version, workbench, source = False, -1, self._workbench, self._source
         while True:
             news.clear()
-            if not opening_sent and workbench.opening is not None:
+            if not opening_sent and source.opening is not None:
                 opening_sent = True
-                await self._send({"type": "opening", "stamp": str(workbench.opening)})
-            for message in workbench.entries.news(sent_counts):
+                await self._send({"type": "opening", "stamp": str(source.opening)})
+            for message in source.findings.news(sent_counts):
                 await self._send(message)
-            if notes_version != workbench.notes_changed:
-                notes_version = workbench.notes_changed
-                await self._send(await asyncio.to_thread(_notes, workbench))
+            if notes_version != workbench.notes_version:
+                notes_version = workbench.notes_version
+                await self._send(await asyncio.to_thread(self._notes))
             await self._send(workbench.progress())
             await news.wait()
             await asyncio.sleep(TOGETHER)
@@ -107,6 +108,15 @@ class PageConnection:
     async def _send(self, message: dict[str, Any]) -> None:
         async with self._sending:
             await self._socket.send_text(json.dumps(message))
+
+    def _notes(self) -> dict[str, Any]:
+        from bevviz.workbench.page_messages import note_dict
+
+        try:
+            notes, error = list(self._workbench.tools.notes), ""
+        except UserError as problem:
+            notes, error = [], str(problem)
+        return {"type": "notes", "notes": [note_dict(note) for note in notes], "error": error}
 
     # --- messages from the page ----------------------------------------------------------------
 
@@ -122,7 +132,10 @@ class PageConnection:
             message = json.loads(text)
             number = message.get("id")
             self._newest = max(self._newest, int(number))
-            await self._handlers[message["type"]](int(number), message)
+            if command := self._source.commands.get(message["type"]):
+                await self._send(await asyncio.to_thread(self._reply, command, message))
+            else:
+                await self._handlers[message["type"]](int(number), message)
         except (WebSocketDisconnect, RuntimeError):
             return
         except UserError as error:
@@ -141,139 +154,130 @@ class PageConnection:
         def job() -> Any:
             if idle and number != self._newest:
                 return None
-            with self._workbench.quiet():
+            with self._source.quiet():
                 return work()
 
         return await asyncio.get_running_loop().run_in_executor(self._desk, job)
 
-    async def _ask(self, number: int, message: dict[str, Any]) -> None:
-        from bevviz.why.pick import Pick
+    async def _ask(self, number: int, message: Message) -> None:
+        """Answer a question and mark the object. Then send hints, unless a newer message came."""
+        from bevviz.workbench.page_messages import other_answers, selection_text
 
-        workbench, settings = self._workbench, _settings(message)
-        frame = await self._frame(message)
-
-        def requested_pick() -> Pick | None:
-            if "pick" in message:
-                return Pick.parse(str(message["pick"]))
-            position = tuple(float(v) for v in message.get("position") or () if v is not None)
-            instance = message.get("instance")
-            path = str(message["entity"])
-            return workbench.picked(
-                frame, settings, path, None if instance is None else int(instance), position
-            )
-
-        def work() -> dict[str, Any] | None:
-            picked = requested_pick()
-            if picked is None:
-                return None
-            answer, others = workbench.ask(frame, settings, picked)
-            return {"pick": str(picked), **answer.as_dict(), "beside": list(_briefly(others))}
-
-        answer = await self._at_desk(number, work)
+        workbench, frame = self._workbench, await self._frame(message)
+        settings = self._source.asked_settings(_settings(message), again="pick" in message)
         head = {"id": number, "frame": frame}
-        if answer is None:
+
+        def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | None:
+            selection = self._selected(message, frame, settings)
+            if selection is None:
+                return None
+            answer, *others = workbench.ask(frame, settings, selection)
+            pick, beside = selection_text(selection), list(other_answers(others))
+            tree = {"pick": pick, **answer.as_dict(), "beside": beside}
+            return selection, self._source.look(frame, settings), answer, tree
+
+        answered = await self._at_desk(number, work)
+        if answered is None:
             await self._send({"type": "nothing", **head, "entity": str(message.get("entity", ""))})
             return
-        await self._send({"type": "answer", **head, **answer})
-        pick = Pick.parse(answer["pick"])
-        hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, pick), idle=True)
+        selection, result, answer, tree = answered
+        await self._send({"type": "answer", **head, **tree})
+        await self._at_desk(number, lambda: self._source.mark(result, answer))
+        hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, selection), idle=True)
         if hints is not None:
             await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
 
-    async def _try(self, number: int, message: dict[str, Any]) -> None:
-        from bevviz.why.pick import Pick
-        from bevviz.workbench.controls import controls
+    def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
+        """Return the selection of a question: named by its text, or by a click in the viewer."""
+        from bevviz.workbench.page_messages import parse_selection
 
-        settings, frame = _settings(message), await self._frame(message)
-        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
-        effects = await self._at_desk(number, lambda: self._workbench.attempt(frame, settings, pick))
+        if "pick" in message:
+            return parse_selection(str(message["pick"]))
+        instance = message.get("instance")
+        row = None if instance is None else int(instance)
+        position = [float(value) for value in message.get("position") or () if value is not None]
+        return self._source.select(frame, settings, str(message["entity"]), row, position)
+
+    async def _try(self, number: int, message: Message) -> None:
+        from bevviz.workbench.page_messages import controls
+
+        frame, settings, selection = await self._frame(message), _settings(message), _selection(message)
+        effects = await self._at_desk(number, lambda: self._workbench.try_values(frame, settings, selection))
         await self._send({"type": "tried", "id": number, "frame": frame, **effects})
-        new_controls = controls(self._workbench.configured(settings), self._opened)
+        new_controls = controls(self._source.configured(settings), self._opened)
         if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
             self._controls = new_controls
             await self._send({"type": "controls", "controls": new_controls})
 
-    async def _settle(self, number: int, message: dict[str, Any]) -> None:
+    async def _settle(self, number: int, message: Message) -> None:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
         frame = await self._frame(message)
-        await self._at_desk(number, lambda: self._workbench.look(frame, _settings(message)), idle=True)
+        await self._at_desk(number, lambda: self._source.look(frame, _settings(message)), idle=True)
 
-    async def _drive(self, number: int, message: dict[str, Any]) -> None:
+    async def _drive(self, number: int, message: Message) -> None:
         """Run the drive with other values."""
         settings = _settings(message)
-        await asyncio.to_thread(self._workbench.trials.begin, settings)
+        await asyncio.to_thread(self._workbench.tools.trials.begin, settings)
 
-    async def _cancel(self, number: int, message: dict[str, Any]) -> None:
-        runner = self._workbench.reports if message["what"] == "report" else self._workbench.trials
+    async def _cancel(self, number: int, message: Message) -> None:
+        tools = self._workbench.tools
+        runner = tools.reports if message["what"] == "report" else tools.trials
         await asyncio.to_thread(runner.end)
 
-    async def _report(self, number: int, message: dict[str, Any]) -> None:
+    async def _report(self, number: int, message: Message) -> None:
+        reports = self._workbench.tools.reports
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._at_desk(
-            number, lambda: self._workbench.reports.begin(frame, settings, before, after, text)
-        )
+        await self._at_desk(number, lambda: reports.begin(frame, settings, before, after, text))
 
-    async def _note(self, number: int, message: dict[str, Any]) -> None:
-        from bevviz.why.pick import Pick
+    async def _note(self, number: int, message: Message) -> None:
+        file = self._workbench.tools.notes.path.name
+        frame, text, selection = await self._frame(message), str(message["text"]), _selection(message)
+        await self._at_desk(number, lambda: self._workbench.note(frame, text, selection))
+        await self._send({"type": "noted", "id": number, "file": file})
 
-        frame, text = await self._frame(message), str(message["text"])
-        pick = Pick.parse(str(message["pick"])) if message.get("pick") else None
-        await self._at_desk(number, lambda: self._workbench.note(frame, text, pick))
-        await self._send({"type": "noted", "id": number, "file": self._workbench.notes.path.name})
-
-    async def _unnote(self, number: int, message: dict[str, Any]) -> None:
+    async def _unnote(self, number: int, message: Message) -> None:
         stamp, text = int(message["stamp"]), str(message["text"])
         await self._at_desk(number, lambda: self._workbench.remove_note(stamp, text))
 
-    async def _shown(self, number: int, message: dict[str, Any]) -> None:
+    def _reply(self, command: Callable[[Message], dict[str, Any]], message: Message) -> dict[str, Any]:
+        """Return the reply of the source to one of its commands."""
+        try:
+            return command(message)
+        except UserError as error:
+            return {"type": "said", "text": str(error), "wrong": True}
+
+    async def _shown(self, number: int, message: Message) -> None:
         """Let the run continue: the page has drawn its first frame."""
-        self._workbench.go_on()
+        self._source.go_on()
 
-    async def _frame(self, message: dict[str, Any]) -> int:
+    async def _frame(self, message: Message) -> int:
         """Return the number of the frame that the page shows. The run may not have reached it yet."""
-        return await asyncio.to_thread(self._workbench.number_at, round(float(message["time"])))
+        return await asyncio.to_thread(self._source.number_at, round(float(message["time"])))
 
 
-def _briefly(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
-    """Yield the other answers in brief, in the order of the questioner (nearest missed object first)."""
-    from bevviz.why.pick_answers import pick_of
-
-    for answer in answers[:BESIDE]:
-        if (pick := pick_of(answer)) is not None:
-            verdict = answer.verdict
-            yield {
-                "pick": str(pick),
-                "name": answer.subject.name,
-                "reported": verdict.reported,
-                "reason": verdict.reason.value,
-            }
-
-
-def _notes(workbench: WorkbenchSession) -> dict[str, Any]:
-    try:
-        notes = list(workbench.notes)
-    except UserError as error:
-        return {"type": "notes", "notes": [], "error": str(error)}
-    records = [{**asdict(note), "stamp": str(note.stamp), "received": str(note.received)} for note in notes]
-    return {"type": "notes", "notes": records, "error": ""}
-
-
-def _settings(message: dict[str, Any]) -> Settings:
+def _settings(message: Message) -> Settings:
     return tuple(str(setting) for setting in message.get("set") or ())
 
 
+def _selection(message: Message) -> Selection | None:
+    """Return the selection that a message names, if it names one."""
+    from bevviz.workbench.page_messages import parse_selection
+
+    return parse_selection(str(message["pick"])) if message.get("pick") else None
+
+
 @contextlib.contextmanager
-def news_event(listen: Callable[[Callable[[], None]], Callable[[], None]]) -> Iterator[asyncio.Event]:
+def news_event(news: News) -> Iterator[asyncio.Event]:
     """Return an event that is set whenever there is news, from any thread."""
-    news, loop = asyncio.Event(), asyncio.get_running_loop()
+    event, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def notify() -> None:
         with contextlib.suppress(RuntimeError):  # The server has ended.
-            loop.call_soon_threadsafe(news.set)
+            loop.call_soon_threadsafe(event.set)
 
-    stop = listen(notify)
+    stop = news.listen(notify)
     try:
-        yield news
+        yield event
     finally:
         stop()

@@ -16,7 +16,10 @@ from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Settings, WorkbenchSession
+    from bevviz.drive import Drive
+    from bevviz.report.make import ReportRequest
+    from bevviz.workbench.session import WorkbenchSession
+    from bevviz.workbench.source import Settings
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
@@ -76,13 +79,20 @@ class ReportMaker:
     """Reports of a workbench session, made one at a time.
 
     Args:
-        workbench: the workbench session.
-        on_change: called when the state of a report has changed.
-        folder: output folder, see ``folder_of``.
+        session: the workbench session.
+        drive: its drive.
+        paths: paths of the bag. The reports lie beside it, or in the working directory if its folder is
+            read-only.
+
+    Attributes:
+        made: the reports, the newest last.
     """
 
-    def __init__(self, workbench: WorkbenchSession, on_change: Callable[[], None], folder: Path) -> None:
-        self._workbench, self._on_change, self._folder = workbench, on_change, folder
+    def __init__(self, session: WorkbenchSession, drive: Drive, paths: Sequence[Path]) -> None:
+        self._session, self._drive, self._paths = session, drive, paths
+        folder = paths[0].resolve().parent
+        self._folder = folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
+        self._tell = session.source.news.tell
         self._thread: threading.Thread | None = None
         self.made: list[ReportJob] = []
 
@@ -106,28 +116,28 @@ class ReportMaker:
             raise UserError("a report is being made: wait for it, or cancel it")
         if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
             raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
-        workbench = self._workbench
-        received = workbench.look(number, settings).frame.received
-        seconds = (received - int(workbench.drive.frames.scans[0])) / 1e9
-        output = _free(self._folder, f"{workbench.paths[0].resolve().stem}-{seconds:.1f}s")
+        session, paths = self._session, self._paths
+        received = session.source.look(number, settings).frame.received
+        seconds = (received - int(self._drive.frames.scans[0])) / 1e9
+        output = _free(self._folder, f"{paths[0].resolve().stem}-{seconds:.1f}s")
         low, high = received - round(before * 1e9), received + round(after * 1e9)
         request = ReportRequest(
-            paths=workbench.paths,
-            config=changed_config(workbench.drive.config, settings),
+            paths=paths,
+            config=changed_config(self._drive.config, settings),
             at=iso(received),
             before=before,
             after=after,
             output=output,
             note=note.strip(),
-            asked=workbench.asked_within(low, high, settings),
-            asked_before=workbench.asked_within(low, high) if settings else (),
-            notes=list(workbench.notes),
+            asked=session.asked_within(low, high, settings),
+            asked_before=session.asked_within(low, high) if settings else (),
+            notes=list(session.tools.notes),
         )
         report = ReportJob(len(self.made), output.stem, settings)
         self.made.append(report)
         self._thread = threading.Thread(target=self._make, args=(report, request), name="report", daemon=True)
         self._thread.start()
-        self._on_change()
+        self._tell()
         return report
 
     def end(self) -> None:
@@ -137,37 +147,31 @@ class ReportMaker:
         if self._thread is not None:
             self._thread.join()
 
-    def _make(self, report: ReportJob, request: Any) -> None:
+    def _make(self, report: ReportJob, request: ReportRequest) -> None:
         from bevviz.report.make import make
 
         try:
-            written = make(request, [_ReportProgress(report, self._on_change)], report.stop)
+            written = make(request, [_ReportProgress(report, self._tell)], report.stop)
             report.files = written.files
             report.state = "cancelled" if written.interrupted else "over"
         except Exception as error:
             report.error = str(error) if isinstance(error, UserError) else first_line(error)
             report.state = "failed"
-        self._on_change()
+        self._tell()
 
 
 class _ReportProgress(Observer[FrameResult]):
     """Observer that counts the finished frames of a report."""
 
-    def __init__(self, report: ReportJob, on_change: Callable[[], None]) -> None:
-        self._report, self._on_change = report, on_change
+    def __init__(self, report: ReportJob, tell: Callable[[], None]) -> None:
+        self._report, self._tell = report, tell
 
     def begin(self, items: Items[object]) -> None:
         self._report.total = items.total or 0
 
     def observe(self, result: FrameResult) -> None:
         self._report.done += 1
-        self._on_change()
-
-
-def folder_of(paths: Sequence[Path]) -> Path:
-    """Return the folder of the bag, or the working directory if that folder is read-only."""
-    folder = paths[0].resolve().parent
-    return folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
+        self._tell()
 
 
 def _free(folder: Path, stem: str) -> Path:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import secrets
 import socket
+import threading
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -12,10 +14,10 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from bevviz.errors import UserError
-from bevviz.workbench.access import HOSTS
-from bevviz.workbench.routes import VIEWER, Kind, application
+from bevviz.support.contexts import Closable
+from bevviz.workbench.access import HOSTS, persistent_token
+from bevviz.workbench.routes import VIEWER, Site
 from bevviz.workbench.startup import SessionStartup
-from bevviz.workbench.token import persistent_token
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
@@ -23,14 +25,11 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import WorkbenchSession
 
 PORT = 9880  # The default is fixed, because browsers cache the compiled viewer by its address.
+PATIENCE = 3.0  # seconds that the page of a robot waits for its thread
 
 
 def serve(
-    make: Callable[[], WorkbenchSession],
-    drive: str,
-    port: int | None,
-    ready: Callable[[str], None],
-    kind: Kind = "page",
+    make: Callable[[], WorkbenchSession], drive: str, port: int | None, ready: Callable[[str], None]
 ) -> None:
     """Serve the page of a drive until an interrupt. The drive is opened and run in the background.
 
@@ -40,7 +39,6 @@ def serve(
             again.
         port: port of the page. None: 9880, or a free one if that is in use.
         ready: called with the address once it can be opened.
-        kind: kind of viewer.
 
     Raises:
         UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
@@ -49,16 +47,58 @@ def serve(
     with bound_socket(port) as listening:
         port = listening.getsockname()[1]
         with persistent_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
-            app = application(startup, viewer, version("rerun-sdk"), token, port, kind)
+            site = Site(startup, viewer, version("rerun-sdk"), token, port, "page")
 
             def begin() -> None:
-                ready(f"http://{HOSTS[0]}:{port}/?token={token}")
+                ready(_address(port, token))
                 startup.start()
 
-            server = Server(app, begin)
+            server = Server(site.application(), begin)
             server.run(sockets=[listening])
         if startup.error is not None:
             raise startup.error
+
+
+class LivePage(Closable):
+    """Server of the page of a robot, in a thread of its own, until it is closed.
+
+    Args:
+        workbench: the workbench session of the robot.
+        port: port of the page. None: 9880, or a free one if that is in use.
+
+    Raises:
+        UserError: the port is in use, or the viewer is not installed.
+
+    Attributes:
+        address: address of the page, with its token.
+    """
+
+    def __init__(self, workbench: WorkbenchSession, port: int | None) -> None:
+        viewer, token = viewer_folder(), secrets.token_urlsafe(16)
+        self._listening = bound_socket(port)
+        port = self._listening.getsockname()[1]
+        self.address = _address(port, token)
+        self._startup = SessionStartup(lambda: workbench, lambda: None)
+        self._startup.start()
+        ready = threading.Event()
+        site = Site(self._startup, viewer, version("rerun-sdk"), token, port, "live")
+        self._server = Server(site.application(), ready.set)
+        self._thread = threading.Thread(
+            target=lambda: self._server.run(sockets=[self._listening]), name="page", daemon=True
+        )
+        self._thread.start()
+        ready.wait(PATIENCE)
+
+    def close(self) -> None:
+        """Stop the server, then close the workbench session."""
+        self._server.end()
+        self._thread.join(PATIENCE)
+        self._listening.close()
+        self._startup.close()
+
+
+def _address(port: int, token: str) -> str:
+    return f"http://{HOSTS[0]}:{port}/?token={token}"
 
 
 def bound_socket(port: int | None) -> socket.socket:

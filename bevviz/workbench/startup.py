@@ -1,15 +1,21 @@
-"""Start-up of a workbench session. The page is served meanwhile and loads its viewer."""
+"""Start-up of a workbench session, and its bag. The page is served meanwhile and loads its viewer."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bevviz.bags.source import BagSource
+from bevviz.model.frame import Frame, LabelledBoxes3D
 from bevviz.support.contexts import Closable
 
 if TYPE_CHECKING:
+    from bevviz.evaluate.ground_truth import TruthLookup
     from bevviz.workbench.session import WorkbenchSession
 
 
@@ -62,3 +68,31 @@ class SessionStartup(Closable):
             self._closed = True
             if self._workbench is not None:
                 self._workbench.close()
+
+
+class LabelledSource(BagSource):
+    """Bag whose frames carry the ground truth of a topic or of label files.
+
+    Attributes:
+        truth_of: returns the ground truth of a frame. None: the frames stay as they are.
+    """
+
+    truth_of: TruthLookup | None = None
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._labelled, super().__iter__())
+
+    def frame(self, number: int) -> Frame | None:
+        """Return a frame with its ground truth."""
+        frame = super().frame(number)
+        return None if frame is None else self._labelled(frame)
+
+    def _labelled(self, frame: Frame) -> Frame:
+        truth = None if self.truth_of is None else self.truth_of(frame)
+        if truth is None:
+            return frame
+        scores = np.ones(len(truth.labels), np.float32)
+        boxes = LabelledBoxes3D(
+            "", frame.stamp, frame.points_frame, truth.boxes, truth.labels, scores, frame.pose
+        )
+        return replace(frame, truth=boxes)

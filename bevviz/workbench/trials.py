@@ -14,21 +14,21 @@ from bevviz.config import changed_config, changes
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model.counts import OPINIONS, count_opinions
-from bevviz.model.protocols import Items, Observer
+from bevviz.model.frame import F32
+from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
-from bevviz.pipeline.session import Session, check_same_frames
-from bevviz.recording import entities
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.session import check_same_frames
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.why.frame_index import truth_subjects
-from bevviz.why.pick import Pick
 from bevviz.why.side_effects import Effects, effects
-from bevviz.why.subject import Subject
-from bevviz.workbench.findings import Finding, find_findings, fixed_position
+from bevviz.why.subject import Selection, Subject
+from bevviz.workbench.findings import Finding, finding_at
 
 if TYPE_CHECKING:
-    from bevviz.workbench.session import Settings, WorkbenchSession
+    from bevviz.workbench.recorded_drive import RecordedDrive
+    from bevviz.workbench.source import Settings
 
 DIFFERENCES = ("fixed", "broken", "new false", "false gone", "new", "gone")  # kinds of findings
 
@@ -84,16 +84,15 @@ class Trial:
 
 
 class TrialRunner:
-    """Runner of trials over the drive of a workbench session, one at a time.
+    """Runner of trials over a drive, one at a time.
 
-    Args:
-        workbench: the workbench session.
-        on_change: called when the state of the trial has changed.
+    Attributes:
+        trial: the newest trial.
     """
 
-    def __init__(self, workbench: WorkbenchSession, on_change: Callable[[], None]) -> None:
-        self._workbench, self._on_change = workbench, on_change
-        self._recording, self.film = workbench.stream()
+    def __init__(self, drive: RecordedDrive) -> None:
+        self._drive = drive
+        self._recording, self._stream = drive.stream()
         self._thread: threading.Thread | None = None
         self.trial: Trial | None = None
 
@@ -103,18 +102,18 @@ class TrialRunner:
         Raises:
             UserError: nothing is changed, a parameter is unknown, or a value is wrong.
         """
-        workbench = self._workbench
-        config = changed_config(workbench.drive.config, settings)
-        check_same_frames({"the drive": workbench.drive.config, "what is tried": config})
-        if not changes(workbench.drive.config, config):
+        drive, opened = self._drive, self._drive.pipeline.config
+        config = changed_config(opened, settings)
+        check_same_frames({"the drive": opened, "what is tried": config})
+        if not changes(opened, config):
             raise UserError("nothing is changed: press a hint, or change a parameter first")
-        session = Session(config, loader=workbench.drive.session.loader)
+        session = Session(config, loader=drive.pipeline.loader)
         self.end()
-        trial = self.trial = Trial(settings, workbench.again.total, known=workbench.truth_of is not None)
-        workbench.entries.replace(DIFFERENCES)
+        trial = self.trial = Trial(settings, drive.again.total, known=drive.truth_of is not None)
+        drive.findings.replace(DIFFERENCES)
         self._thread = threading.Thread(target=self._run, args=(trial, session), name="trial", daemon=True)
         self._thread.start()
-        self._on_change()
+        drive.news.tell()
 
     def end(self) -> None:
         """Cancel the running trial. Its results until then stay."""
@@ -123,52 +122,51 @@ class TrialRunner:
         if self._thread is not None:
             self._thread.join()
 
+    def close(self) -> None:
+        """Cancel the running trial, and drop what it has not shown."""
+        self.end()
+        self._stream.read()  # Rerun warns about a binary stream with unread data.
+
     def _run(self, trial: Trial, session: Session) -> None:
-        workbench = self._workbench
+        drive = self._drive
         try:
-            while not workbench.over and not trial.stop.wait(0.1):
+            while not drive.over and not trial.stop.wait(0.1):
                 pass  # The results of the first run are needed for comparison.
             trial.state = "running"
-            logger = tried_logger(self._recording, session, workbench)
-            run(
-                workbench.again,
-                session,
-                [_TrialObserver(workbench, trial, logger, self._show)],
-                stop=trial.stop,
-            )
+            logger = drive.tried_logger(self._recording, session.config)
+            run(drive.again, session, [_TrialObserver(drive, trial, logger, self._show)], stop=trial.stop)
             trial.state = "cancelled" if trial.stop.is_set() else "over"
         except Exception as error:
             trial.state = "failed"
             trial.error = str(error) if isinstance(error, UserError) else first_line(error)
-        self._on_change()
+        drive.news.tell()
 
     def _show(self) -> None:
-        self._workbench.film.add(self.film.read())
-        self._on_change()
+        """Pass what was logged to the pages."""
+        self._drive.film.add(self._stream.read())
+        self._drive.news.tell()
 
 
 class _TrialObserver(Observer[FrameResult]):
     """Observer of a trial. It logs each frame with the other values and counts the changes."""
 
     def __init__(
-        self, workbench: WorkbenchSession, trial: Trial, logger: FrameLogger, show: Callable[[], None]
+        self, drive: RecordedDrive, trial: Trial, logger: FrameLogger, show: Callable[[], None]
     ) -> None:
-        self._workbench, self._trial, self._logger, self._show = workbench, trial, logger, show
-
-    def begin(self, items: Items[object]) -> None:
-        pass
+        self._drive, self._trial, self._logger, self._show = drive, trial, logger, show
 
     def observe(self, result: FrameResult) -> None:
-        workbench, trial, frame = self._workbench, self._trial, result.frame
-        before, truth = workbench.objects(frame.index), workbench.truth(frame)
-        workbench.draw_tried(self._logger, result, find_findings(result, truth))
-        subjects = truth_subjects(frame, workbench.drive.session.stages.class_names)
+        """Log a frame, list its differences and count them."""
+        drive, trial, frame = self._drive, self._trial, result.frame
+        before, truth = drive.objects(frame.index), drive.truth(frame)
+        drive.draw_tried(self._logger, result)
+        subjects = truth_subjects(frame, drive.pipeline.stages.class_names)
         side_effects = effects(before, result.objects, subjects)
         findings = list(difference_findings(result, side_effects, subjects, before))
         trial.counts.update(finding.what for finding, _ in findings)
         trial.counts["changed"] += side_effects.changed
         for tried in (False, True):
-            workbench.entries.add((finding for finding, side in findings if side == tried), tried=tried)
+            drive.findings.add((finding for finding, side in findings if side == tried), tried=tried)
         good, bad = (
             (side_effects.good, side_effects.harm)
             if side_effects.known
@@ -181,59 +179,39 @@ class _TrialObserver(Observer[FrameResult]):
                     score.add(objects, truth)
         trial.done += 1
         self._show()
-        workbench.wait_for_quiet()
+        drive.wait_for_quiet()
 
     def end(self) -> None:
+        """Log the last scalars."""
         self._logger.flush()
         self._show()
-
-
-def tried_logger(recording: Any, session: Session, workbench: WorkbenchSession) -> FrameLogger:
-    """Return a logger that writes tried results on a timeline of their own, beside those of the run."""
-    return FrameLogger(
-        recording,
-        session.config,
-        workbench.drive.scene,
-        wait=SCALAR_WAIT,
-        stamps=(entities.TRIED,),
-        inputs=False,
-    )
 
 
 def difference_findings(
     result: FrameResult, side_effects: Effects, truth: Sequence[Subject], before: Objects | None
 ) -> Iterator[tuple[Finding, bool]]:
     """Yield the findings that other values cause in a frame, and whether the tried side shows them."""
-    frame_ids, pose = (result.frame.index, result.frame.stamp), result.frame.pose
+    frame, after = result.frame, result.objects
 
-    def make_finding(kind: str, name: str, center: Any, pick: Pick) -> Finding:
-        distance = float(np.hypot(*center[:2]))
-        return Finding(
-            *frame_ids, kind, name.rsplit(" at ", 1)[0], distance, pick, position=fixed_position(pose, center)
-        )
+    def difference(kind: str, name: str, center: F32, selection: Selection) -> Finding:
+        return finding_at(frame, kind, name.rsplit(" at ", 1)[0], center, selection)
 
-    after = result.objects
     for effect in side_effects.made:
         if effect.truth >= 0 and (box := truth[effect.truth].box) is not None:
-            yield make_finding("fixed", effect.name, box.center[0], Pick("truth", effect.truth)), True
+            yield difference("fixed", effect.name, box.center[0], Selection(truth=effect.truth)), True
     for effect in side_effects.more:
         assert after is not None
         if not side_effects.known or effect.truth < 0:
-            kind = "new false" if side_effects.known else "new"
-            yield (
-                make_finding(
-                    kind, effect.name, after.boxes.center[effect.after], Pick("object", effect.after)
-                ),
-                True,
-            )
+            kind, center = "new false" if side_effects.known else "new", after.boxes.center[effect.after]
+            yield difference(kind, effect.name, center, Selection(object=effect.after)), True
     for effect in side_effects.gone:
         assert before is not None
         center = before.boxes.center[effect.before]
         if effect.missed:
-            yield make_finding("broken", effect.name, center, Pick("truth", effect.truth)), True
+            yield difference("broken", effect.name, center, Selection(truth=effect.truth)), True
         elif not side_effects.known or effect.truth < 0:
             kind = "false gone" if side_effects.known else "gone"
-            yield make_finding(kind, effect.name, center, Pick("object", effect.before)), False
+            yield difference(kind, effect.name, center, Selection(object=effect.before)), False
 
 
 def trial_effects(

@@ -11,12 +11,12 @@ from bevviz.live.replay import Replay
 from bevviz.live.runtime import Live, Outputs
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
-from bevviz.workbench.live_session import LiveSession
+from bevviz.workbench.running_robot import RunningRobot
 
 
 @contextmanager
-def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveSession]:
-    """Yield the live session of a run over the frames of these results, with ``key=value`` settings."""
+def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[RunningRobot]:
+    """Yield the workbench's side of a run over the frames of these results, with ``key=value`` settings."""
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
     live = Live(
         source,
@@ -24,6 +24,6 @@ def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[LiveS
         Outputs(),
         Notes(lambda line: None),
     )
-    with LiveSession(live) as bench:
+    with RunningRobot(live) as bench:
         yield bench
         live.encoder.close()

@@ -31,7 +31,7 @@ export function restart() {
   current = null;
 }
 
-export function told(message) {
+export function update(message) {
   for (const number of message.gone) entries.delete(number);
   for (const one of message.entries) {
     const known = entries.get(one.number);
@@ -65,19 +65,19 @@ export function draw() {
 
 function redraw() {
   const only = $("here").checked && state.time !== null;
-  const there = [...entries.values()].filter((entry) => !only || here(entry) >= 0);
-  for (const entry of there) entry.best = only ? here(entry) : nearest(entry);
-  rows = there.filter((entry) => !hidden.has(entry.what)).sort((a, b) => (RANK.get(a.what) - RANK.get(b.what))
+  const shown = [...entries.values()].filter((entry) => !only || here(entry) >= 0);
+  for (const entry of shown) entry.best = only ? here(entry) : nearest(entry);
+  rows = shown.filter((entry) => !hidden.has(entry.what)).sort((a, b) => (RANK.get(a.what) - RANK.get(b.what))
     || (away(a.sights[a.best]) - away(b.sights[b.best])) || (Number(a.sights[0][1]) - Number(b.sights[0][1])));
   $("found-none").hidden = rows.length > 0;
   $("found-title").textContent = `Worth a look: ${rows.length}`;
-  filters(there);
+  filters(shown);
   $("found").replaceChildren(...rows.slice(0, SHOWN).map(drawn));
 }
 
-function filters(there) {
+function filters(shown) {
   const counts = new Map();
-  for (const { what } of there) counts.set(what, (counts.get(what) ?? 0) + 1);
+  for (const { what } of shown) counts.set(what, (counts.get(what) ?? 0) + 1);
   const kinds = KINDS.filter((kind) => counts.has(kind) || hidden.has(kind));
   const text = (kind) => `${kind} ${counts.get(kind) ?? 0}`;
   const same = [...$("kinds").children].map((one) => one.textContent).join() === kinds.map(text).join();

@@ -40,29 +40,29 @@ export function progress(message) {
 
 // --- trial over the drive -----------------------------------------------------------------------
 
-function drive(told) {
-  trial = told;
-  $("trial").hidden = told === null;
-  if (told === null) return;
-  const going = told.state === "waiting" || told.state === "running";
-  $("trial-bar").max = told.total || 1;
-  $("trial-bar").value = told.done;
+function drive(message) {
+  trial = message;
+  $("trial").hidden = message === null;
+  if (message === null) return;
+  const going = message.state === "waiting" || message.state === "running";
+  $("trial-bar").max = message.total || 1;
+  $("trial-bar").value = message.done;
   $("trial-bar").hidden = !going;
   $("drive-cancel").hidden = !going;
-  $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: told.error }[told.state] ?? summary(told);
-  $("trial-text").className = told.state === "failed" ? "alarm" : "";
-  $("trial-set").textContent = told.settings.join(", ");
-  $("strip").hidden = going || !told.strip.length;
-  if (!$("strip").hidden) strip(told.strip);
+  $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: message.error }[message.state] ?? summary(message);
+  $("trial-text").className = message.state === "failed" ? "alarm" : "";
+  $("trial-set").textContent = message.settings.join(", ");
+  $("strip").hidden = going || !message.strip.length;
+  if (!$("strip").hidden) strip(message.strip);
 }
 
-function summary(told) {
+function summary(message) {
   const parts = [];
-  if (told.f1) parts.push(`F1 ${told.f1.map((one) => one ?? "–").join(" → ")}`);
-  const frames = told.state === "running" ? `${told.done} of ${told.total} frames` : `${told.done} frames`;
-  parts.push(told.f1 ? `${frames}: ${told.better} better, ${told.worse} worse` : frames);
-  for (const [what, number] of Object.entries(told.counts)) parts.push(`${number} ${what}`);
-  if (told.state === "cancelled") parts.push("cancelled");
+  if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
+  const frames = message.state === "running" ? `${message.done} of ${message.total} frames` : `${message.done} frames`;
+  parts.push(message.f1 ? `${frames}: ${message.better} better, ${message.worse} worse` : frames);
+  for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
+  if (message.state === "cancelled") parts.push("cancelled");
   return parts.join("; ");
 }
 

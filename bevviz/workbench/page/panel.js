@@ -1,10 +1,10 @@
 // The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
-import * as list from "./findings.js";
-import { $, asked, element, remember, state, stated } from "./page_state.js";
 import { connect, newest, on, send, want } from "./connection.js";
-import { drawnThen, isTried, kind, seek, showSide, tell } from "./viewer.js";
-import * as work from "./jobs.js";
+import * as list from "./findings.js";
+import * as jobs from "./jobs.js";
+import { $, asked, element, remember, state, stated } from "./page_state.js";
+import { drawnThen, isTried, kind, onViewer, seek, showSide } from "./viewer.js";
 
 let controls = [];
 let opened = []; // controls of the configuration that the drive was opened with
@@ -76,13 +76,13 @@ function hints(message) {
 }
 
 // Describe the effects of other values on a frame. Hints and tried values use the same words.
-function effects(found) {
+function effects(effect) {
   const rest = (all, some) => all.filter((name) => !some.includes(name));
   const parts = Object.entries({
-    fixes: found.fixed, adds: rest(found.added, found.false), "wrongly adds": found.false,
-    loses: found.right, drops: rest(found.lost, found.right),
+    fixes: effect.fixed, adds: rest(effect.added, effect.false), "wrongly adds": effect.false,
+    loses: effect.right, drops: rest(effect.lost, effect.right),
   }).filter(([, names]) => names.length).map(([what, names]) => `${what} ${names.join(", ")}`);
-  if (found.changed) parts.push(`changes ${found.changed}`);
+  if (effect.changed) parts.push(`changes ${effect.changed}`);
   return parts.join("; ");
 }
 
@@ -131,8 +131,8 @@ function tried(message) {
   const took = () => (performance.now() - since).toFixed(0);
   $("effect").dataset.took = took();
   drawnThen(() => { $("effect").dataset.drawn = took(); });
-  const said = Object.entries(message.opinions).map(([what, both]) => `${what} ${both.map((one) => one ?? "–").join(" → ")}`);
-  const parts = [[effects(message.effects), ...said].filter(Boolean).join("; ") || "changes nothing that is reported"];
+  const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${both.map((one) => one ?? "–").join(" → ")}`);
+  const parts = [[effects(message.effects), ...opinions].filter(Boolean).join("; ") || "changes nothing that is reported"];
   if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
   parts.push(...message.failures);
   $("effect").textContent = `${parts.join("; ")}.`;
@@ -151,7 +151,7 @@ function flip() {
 
 // Show the side of a listed finding: with the settings of the newest trial, or as opened.
 function tryOut(withThem) {
-  const wanted = work.settings();
+  const wanted = jobs.settings();
   if (wanted && wanted.join() !== state.set.join()) {
     state.undo.push(state.set);
     state.set = wanted;
@@ -164,14 +164,14 @@ function tryOut(withThem) {
 
 function showControls() {
   const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const own = new Map(state.set.map((one) => [one.slice(0, one.indexOf("=")), one.slice(one.indexOf("=") + 1)]));
-  const wanted = controls.filter((one) => own.has(one.key) || (words.length
+  const changes = new Map(state.set.map((one) => [one.slice(0, one.indexOf("=")), one.slice(one.indexOf("=") + 1)]));
+  const wanted = controls.filter((one) => changes.has(one.key) || (words.length
     && words.every((word) => `${one.key} ${one.about} ${one.unit}`.toLowerCase().includes(word))));
   // Changed parameters first, then those with the words in their name: 'eps' is also in 'keeps' of a description.
-  const rank = (one) => (own.has(one.key) ? 0 : 1 + Number(!words.every((word) => one.key.includes(word))));
+  const rank = (one) => (changes.has(one.key) ? 0 : 1 + Number(!words.every((word) => one.key.includes(word))));
   wanted.sort((a, b) => rank(a) - rank(b));
   const focused = document.activeElement?.id;
-  $("controls").replaceChildren(...wanted.map((one) => control(one, own)));
+  $("controls").replaceChildren(...wanted.map((one) => control(one, changes)));
   if (focused?.startsWith("control-")) $(focused)?.focus();
 }
 
@@ -181,10 +181,10 @@ function offer(message) {
   showControls();
 }
 
-function control(one, own) {
+function control(one, changes) {
   const label = element("label", "", one.key);
   const input = document.createElement(one.kind === "choice" ? "select" : "input");
-  const value = own.get(one.key) ?? (one.value ?? "");
+  const value = changes.get(one.key) ?? (one.value ?? "");
   input.id = `control-${one.key}`;
   label.htmlFor = input.id;
   const low = one.low === undefined ? "" : `from ${one.low}`;
@@ -199,7 +199,7 @@ function control(one, own) {
     const text = one.kind === "switch" ? String(input.checked) : input.value;
     change([`${one.key}=${text === "" ? "null" : text}`]);
   };
-  return element("div", own.has(one.key) ? "control changed" : "control", "", label, input, about);
+  return element("div", changes.has(one.key) ? "control changed" : "control", "", label, input, about);
 }
 
 // --- session state from the server --------------------------------------------------------------
@@ -232,16 +232,16 @@ function welcome(message) {
 }
 
 on({
-  welcome, controls: offer, answer, nothing, hints, tried, opening: open, error: failed, progress: work.progress,
-  entries: list.told, notes: list.notes, noted: work.noted,
+  welcome, controls: offer, answer, nothing, hints, tried, opening: open, error: failed, progress: jobs.progress,
+  entries: list.update, notes: list.notes, noted: jobs.noted,
 });
-tell({
+onViewer({
   clicked: ask,
   settled: () => {
     remember();
     want(state.time);
     if (isTried()) attemptThere();
-    else send({ type: "settle", time: Number(state.time), set: [] });
+    else if (kind !== "live") send({ type: "settle", time: Number(state.time), set: [] });
     if ($("here").checked) list.draw();
   },
   shown: () => send({ type: "shown" }),
@@ -275,8 +275,8 @@ $("reset").onclick = () => { state.undo.push(state.set); state.set = []; state.f
 $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `--set '${one}'`).join(" "));
 $("search").oninput = showControls;
 window.addEventListener("keydown", (event) => {
-  const own = event.target.closest?.("aside"); // The viewer has hidden inputs of its own.
-  const typing = own && ["INPUT", "SELECT"].includes(event.target.tagName);
+  const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
+  const typing = inPanel && ["INPUT", "SELECT"].includes(event.target.tagName);
   if (typing && event.key === "Escape") event.target.blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
   event.preventDefault();
@@ -284,7 +284,8 @@ window.addEventListener("keydown", (event) => {
   actions[event.key]();
 }, true);
 
+if (kind === "live") Object.assign(actions, (await import("./robot.js")).actions);
 list.start(ask, tryOut);
 list.onRemove((note) => send({ type: "unnote", stamp: note.stamp, text: note.text }));
-work.start();
+jobs.start();
 connect();

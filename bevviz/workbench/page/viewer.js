@@ -19,7 +19,7 @@ const settings = {
   _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
   _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
 };
-const told = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // callbacks for its events
+const callbacks = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // for its events
 export const viewerReady = new Promise((ready) => {
   widget.render({
     model: {
@@ -44,7 +44,7 @@ export function toViewer(message, buffers) {
     nextPicture(() => { if (target !== null) move(target); });
   }
 }
-export const tell = (whom) => Object.assign(told, whom);
+export const onViewer = (more) => Object.assign(callbacks, more);
 
 // The widget compiles a copy of the response, which counts its bytes. That starts late, blocks this thread, and the
 // browser cannot cache it. So compile the response while it loads, from the start of the page on.
@@ -55,8 +55,6 @@ function keepCompiled(url) {
   window.fetch = (what, ...more) => (String(what) === url ? Promise.resolve(new Response()) : fetch(what, ...more));
   WebAssembly.compileStreaming = () => module;
 }
-
-window.addEventListener("to-viewer", ({ detail }) => { target = null; toViewer(detail); });
 
 export const isTried = () => kind !== "live" && state.set.length > 0 && !state.flipped; // A robot has no tried side.
 const timeline = () => (isTried() ? TRIED : OPENED);
@@ -75,8 +73,14 @@ export function seek(stamp) {
   target = String(stamp);
   tries = TRIES;
   state.time = target;
-  told.sought(target);
+  callbacks.sought(target);
   move(target);
+}
+
+// Go to a stamp once. The user may move on from it, or the viewer plays from it.
+export function goTo(stamp, play) {
+  target = null;
+  toViewer({ type: "time_ctrl", timeline: OPENED, timestamp_nanos: stamp, play });
 }
 
 // Show the same time on the chosen side, as opened or as tried.
@@ -94,15 +98,15 @@ function viewerEvent(event) {
   if (event.type === "selection_change") {
     const item = event.items.find((one) => one.type === "entity");
     if (item) {
-      told.clicked({ entity: item.entity_path, instance: item.instance_id ?? null, position: item.position ?? null });
+      callbacks.clicked({ entity: item.entity_path, instance: item.instance_id ?? null, position: item.position ?? null });
     }
   }
 }
 
 function moved(event) {
   if (event.type === "timeline_change") current = event.timeline;
-  const there = Number(target) === event.time && (current ?? timeline()) === timeline();
-  if (target !== null && !there && event.type === "time_update") { // a late event about the previous time
+  const atTarget = Number(target) === event.time && (current ?? timeline()) === timeline();
+  if (target !== null && !atTarget && event.type === "time_update") { // a late event about the previous time
     if (tries > 0) move(target);
     tries -= 1;
     return;
@@ -110,10 +114,10 @@ function moved(event) {
   if (!drawn) {
     drawn = true;
     performance.mark("told");
-    drawnThen(() => { performance.mark("frame"); told.shown(); });
+    drawnThen(() => { performance.mark("frame"); callbacks.shown(); });
   }
   if (event.type !== "time_update" || (state.time !== null && Number(state.time) === event.time)) return;
   state.time = String(BigInt(Math.round(event.time)));
   clearTimeout(settling);
-  settling = setTimeout(told.settled, SETTLED);
+  settling = setTimeout(callbacks.settled, SETTLED);
 }

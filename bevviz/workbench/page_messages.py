@@ -1,7 +1,9 @@
-"""Parameter controls of the page, with unit, range, value and description of each."""
+"""JSON of the messages to and from the page: selections, other answers, notes and parameter controls."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -9,13 +11,66 @@ import annotated_types
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
-from bevviz.config import Config, field_of, unit, values
+from bevviz.config import Config, unit, values
+from bevviz.config.descriptions import field_of
+from bevviz.pipeline.notes import Note
+from bevviz.why import Answer, Selection
+from bevviz.why.pick import Pick
+from bevviz.why.pick_answers import pick_of, selection_of
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
+BESIDE = 6  # further answers that are listed
+
+# --- selections --------------------------------------------------------------------------------
+
+
+def parse_selection(text: str) -> Selection:
+    """Return the selection of a text in the page's address, such as ``detection/front/3``.
+
+    Raises:
+        UserError: the text selects nothing.
+    """
+    return selection_of(Pick.parse(text))
+
+
+def selection_text(selection: Selection) -> str:
+    """Return the text that ``parse_selection`` reads: ``detection/front/3``, ``point//1.5,2,0``."""
+    rows = {
+        "truth": selection.truth,
+        "object": selection.object,
+        "cluster": selection.cluster,
+        "detection": selection.detection,
+    }
+    for kind, row in rows.items():
+        if row is not None:
+            return f"{kind}/{selection.camera}/{row}"
+    places = {"pixel": selection.box, "point": selection.point, "cell": selection.cell}
+    kind, place = next((kind, place) for kind, place in places.items() if place)
+    return f"{kind}/{selection.camera}/{','.join(f'{value:.4g}' for value in place)}"
+
+
+def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
+    """Yield the first other answers in brief, in the order of the explainer."""
+    for answer in answers[:BESIDE]:
+        if (pick := pick_of(answer)) is not None:
+            yield {
+                "pick": str(pick),
+                "name": answer.subject.name,
+                "reported": answer.verdict.reported,
+                "reason": answer.verdict.reason.value,
+            }
+
+
+def note_dict(note: Note) -> dict[str, Any]:
+    """Return a note. Its times are text, as JavaScript numbers cannot hold them."""
+    return {**asdict(note), "stamp": str(note.stamp), "received": str(note.received)}
+
+
+# --- parameter controls ------------------------------------------------------------------------
 
 
 def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any]]:
-    """Return one control for each stage parameter that a frame can be run again with.
+    """Return one control, with unit, range, value and description, for each parameter of the stages.
 
     Args:
         config: configuration whose stages have the parameters.

@@ -1,0 +1,125 @@
+"""Source of the frames that a page asks about."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+from bevviz.config import Config
+from bevviz.evaluate import Truth
+from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.model.frame import Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.session import Session
+from bevviz.support.contexts import Closable
+from bevviz.why import Answer, Selection
+from bevviz.workbench.buffers import News, PageState, Reader
+from bevviz.workbench.findings import FindingList
+
+Settings = tuple[str, ...]
+Message = Mapping[str, Any]  # message from the page
+
+
+class Source(Closable):
+    """Base class of the sources of a page: a recorded drive and a running robot.
+
+    Args:
+        title: name of the drive or the robot.
+        pipeline: pipeline session with the configuration in force and the loaded networks.
+        truth_of: returns the ground truth of a frame. None: there is none.
+
+    Attributes:
+        scans: number of scans. 0 for a robot.
+        findings: findings, grouped over frames.
+        news: tells of each new frame and of all other news for the page.
+        opening: stamp of the frame that a page opens at. None: no frame is shown yet, or the newest one.
+        commands: further messages of the page by type, each with the function that returns the reply.
+    """
+
+    def __init__(self, title: str, pipeline: Session, truth_of: TruthLookup | None = None) -> None:
+        self.title, self.pipeline, self.truth_of = title, pipeline, truth_of
+        self.scans = 0
+        self.findings, self.news = FindingList(), News()
+        self.opening: int | None = None
+        self.commands: Mapping[str, Callable[[Message], dict[str, Any]]] = {}
+
+    def truth(self, frame: Frame) -> Truth | None:
+        """Return the ground truth of a frame, if there is any."""
+        return None if self.truth_of is None else self.truth_of(frame)
+
+    def start(self) -> None:
+        """Start to make frames, if they are not made already."""
+
+    def go_on(self) -> None:
+        """Continue, if the run waits until a page shows the first frame."""
+
+    def quiet(self) -> AbstractContextManager[None]:
+        """Return a context in which background work pauses, if it can."""
+        return nullcontext()
+
+    @abstractmethod
+    def progress(self) -> dict[str, Any]:
+        """Return the progress of the run for the page."""
+
+    @abstractmethod
+    def reader(self, lane: str, first: int, state: PageState) -> AbstractContextManager[Reader]:
+        """Return a context in which a page reads the recording.
+
+        Args:
+            lane: ``film`` for the run, ``desk`` for answers and tried results.
+            first: number of pieces that the page has.
+            state: state of the page.
+        """
+
+    @abstractmethod
+    def number_at(self, stamp: int) -> int:
+        """Return the number of the frame that a viewer shows at a stamp.
+
+        Raises:
+            UserError: there is no such frame.
+        """
+
+    @abstractmethod
+    def look(self, number: int, settings: Settings = ()) -> FrameResult:
+        """Return the result of a frame, with other values if ``settings`` names some.
+
+        Raises:
+            UserError: there is no such frame, a parameter is unknown, or a value is wrong.
+        """
+
+    def asked_settings(self, settings: Settings, again: bool) -> Settings:
+        """Return the settings that a question is about.
+
+        Args:
+            settings: settings that the page shows.
+            again: the question selects an object by its name, not by a click on the shown frame.
+        """
+        return settings
+
+    @abstractmethod
+    def select(
+        self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
+    ) -> Selection | None:
+        """Return the selection of a click in a frame, see ``bevviz.why.pick.pick``."""
+
+    @abstractmethod
+    def mark(self, result: FrameResult, answer: Answer) -> None:
+        """Mark the object of an answer in every view."""
+
+    @abstractmethod
+    def try_values(self, number: int, settings: Settings) -> tuple[FrameResult, FrameResult]:
+        """Show a frame with other values. Return its result before and after.
+
+        Raises:
+            UserError: as ``look``.
+        """
+
+    @abstractmethod
+    def configured(self, settings: Settings) -> Config:
+        """Return the configuration that ``try_values`` puts in force.
+
+        Raises:
+            UserError: a parameter is unknown, or a value is wrong.
+        """
