@@ -75,7 +75,7 @@ def test_viewers_get_fewer_points_and_files_all(
         "nothing else is left out"
     )
 
-    bench.see(result)  # a click on a point is on that one
+    bench.observe(result)  # a click on a point is on that one
     for row in (0, 7, LIMIT - 1):
         found = bench.select(frame.index, (), path, row, [])
         assert found is not None and found.point == pytest.approx(few[row])

@@ -21,7 +21,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from bevviz.bags.mcap_writer import McapWriter, complete
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.support.files import ScratchFolder, atomic_write, claim_target, save_text, unfinished_files
+from bevviz.support.files import atomic_write, claim_target, save_text, unfinished_files
+from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.workbench.buffers import RecordingBuffer
 from tests.support import bags
 from tests.support.commands import Capture, environment, error_of

@@ -225,11 +225,11 @@ def test_only_the_newest_frames_and_those_held_are_there(
     with pytest.raises(UserError, match="no frame has come yet"):
         bench.number_at(0)
     for result in results[:HELD]:
-        bench.see(result)
+        bench.observe(result)
     first = bench.hold(results[1].frame.stamp)
     assert first is results[1]
     for result in results[HELD:]:
-        bench.see(result)
+        bench.observe(result)
     assert bench.look(1) is first
     assert bench.number_at(results[-1].frame.stamp + 10**7) == results[-1].frame.index
     with pytest.raises(UserError, match=f"the newest {HELD} can be asked about"):
@@ -246,7 +246,7 @@ def test_only_the_newest_frames_and_those_held_are_there(
 
 def test_a_held_frame_can_be_asked_with_other_values(bench: RunningRobot, results: list[FrameResult]) -> None:
     for result in results[:2]:
-        bench.see(result)
+        bench.observe(result)
     assert results[1].objects is not None and len(results[1].objects)
     assert "was reported" in WorkbenchSession(bench).ask(1, (), Selection(object=0))[0].verdict.text
     tried = bench.look(1, ("clustering.min_cluster_points=100000",))
@@ -283,7 +283,7 @@ def test_the_objects_method_is_changed_there_and_back(
     """Ours, a function with parameters of its own, the robot's topic, and ours again."""
     bench = bench_with_network
     session = WorkbenchSession(bench)
-    bench.see(results[0])
+    bench.observe(results[0])
     theirs = ("objects.method=network:detect", "objects.params.ahead=14", "opinions.min_height=400")
     told = session.try_values(0, theirs)
     assert told["changes"]["objects.params.ahead"] == "absent -> 14.0"

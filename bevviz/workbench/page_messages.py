@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
 from bevviz.config import Config, unit, values
-from bevviz.config.descriptions import field_of
+from bevviz.config.keys import field_of
 from bevviz.pipeline.notes import Note
 from bevviz.why import Answer, Selection
 from bevviz.why.pick import Pick

@@ -268,7 +268,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         cloud: bool = False,
     ) -> None:
         layers: list[FindingRows] = []
-        logger.log(result, beside=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
+        logger.log(result, log_more=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
         self._layers[result.frame.index, tried] = layers[0]
 
     @contextmanager

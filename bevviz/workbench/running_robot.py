@@ -64,7 +64,7 @@ class RunningRobot(Source):
         recording.set_log_time_enabled(False)
         self._marks = rr.binary_stream(recording)
         self._marker = FrameLogger(recording, live.config, live.scene)
-        live.attach(self.film, self.see)
+        live.attach(self.film, self.observe)
 
     def close(self) -> None:
         """Close the buffer of the pages."""

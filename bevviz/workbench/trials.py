@@ -18,8 +18,7 @@ from bevviz.model.frame import F32
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
-from bevviz.pipeline.session import Session
-from bevviz.pipeline.session import check_same_frames
+from bevviz.pipeline.session import Session, check_same_frames
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why.frame_index import truth_subjects
 from bevviz.why.side_effects import Effects, effects
