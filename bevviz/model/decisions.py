@@ -7,8 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.config import BUILTIN_METHODS, Config
-from bevviz.config.plugins import TOPIC
+from bevviz.config import Config
+from bevviz.model.reasons import (
+    Reason,
+    ReasonKind,
+    kind_of,
+    limit,
+    limit_of,
+    make_reason,
+    owner_of,
+    scored,
+)
 from bevviz.model.results import (
     CameraResult,
     Clusters,
@@ -78,38 +87,89 @@ def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
     if result.detections is None and result.camera.image is not None:
         why = "the detector failed" if config.detector.model else "detector.model is not set"
         texts.append(f"no detections, {why}")
+    name = result.camera.name
     for text in texts:
-        yield Explanation("camera", result.camera.name, -1, "problem", f"{result.camera.name}: {text}")
+        yield Explanation("camera", name, -1, Reason(ReasonKind.PROBLEM), f"{name}: {text}")
 
 
 # --- detections --------------------------------------------------------------------------------
+
+
+def detection_reason(detections: Detections, row: int, config: Config) -> Reason:
+    """Return the reason why the detector stage kept a detection or not."""
+    kind = kind_of(DetectionState(int(detections.state[row])))
+    if kind is not ReasonKind.SUPPRESSED:
+        return make_reason(kind, config, detection=scored(detections, row))
+    rival = int(detections.suppressed_by[row])
+    return make_reason(
+        kind,
+        config,
+        detection=scored(detections, row),
+        rival=None if rival < 0 else scored(detections, rival),
+        iou=float(detections.overlap[row]),
+    )
+
+
+def not_kept_text(reason: Reason) -> str:
+    """Return why the detector stage did not keep a detection."""
+    assert reason.limit is not None
+    if reason.kind is ReasonKind.BELOW_THRESHOLD:
+        return f"below {reason.limit.short}"
+    return f"suppressed by {reason['rival']}, IoU {reason['iou']:.2f} > {reason.limit.short}"
+
+
+def pair_reason(fusion: Fusion, config: Config, detection: int, cluster: int) -> Reason:
+    """Return the rule of our fusion that separates a detection and a cluster; MATCHED: none does."""
+    pair, decision = fusion.pair(detection, cluster), Decision(int(fusion.detection_decision[detection]))
+    rule = _separating_rule(pair, config)
+    if rule is None:
+        is_matched = decision is Decision.MATCHED
+        rule = ReasonKind.OTHER_CLUSTER if is_matched else ReasonKind.TAKEN
+        if is_matched and fusion.detection_cluster[detection] == cluster:
+            rule = ReasonKind.MATCHED
+        elif decision is Decision.MISFIT:
+            rule = ReasonKind.MISFIT
+    return make_reason(rule, config, cluster=cluster, pair=pair)
+
+
+def _separating_rule(pair: Pair | None, config: Config) -> ReasonKind | None:
+    """Return the limit that a pair does not meet."""
+    fusion = config.fusion
+    if fusion.method == "centroid":
+        return ReasonKind.TOO_FAR if pair is None or not np.isfinite(pair.cost) else None
+    if pair is None or pair.points < fusion.min_points:
+        return ReasonKind.TOO_FEW_POINTS
+    if pair.depth > fusion.max_depth:
+        return ReasonKind.TOO_FAR
+    return ReasonKind.LOW_OVERLAP if pair.iou < fusion.min_iou else None
 
 
 def _detections(
     result: CameraResult, detections: Detections, clusters: Clusters | None, config: Config, lidar: bool
 ) -> Iterator[Explanation]:
     """Yield the explanation of each detection of a camera."""
-    for d, value in enumerate(detections.state.tolist()):
-        state = DetectionState(value)
-        key = state.name.lower()
-        if state is DetectionState.BELOW_THRESHOLD:
-            text = f"below detector.conf_threshold {config.detector.conf_threshold:g}"
-        elif state is DetectionState.SUPPRESSED:
-            rival = _label(detections, int(detections.suppressed_by[d]))
-            limit = f"detector.iou_threshold {config.detector.iou_threshold:g}"
-            text = f"suppressed by {rival}, IoU {detections.overlap[d]:.2f} > {limit}"
+    for d in range(len(detections)):
+        reason = detection_reason(detections, d, config)
+        if reason.kind is not ReasonKind.KEPT:
+            text = not_kept_text(reason)
         elif result.fusion is None or clusters is None:
             why = "; ".join(result.camera.problems) or "no clusters in this frame"
             text = f"not compared with clusters: {why}" if lidar else "kept"
         else:
-            decision = Decision(int(result.fusion.detection_decision[d]))
-            key = decision.name.lower()
-            text = _detection(decision, d, result, result.fusion, detections, clusters, config)
-        yield Explanation("detection", result.camera.name, d, key, f"{_label(detections, d)}: {text}")
+            reason = _fusion_reason(result.fusion, d, config)
+            text = _detection(reason, d, result, result.fusion, detections, clusters, config)
+        yield Explanation("detection", result.camera.name, d, reason, f"{scored(detections, d)}: {text}")
+
+
+def _fusion_reason(fusion: Fusion, d: int, config: Config) -> Reason:
+    """Return the decision of the fusion about a kept detection."""
+    cluster = int(fusion.detection_cluster[d])
+    kind = kind_of(Decision(int(fusion.detection_decision[d])))
+    return make_reason(kind, config, cluster=cluster, pair=fusion.pair(d, cluster))
 
 
 def _detection(
-    decision: Decision,
+    reason: Reason,
     d: int,
     result: CameraResult,
     fusion: Fusion,
@@ -118,10 +178,9 @@ def _detection(
     config: Config,
 ) -> str:
     """Return the decision of the fusion about detection ``d`` in words."""
-    if decision is Decision.NO_CLUSTER:
+    if reason.kind is ReasonKind.NO_CLUSTER:
         return f"no cluster, {_unclustered(d, result, detections, clusters, config)}"
-    k = int(fusion.detection_cluster[d])
-    pair = _pair(fusion, d, k)
+    k, pair = reason["cluster"], reason["pair"]
     if config.fusion.method == "centroid":
         evidence = f"centre of cluster {k} at {pair.depth:.1f} m is {pair.distance:.0f} px from its own"
     else:
@@ -129,16 +188,16 @@ def _detection(
             f"{_points(pair.points)} of cluster {k} in its frustum at {pair.depth:.1f} m, IoU {pair.iou:.2f}"
             + mask_evidence(fusion, d, config)
         )
-    if decision is Decision.MATCHED:
+    if reason.kind is ReasonKind.MATCHED:
         is_matched = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == d)
         others = [str(other) for other in np.flatnonzero(is_matched).tolist() if other != k]
         if not others:
             return f"{evidence}, matched"
         also = f"clusters {', '.join(others)} take" if others[1:] else f"cluster {others[0]} takes"
         return f"{evidence}, matched; {also} the same box"
-    if decision is Decision.TAKEN:
-        return f"no match: {evidence}, taken by {_label(detections, int(fusion.cluster_detection[k]))}"
-    return f"no match: {evidence}, {_rule(decision, d, fusion, detections, config)}"
+    if reason.kind is ReasonKind.TAKEN:
+        return f"no match: {evidence}, taken by {scored(detections, int(fusion.cluster_detection[k]))}"
+    return f"no match: {evidence}, {_rule(reason, d, fusion, detections)}"
 
 
 def mask_evidence(fusion: Fusion, d: int, config: Config) -> str:
@@ -171,39 +230,40 @@ def _unclustered(
     kinds = []
     for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
         if label < 0:
-            kinds.append(f"{count} noise ({_noise(config)})")
+            owner = owner_of(config, "clustering")
+            rule = str(limit_of(ReasonKind.NOISE, config)) if owner.ours else f"by {owner.name}"
+            kinds.append(f"{count} noise ({rule})")
         else:
-            kinds.append(f"{count} of cluster {label} ({_set_aside(int(clusters.state[label]), config)})")
+            kinds.append(
+                f"{count} of cluster {label} ({_set_aside(cluster_reason(clusters, label, config))})"
+            )
     return f"{_points(len(labels))} in its frustum: {', '.join(kinds)}"
 
 
-def _noise(config: Config) -> str:
-    """Return the parameter or the method that decided what is noise."""
-    method_name = config.clustering.method
-    if method_name in BUILTIN_METHODS:
-        return f"clustering.min_points is {config.clustering.min_points}"
-    return f"by {method_name.removeprefix(TOPIC)}"
-
-
 # --- clusters ----------------------------------------------------------------------------------
+
+
+def cluster_reason(clusters: Clusters, row: int, config: Config) -> Reason:
+    """Return the reason why a cluster is kept or outside the size limits."""
+    kind = kind_of(ClusterState(int(clusters.state[row])))
+    return make_reason(kind, config, cluster=int(row), count=int(clusters.count[row]))
 
 
 def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
     """Yield the explanation of each cluster for each camera that sees it."""
     compared = [result.camera.name for result in cameras if result.fusion is not None]
     ranges = np.hypot(clusters.centroid[:, 0], clusters.centroid[:, 1])
-    for k, (state, count, distance) in enumerate(
-        zip(clusters.state.tolist(), clusters.count, ranges, strict=True)
-    ):
-        head = f"cluster {k}: {_points(count)} at {distance:.1f} m"
-        if state != ClusterState.KEPT:
-            text = f"{head}: {_set_aside(state, config)}"
-            yield Explanation("cluster", "", k, ClusterState(state).name.lower(), text)
+    for k, (count, distance) in enumerate(zip(clusters.count, ranges, strict=True)):
+        head, reason = (
+            f"cluster {k}: {_points(count)} at {distance:.1f} m",
+            cluster_reason(clusters, k, config),
+        )
+        if reason.kind is not ReasonKind.KEPT:
+            yield Explanation("cluster", "", k, reason, f"{head}: {_set_aside(reason)}")
             continue
         if not compared:
-            yield Explanation(
-                "cluster", "", k, "kept", f"{head}: not compared with detections, as no camera has any"
-            )
+            text = f"{head}: not compared with detections, as no camera has any"
+            yield Explanation("cluster", "", k, reason, text)
             continue
         unseen = True
         for result in cameras:
@@ -211,33 +271,32 @@ def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Confi
             if fusion is None or detections is None or fusion.cluster_decision[k] == Decision.OUT_OF_VIEW:
                 continue
             unseen = False
-            decision = Decision(int(fusion.cluster_decision[k]))
-            text = _cluster(decision, k, fusion, detections, config)
-            if decision is not Decision.MATCHED:
+            kind, d = kind_of(Decision(int(fusion.cluster_decision[k]))), int(fusion.cluster_detection[k])
+            reason = make_reason(kind, config, detection=d, pair=fusion.pair(d, k))
+            text = _cluster(reason, fusion, detections, config)
+            if kind is not ReasonKind.MATCHED:
                 text = f"in view of {result.camera.name}, {text}"
-            yield Explanation("cluster", result.camera.name, k, decision.name.lower(), f"{head}: {text}")
+            yield Explanation("cluster", result.camera.name, k, reason, f"{head}: {text}")
         if unseen:
-            yield Explanation(
-                "cluster", "", k, "out_of_view", f"{head}: out of view of {' and '.join(compared)}"
-            )
+            text = f"{head}: out of view of {' and '.join(compared)}"
+            yield Explanation("cluster", "", k, Reason(ReasonKind.OUT_OF_VIEW), text)
 
 
-def _cluster(decision: Decision, k: int, fusion: Fusion, detections: Detections, config: Config) -> str:
-    """Return the decision of the fusion about cluster ``k`` in words."""
-    if decision is Decision.NO_DETECTION:
+def _cluster(reason: Reason, fusion: Fusion, detections: Detections, config: Config) -> str:
+    """Return the decision of the fusion about a cluster in words."""
+    if reason.kind is ReasonKind.NO_DETECTION:
         return "under no detection"
-    d = int(fusion.cluster_detection[k])
-    label = _label(detections, d)
-    if decision is Decision.MATCHED:
+    d, pair = reason["detection"], reason["pair"]
+    label = scored(detections, d)
+    if reason.kind is ReasonKind.MATCHED:
         return f"matched with {label}"
-    pair = _pair(fusion, d, k)
     if config.fusion.method == "centroid":
         evidence = f"its centre {pair.distance:.0f} px from that of {label}"
     else:
         evidence = f"{_points(pair.points)} in the frustum of {label}, IoU {pair.iou:.2f}"
-    if decision is Decision.TAKEN:
+    if reason.kind is ReasonKind.TAKEN:
         return f"{evidence}, taken by cluster {fusion.detection_cluster[d]}"
-    return f"{evidence}, {_rule(decision, d, fusion, detections, config)}"
+    return f"{evidence}, {_rule(reason, d, fusion, detections)}"
 
 
 def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explanation]:
@@ -247,7 +306,7 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
     for camera, d, part_cluster in dict.fromkeys(keys):
         detections = by_name[camera]
         assert detections is not None
-        label_text = f"by {_label(detections, d)}"
+        label_text = f"by {scored(detections, d)}"
         cluster_points, noise_points = [], 0
         rows = [row for row, key in enumerate(keys) if key == (camera, d, part_cluster)]
         for row in rows:
@@ -255,11 +314,11 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
             share = f"{points:,} of {splits.of[row]:,} points"
             if rest_cluster >= 0:
                 text = f"cluster {rest_cluster} split {label_text}: {share} are cluster {part_cluster}"
-                yield Explanation("split", camera, rest_cluster, "split", text)
+                yield Explanation("split", camera, rest_cluster, Reason(ReasonKind.SPLIT), text)
             elif points < splits.of[row]:
                 text = f"cluster {part_cluster} split {label_text}: {share} of a cluster "
                 text += "that others have the rest of"
-                yield Explanation("split", camera, part_cluster, "split", text)
+                yield Explanation("split", camera, part_cluster, Reason(ReasonKind.SPLIT), text)
             elif splits.is_noise[row]:
                 noise_points = points
             else:
@@ -272,7 +331,7 @@ def _splits(cameras: Sequence[CameraResult], splits: Splits) -> Iterator[Explana
                 "split",
                 camera,
                 part_cluster,
-                "merged",
+                Reason(ReasonKind.MERGED),
                 f"cluster {part_cluster} made {label_text} of {' and '.join(pieces)}",
             )
 
@@ -295,7 +354,9 @@ def _objects(
         if opinion is Opinion.NOT_ASKED:
             problems = "; ".join(p for result in cameras for p in result.camera.problems)
             text += f": {problems}" if problems else ""
-        yield Explanation("object", name, k, opinion.word, f"{_object(objects, k)}: {text}")
+        yield Explanation(
+            "object", name, k, Reason(ReasonKind(opinion.word)), f"{_object(objects, k)}: {text}"
+        )
 
 
 def _opinion(
@@ -307,18 +368,18 @@ def _opinion(
     config: Config,
 ) -> str:
     """Return the opinion on object ``k`` in words, with the number that decided it."""
-    camera, limits = "" if result is None else result.camera.name, config.opinions
+    camera = "" if result is None else result.camera.name
     if opinion is Opinion.NOT_ASKED:
         return "unseen, no camera has detections"
     if opinion is Opinion.OUT_OF_VIEW:
         share = f"{opinions.shown[k]:.0%} of it in the image of {camera or 'any camera'}"
-        return f"unseen, {share}, opinions.min_shown is {limits.min_shown:g}"
+        return f"unseen, {share}, {limit(config, 'opinions.min_shown')}"
     if opinion is Opinion.HIDDEN:
         share = f"{opinions.visible[k]:.0%} of it is not hidden behind what is nearer"
-        return f"unseen, {share}, opinions.min_visible is {limits.min_visible:g}"
+        return f"unseen, {share}, {limit(config, 'opinions.min_visible')}"
     if opinion is Opinion.TOO_SMALL:
         height = f"{opinions.height[k]:.1f} px high in {camera}"
-        return f"unseen, {height}, opinions.min_height is {limits.min_height:g} px"
+        return f"unseen, {height}, {limit(config, 'opinions.min_height')}"
     if opinion is Opinion.NO_CLASS:
         return f"unseen, the detector of {camera} knows no such class"
     assert result is not None
@@ -326,7 +387,7 @@ def _opinion(
     if opinion is not Opinion.CONTRADICTED:
         assert result.detections is not None
         head = "confirmed by" if opinion is Opinion.CONFIRMED else "named otherwise by"
-        return f"{head} {_label(result.detections, d)} of {camera}, {_looks(k, d, opinions, result)}"
+        return f"{head} {scored(result.detections, d)} of {camera}, {_looks(k, d, opinions, result)}"
     visibility = f"{opinions.shown[k]:.0%} in its image, {opinions.visible[k]:.0%} not hidden"
     return f"contradicted by {camera} ({visibility}): {_nearest(k, d, opinions, result, clusters, config)}"
 
@@ -347,17 +408,17 @@ def _nearest(
     detections, fusion = result.detections, result.fusion
     if d < 0 or detections is None:
         is_network = Path(config.detector.model).suffix == ".onnx"
-        limit = f", not even with a score of {config.detector.explain_threshold:g}" if is_network else ""
-        return f"no detection there{limit}"
-    text = f"the nearest is {_label(detections, d)}, IoU {opinions.iou[k]:.2f}"
-    state = DetectionState(int(detections.state[d]))
-    if state is DetectionState.BELOW_THRESHOLD:
-        return f"{text}, below detector.conf_threshold {config.detector.conf_threshold:g}"
+        weakest = f", not even with a score of {config.detector.explain_threshold:g}" if is_network else ""
+        return f"no detection there{weakest}"
+    text = f"the nearest is {scored(detections, d)}, IoU {opinions.iou[k]:.2f}"
+    reason = detection_reason(detections, d, config)
+    if reason.kind is ReasonKind.BELOW_THRESHOLD:
+        return f"{text}, {not_kept_text(reason)}"
     if fusion is not None and clusters is not None and fusion.detection_decision[d] == Decision.MATCHED:
         cluster = int(fusion.detection_cluster[d])
         return f"{text}, which is cluster {cluster} at {np.hypot(*clusters.centroid[cluster, :2]):.1f} m"
     if opinions.iou[k] < config.opinions.min_iou:
-        return f"{text}, opinions.min_iou is {config.opinions.min_iou:g}"
+        return f"{text}, {limit(config, 'opinions.min_iou')}"
     return f"{text}, which fits another box better"
 
 
@@ -365,44 +426,23 @@ def _fused(
     objects: Objects, opinions: Opinions, clusters: Clusters | None, config: Config
 ) -> Iterator[Explanation]:
     """Yield for each object of our fusion whether the other method has it, too."""
-    method, fused = _method(config), opinions.fused
+    method, fused = owner_of(config, "objects").name, opinions.fused
     for j, k in enumerate(opinions.partner.tolist()):
         cluster, camera = int(fused.cluster[j]), fused.camera[j]
         points = "" if clusters is None else f", {_points(clusters.count[cluster])}"
-        origin = f"cluster {cluster}{points}, named by {_label(fused, j)} of {camera}"
+        origin = f"cluster {cluster}{points}, named by {scored(fused, j)} of {camera}"
         if k < 0:
-            yield Explanation(
-                "fused", camera, j, "missed", f"{_object(fused, j)}: missed by {method}; {origin}"
-            )
+            text = f"{_object(fused, j)}: missed by {method}; {origin}"
+            yield Explanation("fused", camera, j, Reason(ReasonKind.MISSED), text)
         else:
-            match_text = f"{method} has {_label(objects, k)} there"
-            yield Explanation("fused", camera, j, "found", f"{_object(fused, j)}: {match_text}; {origin}")
-
-
-def _method(config: Config) -> str:
-    """Return the short name of the method that made the objects."""
-    method = config.objects.method.removeprefix(TOPIC)
-    return method if method.startswith("/") and not method.endswith(".onnx") else Path(method).name
+            match_text = f"{method} has {scored(objects, k)} there"
+            text = f"{_object(fused, j)}: {match_text}; {origin}"
+            yield Explanation("fused", camera, j, Reason(ReasonKind.IN_BOTH), text)
 
 
 def _object(objects: Objects, row: int) -> str:
     """Return name, score and distance of an object."""
-    return f"{_label(objects, row)} at {np.hypot(*objects.boxes.center[row, :2]):.1f} m"
-
-
-def _pair(fusion: Fusion, d: int, k: int) -> Pair:
-    """Return the evidence of a detection and a cluster that the fusion compared."""
-    pair = fusion.pair(d, k)
-    assert pair is not None
-    return pair
-
-
-# --- words -------------------------------------------------------------------------------------
-
-
-def _label(items: Detections | Objects, row: int) -> str:
-    """Return name and score of a detection or an object."""
-    return f"{items.names[row]} {items.score[row]:.2f}"
+    return f"{scored(objects, row)} at {np.hypot(*objects.boxes.center[row, :2]):.1f} m"
 
 
 def _points(count: int | np.integer) -> str:
@@ -410,25 +450,14 @@ def _points(count: int | np.integer) -> str:
     return f"{count} point" if count == 1 else f"{count} points"
 
 
-def _rule(decision: Decision, d: int, result: Fusion, detections: Detections, config: Config) -> str:
+def _rule(reason: Reason, d: int, fusion: Fusion, detections: Detections) -> str:
     """Return the parameter that forbade a pair."""
-    fusion = config.fusion
-    if decision is Decision.MISFIT and result.claims is not None:
-        fit, name = float(result.claims.fit[d]), detections.names[d]
-        rating = f"{fit:.2g} x score {detections.score[d]:.2f}"
-        limit = f"fusion.min_rating is {fusion.min_rating:g}"
-        return f"nothing there suits a {name} better than {rating}, {limit}"
-    if decision is Decision.TOO_FEW_POINTS:
-        return f"fusion.min_points is {fusion.min_points}"
-    if decision is Decision.LOW_OVERLAP:
-        return f"fusion.min_iou is {fusion.min_iou:g}"
-    if fusion.method == "centroid":
-        return f"fusion.match_radius is {fusion.match_radius:g} px"
-    return f"fusion.max_depth is {fusion.max_depth:g} m"
+    if reason.kind is ReasonKind.MISFIT and fusion.claims is not None:
+        rating = f"{float(fusion.claims.fit[d]):.2g} x score {detections.score[d]:.2f}"
+        return f"nothing there suits a {detections.names[d]} better than {rating}, {reason.limit}"
+    return str(reason.limit)
 
 
-def _set_aside(state: int, config: Config) -> str:
+def _set_aside(reason: Reason) -> str:
     """Return the parameter that excluded a cluster."""
-    if state == ClusterState.TOO_SMALL:
-        return f"set aside, clustering.min_cluster_points is {config.clustering.min_cluster_points}"
-    return f"set aside, clustering.max_cluster_points is {config.clustering.max_cluster_points}"
+    return f"set aside, {reason.limit}"

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from bevviz.config import AnomalyKind, ClusteringConfig, Config
+    from bevviz.model.reasons import Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -448,13 +449,19 @@ class FrameResult:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One decision in words. ``state`` is the lower-case name of the Decision or DetectionState."""
+    """One decision: its reason, and the same in words."""
 
     subject: str  # "detection", "cluster", "split", "object", "fused" or "camera"
     camera: str  # "" where no camera is involved
     row: int
-    state: str
+    reason: Reason
     text: str
+
+    @property
+    def state(self) -> str:
+        """The kind of the reason as one word; the opinion of a camera in its own words."""
+        word = self.reason.kind.value
+        return word if self.subject == "object" else word.replace(" ", "_")
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,16 +7,23 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import Detections, DetectionState, Explanation, FrameResult
 from bevviz.recording import entities
 from bevviz.recording.primitives import document, explanations_of, scored
 from bevviz.recording.writer import Writer
 from bevviz.support.text import markdown
 
-_NOT_KEPT_STATES = {"not_kept", "below_threshold", "suppressed"}
-_OBJECT_ORDER = {"contradicted": 0, "missed": 1, "named otherwise": 2, "confirmed": 3}  # order on the page
+_NOT_KEPT = {ReasonKind.NOT_KEPT, ReasonKind.BELOW_THRESHOLD, ReasonKind.SUPPRESSED}
+_OBJECT_ORDER = (  # order on the page
+    ReasonKind.CONTRADICTED,
+    ReasonKind.MISSED,
+    ReasonKind.NAMED_OTHERWISE,
+    ReasonKind.CONFIRMED,
+)
 _MAX_LINES = 5  # log lines for contradicted objects in a frame: a network may have hundreds
-_COUNTED_STATES = {"out_of_view", "too_small", "too_large"}  # clusters that are only counted and numbered
+# Clusters that are only counted and numbered.
+_COUNTED = (ReasonKind.OUT_OF_VIEW, ReasonKind.TOO_LARGE, ReasonKind.TOO_SMALL)
 
 
 def log_decisions(to: Writer, result: FrameResult) -> None:
@@ -42,7 +49,7 @@ def decision_log_lines(result: FrameResult) -> list[tuple[str, str]]:
     lines += [
         ("INFO", f"{explanation.camera}: {explanation.text}")
         for explanation in explanations_of(result.explanations, "detection")
-        if explanation.state not in _NOT_KEPT_STATES and not _is_matched(explanation)
+        if explanation.reason.kind not in _NOT_KEPT and not _is_matched(explanation)
     ]
     return lines + [("INFO", text) for text in _in_doubt(result.explanations)]
 
@@ -64,7 +71,7 @@ def _lines(result: FrameResult) -> Iterator[str]:
         name = camera.camera.name
         if camera.detections is not None:
             decided = explanations_of(explanations, "detection", name)
-            kept = [explanation for explanation in decided if explanation.state not in _NOT_KEPT_STATES]
+            kept = [explanation for explanation in decided if explanation.reason.kind not in _NOT_KEPT]
             yield from _section(
                 f"{name}: detections", [*map(_item, sorted(kept, key=_is_matched))] or ["none"]
             )
@@ -76,15 +83,15 @@ def _lines(result: FrameResult) -> Iterator[str]:
 
 
 def _is_matched(explanation: Explanation) -> bool:
-    return explanation.state == "matched"
+    return explanation.reason.kind is ReasonKind.MATCHED
 
 
 def _objects(explanations: Sequence[Explanation]) -> Iterator[str]:
     """Yield an item for each object that a camera can judge or that is missed, the worst first."""
     objects = explanations_of(explanations, "object")
-    judged = [explanation for explanation in objects if explanation.state != "unseen"]
+    judged = [explanation for explanation in objects if explanation.reason.kind is not ReasonKind.UNSEEN]
     fused = explanations_of(explanations, "fused")
-    missed = [explanation for explanation in fused if explanation.state == "missed"]
+    missed = [explanation for explanation in fused if explanation.reason.kind is ReasonKind.MISSED]
     for explanation in sorted([*judged, *missed], key=_severity):
         yield _item(explanation)
     if len(objects) > len(judged):
@@ -93,17 +100,19 @@ def _objects(explanations: Sequence[Explanation]) -> Iterator[str]:
 
 def _severity(explanation: Explanation) -> int:
     """Return the position of an object's opinion on the page."""
-    return _OBJECT_ORDER.get(explanation.state, len(_OBJECT_ORDER))
+    return _OBJECT_ORDER.index(explanation.reason.kind)
 
 
 def _in_doubt(explanations: Sequence[Explanation]) -> Iterator[str]:
     """Yield a line for each contradicted object, up to a limit, and for each missed object."""
     objects, fused = explanations_of(explanations, "object"), explanations_of(explanations, "fused")
-    contradicted = [explanation.text for explanation in objects if explanation.state == "contradicted"]
+    contradicted = [
+        explanation.text for explanation in objects if explanation.reason.kind is ReasonKind.CONTRADICTED
+    ]
     yield from contradicted[:_MAX_LINES]
     if len(contradicted) > _MAX_LINES:
         yield f"{len(contradicted) - _MAX_LINES} more objects contradicted"
-    yield from (explanation.text for explanation in fused if explanation.state == "missed")
+    yield from (explanation.text for explanation in fused if explanation.reason.kind is ReasonKind.MISSED)
 
 
 def _not_kept(explanations: Sequence[Explanation], detections: Detections) -> Iterator[str]:
@@ -115,7 +124,9 @@ def _not_kept(explanations: Sequence[Explanation], detections: Detections) -> It
         )
         [label] = scored([detections.names[row]], [detections.score[row]])
         yield f"{_counted(names)} suppressed by {label}"
-    below = [explanation for explanation in explanations if explanation.state == "below_threshold"]
+    below = [
+        explanation for explanation in explanations if explanation.reason.kind is ReasonKind.BELOW_THRESHOLD
+    ]
     if below:
         best = max(below, key=lambda explanation: detections.score[explanation.row])
         yield f"{len(below)} more, the best {best.text}" if below[1:] else best.text
@@ -132,17 +143,17 @@ def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
     if not explanations:
         return
     title = f"{camera}: clusters" if camera else "Clusters"
-    detailed = [explanation for explanation in explanations if explanation.state not in _COUNTED_STATES]
+    detailed = [explanation for explanation in explanations if explanation.reason.kind not in _COUNTED]
     items = [*map(_item, sorted(detailed, key=_is_matched))]
-    for state in sorted(_COUNTED_STATES):
-        rows = [explanation.row for explanation in explanations if explanation.state == state]
+    for kind in _COUNTED:
+        rows = [explanation.row for explanation in explanations if explanation.reason.kind is kind]
         if rows:
-            items.append(f"{len(rows)} {state.replace('_', ' ')}: {', '.join(map(str, rows))}")
+            items.append(f"{len(rows)} {kind.value}: {', '.join(map(str, rows))}")
     yield from _section(title, items)
 
 
 def _item(explanation: Explanation) -> str:
-    return f"**{explanation.state.replace('_', ' ')}** {markdown(explanation.text)}"
+    return f"**{explanation.reason.kind.value}** {markdown(explanation.text)}"
 
 
 def _section(title: str, items: Iterable[str]) -> Iterator[str]:

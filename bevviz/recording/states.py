@@ -11,22 +11,23 @@ import rerun as rr
 from bevviz import anomalies
 from bevviz.anomalies import KINDS
 from bevviz.model.colors import Color, StateColor
+from bevviz.model.reasons import ReasonKind, kind_of
 from bevviz.model.results import CameraResult, Decision, FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
 
 COLORS: Mapping[str, Color] = {
     "ok": StateColor.GOOD.value,
-    "matched": StateColor.GOOD.value,
+    ReasonKind.MATCHED.value: StateColor.GOOD.value,
     "degraded": StateColor.DOUBTFUL.value,
     "failed": StateColor.BAD.value,
-    "no cluster": StateColor.BAD.value,
-    "too few points": StateColor.DOUBTFUL.value,
-    "low overlap": StateColor.DOUBTFUL.value,
-    "misfit": StateColor.DOUBTFUL.value,
-    "taken": StateColor.OTHER.value,
-    "too far": StateColor.UNKNOWN.value,
-    "not fused": StateColor.UNKNOWN.value,
+    ReasonKind.NO_CLUSTER.value: StateColor.BAD.value,
+    ReasonKind.TOO_FEW_POINTS.value: StateColor.DOUBTFUL.value,
+    ReasonKind.LOW_OVERLAP.value: StateColor.DOUBTFUL.value,
+    ReasonKind.MISFIT.value: StateColor.DOUBTFUL.value,
+    ReasonKind.TAKEN.value: StateColor.OTHER.value,
+    ReasonKind.TOO_FAR.value: StateColor.UNKNOWN.value,
+    ReasonKind.NOT_FUSED.value: StateColor.UNKNOWN.value,
     "silent": StateColor.BAD.value,
     "unusable": StateColor.BAD.value,
     "no publisher": StateColor.BAD.value,
@@ -80,7 +81,7 @@ def states_of(result: FrameResult) -> dict[str, str]:
         name = camera.camera.name
         is_fused = camera.detections is not None and camera.fusion is not None
         states[entities.state(name)] = (
-            "degraded" if camera.camera.problems else "ok" if is_fused else "not fused"
+            "degraded" if camera.camera.problems else "ok" if is_fused else ReasonKind.NOT_FUSED.value
         )
         for class_name, decision in _best_decisions(camera):
             states[entities.class_state(name, class_name)] = decision
@@ -108,4 +109,4 @@ def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:
         if detections.names[row] not in seen_classes:
             seen_classes.add(detections.names[row])
             decision = Decision(int(camera.fusion.detection_decision[row]))
-            yield detections.names[row], decision.name.lower().replace("_", " ")
+            yield detections.names[row], kind_of(decision).value

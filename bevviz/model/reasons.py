@@ -1,0 +1,207 @@
+"""Reasons of decisions: one vocabulary for stages, explanations, state lanes and the answers of ``why``.
+
+A reason holds the values that were compared and the parameter that decided. Sentences are made from these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bevviz.config import BUILTIN_METHODS, METHOD_KEYS, Config, plugin_of, unit_spellings
+from bevviz.config.plugins import TOPIC
+from bevviz.errors import UserError
+
+
+class ReasonKind(StrEnum):
+    """The stage or rule that decided. The order is that of the stages."""
+
+    REPORTED = "reported"
+    SHARED_BOX = "shared box"  # reported, but its box also names other clusters
+    BORROWED = "borrowed name"  # named by a detection that is not its own
+    SPLIT = "split"
+    MERGED = "merged"
+    MISNAMED = "misnamed"
+    FAILED = "failed"
+    OUT_OF_VIEW = "out of view"
+    HIDDEN = "hidden"
+    NO_POINTS = "no points"
+    GROUND = "ground"
+    NOISE = "noise"
+    NO_CLUSTER = "no cluster"  # of a user's function or the robot; or none in a detection's frustum
+    TOO_SMALL = "too small"
+    TOO_LARGE = "too large"
+    NOT_RUN = "detector not run"
+    NOT_DETECTED = "not detected"
+    BELOW_THRESHOLD = "below threshold"
+    SUPPRESSED = "suppressed"
+    NOT_FUSED = "not fused"
+    LOW_OVERLAP = "low overlap"
+    TOO_FEW_POINTS = "too few points"
+    TOO_FAR = "too far"
+    TAKEN = "taken"
+    MISFIT = "misfit"
+    OTHER_CLUSTER = "other cluster"
+    CONTRADICTED = "contradicted"  # reported by a stage that is not ours, and a camera sees nothing there
+    NOT_AMONG = "not among the objects"  # of a 3D detector, or of a robot whose stages are unknown
+    LOST_IN_FUSION = "lost in the fusion"  # in the robot's fusion, although it had a cluster and a detection
+    # The rest are reasons of single decisions, which no subject of ``why`` has.
+    KEPT = "kept"
+    NOT_KEPT = "not kept"
+    MATCHED = "matched"
+    NO_DETECTION = "no detection"
+    CONFIRMED = "confirmed"
+    NAMED_OTHERWISE = "named otherwise"
+    UNSEEN = "unseen"
+    MISSED = "missed"
+    IN_BOTH = "found"
+    PROBLEM = "problem"
+
+
+PARAMETERS = {  # the parameter that decides
+    ReasonKind.GROUND: "ground.distance_threshold",
+    ReasonKind.NOISE: "clustering.min_points",
+    ReasonKind.MERGED: "clustering.eps",
+    ReasonKind.TOO_SMALL: "clustering.min_cluster_points",
+    ReasonKind.TOO_LARGE: "clustering.max_cluster_points",
+    ReasonKind.NOT_DETECTED: "detector.explain_threshold",
+    ReasonKind.BELOW_THRESHOLD: "detector.conf_threshold",
+    ReasonKind.SUPPRESSED: "detector.iou_threshold",
+    ReasonKind.LOW_OVERLAP: "fusion.min_iou",
+    ReasonKind.TOO_FEW_POINTS: "fusion.min_points",
+    ReasonKind.TOO_FAR: "fusion.max_depth",
+    ReasonKind.MISFIT: "fusion.min_rating",
+}
+
+
+def kind_of(state: IntEnum) -> ReasonKind:
+    """Return the kind that a state of a detection, a cluster or a pair has as a reason."""
+    return ReasonKind(state.name.lower().replace("_", " "))
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A parameter and its value."""
+
+    key: str
+    value: float | int | str
+    unit: str = ""
+
+    @property
+    def number(self) -> str:
+        """The value with its unit."""
+        text = f"{self.value:g}" if isinstance(self.value, float) else str(self.value)
+        return f"{text} {self.unit}".rstrip()
+
+    @property
+    def short(self) -> str:
+        """The key and the value, for texts in brackets."""
+        return f"{self.key} {self.number}"
+
+    def __str__(self) -> str:
+        """Return the sentence about the parameter."""
+        return f"{self.key} is {self.number}"
+
+
+def limit(config: Config, key: str) -> Limit:
+    """Return a parameter of the configuration."""
+    section, name = key.split(".")
+    return Limit(key, getattr(getattr(config, section), name), _unit(key))
+
+
+@cache
+def _unit(key: str) -> str:
+    """Return the symbol of a parameter's unit."""
+    return next(iter(unit_spellings(key)), "")
+
+
+def limit_of(kind: ReasonKind, config: Config) -> Limit | None:
+    """Return the parameter that decides about a kind of reason, None if there is none."""
+    key = PARAMETERS.get(kind)
+    if kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
+        key = "fusion.match_radius"
+    return limit(config, key) if key else None
+
+
+class Scored(NamedTuple):
+    """A class name with its score."""
+
+    name: str
+    score: float
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.score:.2f}"
+
+
+def scored(items: Any, row: int) -> Scored:
+    """Return name and score of a row of detections or objects."""
+    return Scored(items.names[row], float(items.score[row]))
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """The reason of one decision.
+
+    Attributes:
+        kind: the rule.
+        limit: the parameter that decided, None if no parameter of ours did.
+        values: the values that were compared, by name.
+    """
+
+    kind: ReasonKind
+    limit: Limit | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
+
+def make_reason(kind: ReasonKind, config: Config, **values: Any) -> Reason:
+    """Return a reason with the parameter that decided it."""
+    return Reason(kind, limit_of(kind, config), values)
+
+
+# --- owners of stages --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class StageOwner:
+    """The owner of one stage: bevviz, a user's function, or a topic of the robot.
+
+    Attributes:
+        section: section of the configuration.
+        function: ``module:name`` of the user's function; empty: none.
+        topic: topic of the robot; empty: none.
+    """
+
+    section: str
+    function: str = ""
+    topic: str = ""
+
+    @property
+    def ours(self) -> bool:
+        """Whether the stage is part of bevviz."""
+        return not self.function and not self.topic
+
+    @property
+    def name(self) -> str:
+        """Name of the function or topic for sentences, empty for our stages."""
+        return self.function or self.topic
+
+
+def owner_of(config: Config, section: str) -> StageOwner:
+    """Return the owner of the stage of a section."""
+    method = str(getattr(getattr(config, section), METHOD_KEYS[section]))
+    if method.startswith(TOPIC):
+        return StageOwner(section, topic=method.removeprefix(TOPIC))
+    try:
+        plugin = plugin_of(config, section)
+    except UserError:  # The function could be loaded when the frame was run.
+        return StageOwner(section, function=method)
+    if plugin is None and section == "objects" and method not in BUILTIN_METHODS:
+        return StageOwner(section, function=Path(method).name)  # file of a network
+    return StageOwner(section, function=plugin.name if plugin is not None else "")
