@@ -133,12 +133,17 @@ def _drives(folder: Path) -> dict[str, list[str]]:
     if not (folder / "export").exists():
         _run(["export", str(demo), "--model", "demo", "--format", "nuscenes", "-o", "export"], folder)
     drives["demo nuscenes"] = [str(folder / "export")]
-    for name in ("kitti_raw", "kitti_tracking", "kitti_odometry"):
+    for name, options in {
+        "kitti_raw": [],
+        "kitti_tracking": ["--sequence", "0000"],
+        "kitti_odometry": [],
+    }.items():
         root = folder / name
         if not root.exists():
             root.mkdir()
             getattr(datasets, name)(root)
-        drives[f"made {name}"] = [str(root)]
+        place = root / "2011_09_26" if name == "kitti_raw" else root
+        drives[f"made {name}"] = [str(place), *options]
     drives["kitti object"] = [str(DATA / "kitti")]
     drives["kitti drive"] = [str(DATA / "kitti_drive")]
     return drives

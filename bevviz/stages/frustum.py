@@ -292,7 +292,7 @@ class _CameraFrustums:
 
     def _weight(self, d: int, candidate: _Candidate) -> float:
         """Return the rating of a candidate, lower for farther ones."""
-        return candidate.fit / max(candidate.depth, 1.0) ** self._nearness(d)
+        return float(candidate.fit / max(candidate.depth, 1.0) ** self._nearness(d))
 
     def _nearness(self, d: int) -> float:
         """Return the exponent of the distance in the comparison of a detection's candidates."""
