@@ -304,9 +304,9 @@ def _workbench(drive: Sequence[str], folder: Path) -> Hashes:
 def _live(folder: Path) -> Hashes:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.notes import Notes
-    from bevviz.live.replay import Replay
+    from bevviz.live.frames import Replay
     from bevviz.live.runtime import Live, Outputs
+    from bevviz.live.status import Notes
     from bevviz.synthetic import SyntheticSource
 
     path = folder / f"live_{time.time_ns()}.rrd"

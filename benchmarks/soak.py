@@ -18,9 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.notes import Notes
-from bevviz.live.replay import Replay
+from bevviz.live.frames import Replay
 from bevviz.live.runtime import Live, Outputs, Status
+from bevviz.live.status import Notes
 from bevviz.synthetic import SyntheticSource
 
 WARM = 10.0  # seconds at the start that are left out: kernels are loaded, buffers fill

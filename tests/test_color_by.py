@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 import bevviz
 from bevviz.config import load
 from bevviz.config.sections import Quantity
-from bevviz.live.thinning import chosen, is_cloud, thin_cloud
+from bevviz.live.encoder import is_cloud, sample_rows, thin_cloud
 from bevviz.model.frame import F32, Scene
 from bevviz.recording import blueprints
 from bevviz.recording.cloud import ColoredPoints, quantity_annotations, quantity_ids
@@ -85,7 +85,7 @@ def test_thinned_points_keep_their_colours() -> None:
     cloud = ColoredPoints(rr.Points3D(points), ids)
     assert is_cloud(cloud, 10)
     thinned = {b.component_descriptor().component: b.as_arrow_array() for b in thin_cloud(cloud, 10, 1)}
-    rows = chosen(100, 10, 1)
+    rows = sample_rows(100, 10, 1)
     assert thinned["ColorBy:ring"].to_pylist() == (rows + 256).tolist()
     assert thinned["ColorBy:time"].to_pylist() == [3]
     assert thinned["Points3D:positions"].to_pylist() == points[rows].tolist()

@@ -18,8 +18,7 @@ from rosbags.typesys import get_types_from_msg
 from bevviz.bags.bag import Recording
 from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.errors import UserError
-from bevviz.live.live_message import LiveMessage
-from bevviz.live.ouster_sensors import Ousters
+from bevviz.live.live_message import LiveMessage, OusterSensors
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import BUILT_IN, declared_decoder, decoders, find_decoder
 from bevviz.messages.topics import Topic
@@ -95,8 +94,8 @@ def test_bags_and_live_decode_velodyne_packets_alike(tmp_path: Path) -> None:
 def test_bags_and_live_decode_ouster_scans_alike(tmp_path: Path) -> None:
     text, kind = ouster_packets.metadata("RNG15_RFL8_NIR8"), ouster_packets.KIND
     path = ouster_packets.bag(tmp_path / "bag", told=text, scans=1)
-    ousters, live = Ousters(), list[Any]()
-    ousters.look([Topic(ouster_packets.LIDAR, kind)], {})
+    ousters, live = OusterSensors(), list[Any]()
+    ousters.describe(Topic(ouster_packets.LIDAR, kind), {})
     ousters.add_metadata(ouster_packets.METADATA, text)
     sensor = ousters.sensor(ouster_packets.LIDAR)
     with Recording([path]) as recording:

@@ -27,14 +27,12 @@ from bevviz.config import load
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import INDEX, Indexer, Saver, remove_leftovers, unused_names
-from bevviz.live.flight_recorder import FlightRecorder
-from bevviz.live.notes import Notes
-from bevviz.live.replay import Replay
+from bevviz.live.files import INDEX, Indexer, RecordingSaver, remove_leftovers, unused_names
+from bevviz.live.flight_recorder import FlightRecorder, Triggers
+from bevviz.live.frames import Replay, ThinnedSource, thin
+from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.thinning import Thinned, thin
-from bevviz.live.triggers import Triggers
-from bevviz.live.viewers import RETRY, Program, Viewer
+from bevviz.live.status import Notes
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
     CameraResult,
@@ -453,7 +451,7 @@ def test_thinning_reduces_frames_and_data(frames: list[Frame], drive: SyntheticS
 
     def left(setting: str) -> list[Frame]:
         config = load(settings=[setting])
-        thinned = Thinned(Scans(frames, drive.scene, rate=1e6, total=40), lambda: config, clock)
+        thinned = ThinnedSource(Scans(frames, drive.scene, rate=1e6, total=40), lambda: config, clock)
         kept = list(thinned)
         assert thinned.thinned == 40 - len(kept)
         return kept
@@ -546,7 +544,7 @@ def test_the_flight_recorder_holds_the_last_seconds(
     config = load(settings=["live.flight_time=2 s", f"live.flight_folder={tmp_path}"]).live
     indexer = Indexer()
     with packets_of(results, drive.scene, 80) as (encoder, packets):
-        flight = FlightRecorder(config, encoder, indexer)
+        flight = FlightRecorder(config, encoder, indexer, Notes(lambda text: None))
         for packet in packets:
             flight.put(packet)
         saved = [flight.save(), flight.save(tmp_path / "second.rrd")]
@@ -567,11 +565,11 @@ def test_the_flight_recorder_is_bounded_in_memory(results: list[FrameResult], dr
     sizes: list[int] = []
     config = load(settings=["live.flight_time=1000", "live.flight_size=1 MB"]).live
     with packets_of(results, drive.scene, 80) as (encoder, packets):
-        flight = FlightRecorder(config, encoder, NoIndexer())
+        flight = FlightRecorder(config, encoder, NoIndexer(), Notes(lambda text: None))
         for packet in packets:
             flight.put(packet)
             sizes.append(flight.size)
-            assert flight.size == sum(len(held.data) for held in flight.held())
+            assert flight.size == sum(len(held.data) for held in flight.packets())
     assert 500_000 < max(sizes) <= 1_000_000 < sum(len(packet.data) for packet in packets)
 
 
@@ -707,7 +705,7 @@ def test_a_trigger_saves_the_last_seconds(run: Run) -> None:
 def save(path: Path, encoder: Encoder, packets: list[Packet], *settings: str) -> list[Path]:
     """Save the packets and return the files that they are saved in."""
     config = load(settings=[f"live.output_queue={len(packets)}", *settings]).live
-    saver = Saver(path, config, encoder, NoIndexer(), Notes(lambda text: None))
+    saver = RecordingSaver(path, config, encoder, NoIndexer(), Notes(lambda text: None))
     for packet in packets:
         saver.put(packet)
     saver.close()
@@ -718,7 +716,7 @@ def save(path: Path, encoder: Encoder, packets: list[Packet], *settings: str) ->
 def test_without_a_frame_there_is_no_file(results: list[FrameResult], drive: SyntheticSource) -> None:
     said: list[str] = []
     config = load()
-    saver = Saver(
+    saver = RecordingSaver(
         Path("none.rrd"), config.live, Encoder(config, drive.scene, "live"), NoIndexer(), Notes(said.append)
     )
     assert Path("none.rrd").exists()
@@ -785,7 +783,7 @@ def test_what_was_written_before_the_disk_was_full_is_readable(
     size = len(encoder.prelude(packets[0].context)) + sum(len(p.data) for p in packets[:3])
     said: list[str] = []
     path = tmp_path / "out.rrd"
-    saver = Saver(path, config.live, encoder, NoIndexer(), Notes(said.append))
+    saver = RecordingSaver(path, config.live, encoder, NoIndexer(), Notes(said.append))
     with file_limit(size + len(packets[3].data) // 2):
         for packet in packets:
             saver.put(packet)
@@ -1090,7 +1088,7 @@ def test_a_recording_is_not_written_through_a_link(drive: SyntheticSource, tmp_p
     config = load()
     encoder = Encoder(config, drive.scene, "live")
     with pytest.raises(UserError, match="is already there"):
-        Saver(link, config.live, encoder, NoIndexer(), Notes(lambda text: None))
+        RecordingSaver(link, config.live, encoder, NoIndexer(), Notes(lambda text: None))
     assert bag.read_text() == "the bag"
 
 

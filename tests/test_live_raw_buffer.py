@@ -47,11 +47,12 @@ from tests.support.waiting import PATIENCE, until
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.live.files import define
 from bevviz.live.node import Node
-from bevviz.live.notes import Notes
-from bevviz.live.raw_recorder import Earlier, RawMessage, RawRecorder, children, define
+from bevviz.live.raw_recorder import LatchedMessages, RawMessage, RawRecorder, children
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.source import LiveSource
+from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_transforms
 
@@ -225,7 +226,7 @@ def test_a_message_stays_until_another_one_takes_its_place() -> None:
         data = typestore().serialize_cdr(encode_transforms(received, edges), "tf2_msgs/msg/TFMessage")
         return said("/tf", "tf2_msgs/msg/TFMessage", received, bytes(data))
 
-    earlier = Earlier()
+    latched = LatchedMessages()
     messages = [
         said("/map", "nav_msgs/msg/OccupancyGrid", 1, b"old"),
         pose(2, "odom", "b"),
@@ -235,10 +236,10 @@ def test_a_message_stays_until_another_one_takes_its_place() -> None:
         pose(6, "odom"),
     ]
     for message in messages:
-        earlier.note(message)
-    kept = earlier.before(1000)
+        latched.add(message)
+    kept = latched.before(1000)
     assert [(m.sent, m.received) for m in kept] == [(2, 997), (5, 998), (6, 999)]
-    assert earlier.size == sum(len(m.data) for m in kept)
+    assert latched.size == sum(len(m.data) for m in kept)
     assert children(messages[1].data) == (b"odom", b"b") and children(b"\0\1\0\0\5") == ()
 
 

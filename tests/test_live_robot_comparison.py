@@ -9,7 +9,7 @@ import pytest
 
 from bevviz.compare.differences import Change
 from bevviz.config import load
-from bevviz.live.robot_comparison import WAITING, AgainstRobot
+from bevviz.live.robot_comparison import WAITING, RobotComparison
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult, Objects
 from bevviz.synthetic import SyntheticSource
@@ -55,17 +55,17 @@ def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0
 
 
 def test_boxes_may_arrive_before_or_after_the_result(first: Frame) -> None:
-    against = AgainstRobot("", CONFIG.live)
+    against = RobotComparison("", CONFIG.live)
     (with_it,) = against.compare(result(first, 0, robot=10.1))
-    assert [d.change for d in with_it.found.objects] == [Change.SAME] and against.topic == TOPIC
+    assert [d.change for d in with_it.differences.objects] == [Change.SAME] and against.topic == TOPIC
     assert against.compare(result(first, 1)) == []
     early = result(first, 3)  # the robot has said so before our result is there
     late = [(result(first, 1).frame.stamp, theirs(first, 11.0)), (early.frame.stamp, theirs(first, 10.4))]
     (after,) = against.compare(result(first, 2), late)
-    assert after.found.index == 1 and after.found.objects[0].change is Change.MOVED
-    assert after.found.objects[0].distance == pytest.approx(1.0, abs=1e-4)
+    assert after.differences.index == 1 and after.differences.objects[0].change is Change.MOVED
+    assert after.differences.objects[0].distance == pytest.approx(1.0, abs=1e-4)
     (before,) = against.compare(early)
-    assert before.found.index == 3 and (against.frames, against.differing) == (
+    assert before.differences.index == 3 and (against.frames, against.differing) == (
         3,
         1,
     )  # 0.4 m is no difference yet
@@ -79,23 +79,23 @@ def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
 
 
 def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
-    against = AgainstRobot("", CONFIG.live)
+    against = RobotComparison("", CONFIG.live)
     camera = first.cameras[0].name
     assert against.compare(result(first, 0)) == []
     old = result(first, 0).frame
     assert against.compare(result(first, 1), [(old.stamp, detections(old, camera))]) == []
     (after,) = against.compare(result(first, 2), [(old.stamp, theirs(old, 10.0))])
-    assert after.found.index == 0 and after.found.b.images[camera].names == ("car",)
+    assert after.differences.index == 0 and after.differences.b.images[camera].names == ("car",)
     assert against.late_images == 0
     (direct,) = against.compare(result(first, 3, robot=10.0))
-    assert direct.found.b.images == {}
+    assert direct.differences.b.images == {}
     known = result(first, 3).frame
     against.compare(result(first, 4), [(known.stamp, detections(known, camera))])
     assert against.late_images == 1
 
 
 def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
-    against = AgainstRobot("", CONFIG.live)
+    against = RobotComparison("", CONFIG.live)
     reasons = []
     for index in range(12):
         against.compare(result(first, index, robot=10.0 if index in (0, 7) else 11.0))
@@ -107,7 +107,7 @@ def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
 
 
 def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
-    against = AgainstRobot("", CONFIG.live)
+    against = RobotComparison("", CONFIG.live)
     both = result(first, 0)
     frame = both.frame
     both = replace(both, frame=replace(frame, robot_boxes=(theirs(frame, 1, "/a"), theirs(frame, 1, "/b"))))
@@ -119,9 +119,9 @@ def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
 
 def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None:
     """Nothing was found and nothing was looked for are two things: a failed stage is no difference."""
-    against = AgainstRobot("", CONFIG.live)
+    against = RobotComparison("", CONFIG.live)
     (before,) = against.compare(result(first, 0, robot=11.0))
-    assert before.found.counts[Change.MOVED] == 1
+    assert before.differences.counts[Change.MOVED] == 1
     for index in range(1, 9):
         failed = replace(result(first, index, robot=11.0), objects=None)
         assert against.compare(failed) == []
@@ -130,9 +130,9 @@ def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None
     assert against.compare(result(first, 9)) == []
     late = [(result(first, 9).frame.stamp, theirs(first, 10.0))]
     (after,) = against.compare(replace(result(first, 10), objects=None), late)
-    assert after.found.index == 9 and after.found.counts == {Change.SAME: 1}
+    assert after.differences.index == 9 and after.differences.counts == {Change.SAME: 1}
     nobody = Objects(
         Boxes3D.empty(), (), np.zeros(0, np.float32), np.zeros(0, np.int32), (), np.zeros(0, np.int32)
     )
     (nothing,) = against.compare(replace(result(first, 11, robot=10.0), objects=nobody))
-    assert nothing.found.counts == {Change.ONLY_B: 1}
+    assert nothing.differences.counts == {Change.ONLY_B: 1}

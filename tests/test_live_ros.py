@@ -60,7 +60,7 @@ from bevviz.live.publish import (
     Publisher,
 )
 from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
-from bevviz.live.remote_requests import Orders
+from bevviz.live.requests import RosRequests
 from bevviz.live.source import LiveSource, remedy
 
 LIGHT = Play(frames=3, points=20_000)
@@ -352,7 +352,7 @@ def test_topics_that_cannot_be_received_are_reported(robot: str, monkeypatch: py
             raise UserError("vision_msgs is not installed")
         return typesupport.message_type(name)
 
-    monkeypatch.setattr("bevviz.live.source.message_type", without_vision_msgs)
+    monkeypatch.setattr("bevviz.live.graph.message_type", without_vision_msgs)
     said: list[str] = []
     with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
         heard = list(islice(frames(source), 3))
@@ -603,7 +603,7 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
         return Path("/tmp/robot.rrd")
 
     robot, operator = pair
-    orders = Orders(robot.node, config, change, save)
+    orders = RosRequests(robot.node, config, change, save)
     client = operator.node.create_client(SetParameters, "/one/set_parameters")
 
     def set_to(name: str, value: Any) -> Any:
@@ -760,7 +760,7 @@ def test_parameters_of_the_command_line() -> None:
     ordered: list[str] = []
     arguments = ["-p", "range_y:=12.5", "-r", "__node:=eye", "-r", "__ns:=/robot1"]
     with Node(arguments) as session:
-        Orders(session.node, Config(), ordered.extend)
+        RosRequests(session.node, Config(), ordered.extend)
         assert session.node.get_fully_qualified_name() == "/robot1/eye"
         assert session.resolve("points") == "/robot1/points"
     assert ordered == ["bev.range_y=12.5"]

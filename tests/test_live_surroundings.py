@@ -27,12 +27,11 @@ from tests.support.waiting import PATIENCE, until
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.diagnostics import TYPE, Diagnostics
 from bevviz.live.node import Node
-from bevviz.live.notes import Notes
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.source import LiveSource
+from bevviz.live.status import TYPE, Diagnostics, Notes
 from bevviz.live.typesupport import message_type
 
 BOXES = "vision_msgs/msg/Detection3DArray"

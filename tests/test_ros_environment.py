@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.live.environment import load_rclpy, middlewares
+from bevviz.live.node import load_rclpy, middlewares
 
 
 def _install(folder: Path, code: str, monkeypatch: pytest.MonkeyPatch) -> None:

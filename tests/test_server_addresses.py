@@ -165,7 +165,7 @@ def test_the_window_is_for_this_machine(start: str, tmp_path: Path, monkeypatch:
         _start_viewer()
         command = [rerun_cli.rerun_program(), *arguments]
     else:
-        from bevviz.live.viewers import window
+        from bevviz.live.outputs import window
 
         command = list(window().command)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.live import control
-from bevviz.live.control import Control, snap
+from bevviz.live import requests as control
+from bevviz.live.requests import Control, snap
 from bevviz.support.files import check_owned
 
 
@@ -134,7 +134,7 @@ def test_snap_works_with_odd_runtime_folders(
 LISTENER = """
 import sys, time
 from pathlib import Path
-from bevviz.live.control import Control
+from bevviz.live.requests import Control
 with Control(lambda path: Path("/x.rrd"), print):
     print("ready", flush=True)
     time.sleep(60)
@@ -195,6 +195,6 @@ def test_simultaneous_requests_are_served_in_turn() -> None:
 
 def test_the_client_imports_little() -> None:
     heavy = "{'numpy', 'rerun', 'numba', 'cv2'}"
-    code = f"import bevviz.live.control, sys; print(sorted({heavy} & sys.modules.keys()))"
+    code = f"import bevviz.live.requests, sys; print(sorted({heavy} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -22,7 +22,7 @@ from bevviz.config.project import named_code, read_project_layers
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import RECEIVED, grant_trust, trust_records
 from bevviz.errors import UserError
-from bevviz.live.remote_requests import Orders
+from bevviz.live.requests import RosRequests
 from bevviz.recording.source_lookup import Origin, RecordingSource
 from bevviz.why.hints import with_changes
 from tests.support import bags
@@ -358,7 +358,7 @@ def test_workers_find_no_python_of_the_folder(received: Path) -> None:
 
 
 class Node:
-    """A ROS node as far as ``Orders`` needs one: parameters that other nodes set."""
+    """A ROS node as far as ``RosRequests`` needs one: parameters that other nodes set."""
 
     def __init__(self) -> None:
         self.on_set: Any = None
@@ -383,7 +383,7 @@ def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rcl_interfaces.msg", msg)
     write_project(received, "")
     settings, node = ReloadableConfig(), Node()
-    Orders(node, settings.config, settings.take)
+    RosRequests(node, settings.config, settings.take)
     told = node.on_set([Parameter("ground.method", "drive_tools:segment")])
     assert not told.successful
     assert "start bevviz with --set ground.method=drive_tools:segment" in told.reason

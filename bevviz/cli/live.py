@@ -29,12 +29,12 @@ from bevviz.support import progress
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.control import Control
-    from bevviz.live.notes import Notes
+    from bevviz.live.frames import Replay
     from bevviz.live.raw_recorder import RawRecorder
-    from bevviz.live.replay import Replay
+    from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
     from bevviz.live.source import LiveSource
+    from bevviz.live.status import Notes
     from bevviz.model.frame import Source
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.stage_loader import StageLoader
@@ -119,7 +119,7 @@ def _live(options: argparse.Namespace) -> int:
     # Silence Rerun's warning about files without an index. They get one when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.notes import Notes
+    from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
     option_values = {
@@ -187,24 +187,26 @@ def _watch_robot(
     raw: RawRecorder,
 ) -> int:
     """Wait for the robot, then run. Publish results and take requests as the options say."""
-    from bevviz.live.control import Control, unasked
-    from bevviz.live.diagnostics import Diagnostics
+    from bevviz.live.frames import warm_up
     from bevviz.live.publish import Publisher
-    from bevviz.live.remote_requests import Orders
-    from bevviz.live.warm_up import warm_up
+    from bevviz.live.requests import Control, RosRequests, answer_sigusr1
+    from bevviz.live.status import Diagnostics
 
     def refuse(path: Path | None = None) -> Path:
         raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
 
-    with Control(refuse, notes.warn) as control, unasked(lambda: notes.warn("there is nothing to save yet")):
+    with (
+        Control(refuse, notes.warn) as control,
+        answer_sigusr1(lambda: notes.warn("there is nothing to save yet")),
+    ):
 
         def take(more: list[str]) -> None:
             settings.take(more)
             if orders is not None:
                 orders.config = settings.config
 
-        orders: Orders | None = None
-        orders = Orders(source.node, settings.config, take, refuse)
+        orders: RosRequests | None = None
+        orders = RosRequests(source.node, settings.config, take, refuse)
         orders.config = settings.config
         if not options.observe:  # Warm up while waiting for the robot.
             warm_up_stages = partial(warm_up, settings.config, loader)
@@ -227,7 +229,7 @@ def _watch_robot(
             if diagnostics is not None:
                 diagnostics.observe(result)
 
-        def follow(live: Live, orders: Orders = orders) -> Callable[[Config], None]:
+        def follow(live: Live, orders: RosRequests = orders) -> Callable[[Config], None]:
             control.save = orders.save = live.save
             orders.change = live.update
             if diagnostics is not None:
@@ -246,7 +248,7 @@ def _watch_robot(
 
 def _replay(frames: int) -> Replay:
 
-    from bevviz.live.replay import Replay
+    from bevviz.live.frames import Replay
     from bevviz.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=frames)
@@ -361,7 +363,7 @@ def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
 
 
 def _snap(options: argparse.Namespace) -> int:
-    from bevviz.live.control import snap
+    from bevviz.live.requests import snap
 
     recording = snap(options.path, options.pid)
     print(recording)

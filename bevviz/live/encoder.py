@@ -12,16 +12,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.compare.log import DifferenceLogger
 from bevviz.config import Config
-from bevviz.live.robot_comparison import AgainstRobot, Compared
-from bevviz.live.thinning import is_cloud, thin_cloud
-from bevviz.model.frame import LateBoxes, Scene
+from bevviz.live.robot_comparison import ComparedFrame, RobotComparison
+from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
+from bevviz.recording.cloud import ColoredPoints
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.recording.sinks import APPLICATION
 from bevviz.support.contexts import Closable
@@ -117,7 +119,7 @@ class Encoder:
         scene: Scene,
         blueprint: str,
         whole: float = WHOLE,
-        against: AgainstRobot | None = None,
+        against: RobotComparison | None = None,
         clock: Callable[[], float] = time.monotonic,
         network: str = "",
     ) -> None:
@@ -151,7 +153,7 @@ class Encoder:
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
-        compared: Sequence[Compared] = (),
+        compared: Sequence[ComparedFrame] = (),
     ) -> Packet:
         """Encode one frame, with changes of the configuration or scene since the last. See ``FrameLogger``.
 
@@ -204,7 +206,7 @@ class Encoder:
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
-    def _log_differences(self, compared: Sequence[Compared], whole: bool) -> None:
+    def _log_differences(self, compared: Sequence[ComparedFrame], whole: bool) -> None:
         """Log differences from the robot's results."""
         if self._against is None or not (compared or self._differences):
             return
@@ -213,7 +215,7 @@ class Encoder:
         if whole:
             self._differences.refresh()
         for comparison in compared:
-            self._differences.log(comparison.found, comparison.received, comparison.world_from_points)
+            self._differences.log(comparison.differences, comparison.received, comparison.world_from_points)
 
     def prelude(self, context: RecordingContext, *, blueprint: bool = True) -> bytes:
         """Return the beginning of a recording whose first packet has this context. Any thread may call it."""
@@ -224,3 +226,50 @@ class Encoder:
             if self._against is not None:
                 DifferenceLogger(stream.recording, self._against.names, "")
             return stream.read()
+
+
+# --- thinned clouds ----------------------------------------------------------------------------
+
+
+def sample_rows(count: int, points: int, seed: int) -> I64:
+    """Return the rows of a random sample, in order.
+
+    The rows are divided into ``points`` equal runs, and each run gives one row. If there are fewer rows than
+    that, all are returned. The same seed gives the same rows.
+    """
+    if count <= points:
+        return np.arange(count)
+    edges = np.arange(points + 1) * count // points
+    rows: I64 = np.random.default_rng(seed).integers(edges[:-1], edges[1:])
+    return rows
+
+
+def is_cloud(logged: rr.AsComponents, points: int) -> bool:
+    """Return whether an archetype is a cloud with more than ``points`` points."""
+    return isinstance(logged, rr.Points3D | rr.Points2D | ColoredPoints) and _count(logged) > points
+
+
+def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.DescribedComponentBatch]:
+    """Return the components of the sampled points of a cloud."""
+    count = _count(cloud)
+    rows = pa.array(sample_rows(count, points, seed))
+    thinned = []
+    for batch in cloud.as_component_batches():
+        values = batch.as_arrow_array()
+        kept = _Values(values.take(rows) if len(values) == count else values)
+        thinned.append(rr.DescribedComponentBatch(kept, batch.component_descriptor()))
+    return thinned
+
+
+def _count(cloud: rr.AsComponents) -> int:
+    return max((len(batch.as_arrow_array()) for batch in cloud.as_component_batches()), default=0)
+
+
+class _Values:
+    """Arrow array in the form of a Rerun component."""
+
+    def __init__(self, values: pa.Array) -> None:
+        self._values = values
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._values

@@ -1,4 +1,4 @@
-"""Recordings on disk. Frames are written as they come, in parts that open on their own."""
+"""Files of a run: recordings and bags, written as frames and messages come, in parts."""
 
 from __future__ import annotations
 
@@ -6,83 +6,34 @@ import os
 import re
 import secrets
 import subprocess
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
+from queue import SimpleQueue
 
-from bevviz.bags.mcap_writer import complete
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+
+from bevviz.bags.mcap_writer import CHUNK_SIZE, McapWriter, complete
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.notes import Notes
-from bevviz.live.output import Output
+from bevviz.live.outputs import Output
+from bevviz.live.raw_recorder import MEGABYTE, RawMessage, RawRecorder
+from bevviz.live.status import Notes
+from bevviz.messages.definitions import definition
 from bevviz.recording import rerun_cli
+from bevviz.support.contexts import Closable
 from bevviz.support.files import create_file, is_locked, lock_file, rename_new, write_all
 
-MEGABYTE = 1_000_000
 INDEX = ".bevviz-index-"  # followed by eight hex digits: suffix of a file while its index is made
 INDEXED = 1000 * MEGABYTE  # bytes; the index is made in memory, so a larger file gets none
+WAITING = 200 * MEGABYTE  # bytes of messages that may wait for a slow disk
 
 
-class Indexer:
-    """Worker that gives finished recordings an index and merges their small chunks, in the background.
-
-    A recording without an index opens too, but slowly. If the work fails, the file stays as it is. The work
-    ends with this process. The next process removes the leftovers of a killed one in the same folder.
-    """
-
-    def __init__(self) -> None:
-        self._worker = ThreadPoolExecutor(1, "index")
-        self._waiting = 0
-
-    @property
-    def waiting(self) -> int:
-        """Number of files that are not done."""
-        return self._waiting
-
-    def add(self, path: Path) -> None:
-        """Queue a file, unless it is too large."""
-        if path.stat().st_size <= INDEXED:
-            with suppress(RuntimeError):  # the indexer is closed, so the file stays as it is
-                self._worker.submit(self._index, path)
-                self._waiting += 1
-
-    def close(self) -> None:
-        """Finish the queued files."""
-        self._worker.shutdown()
-
-    def _index(self, path: Path) -> None:
-        """Write an indexed copy and replace the file with it."""
-        indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
-        optimize = [
-            "nice",
-            "-n",
-            "19",
-            rerun_cli.rerun_program(),
-            "rrd",
-            "optimize",
-            str(path),
-            "-o",
-            str(indexed),
-        ]
-        handle = create_file(indexed)
-        try:
-            lock_file(handle, f"{indexed}: another process is writing it")
-            done = subprocess.run(
-                rerun_cli.ending_with_parent(optimize),
-                capture_output=True,
-                check=False,
-                env=rerun_cli.environment(),
-                start_new_session=True,
-            )
-            if done.returncode == 0 and indexed.stat().st_size:
-                indexed.replace(path)
-            else:
-                indexed.unlink(missing_ok=True)
-        finally:
-            os.close(handle)
-            self._waiting -= 1
+# --- names -------------------------------------------------------------------------------------
 
 
 def check_name(path: Path, *suffixes: str) -> None:
@@ -97,16 +48,23 @@ def check_name(path: Path, *suffixes: str) -> None:
         raise UserError(f"--save {path}: there is no folder {path.parent}")
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete unfinished index files of ended processes. Their recordings are complete without them."""
-    for path in folder.glob(f"*{INDEX}????????"):
-        with suppress(OSError, UserError):
-            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            try:
-                lock_file(handle, "")
-                path.unlink()
-            finally:
-                os.close(handle)
+def free_names(save: Path | None, raw: Path | None, notes: Notes) -> tuple[Path | None, Path | None]:
+    """Return free names for the recording and the bag. Complete the bags that killed runs left.
+
+    Raises:
+        UserError: a name cannot be used.
+    """
+    asked = [path for path in (save, raw) if path is not None]
+    for path in asked:
+        check_name(path, ".rrd", ".mcap")
+    if raw is not None:
+        complete_leftovers(raw, notes)
+    free = unused_names(*asked)
+    if free != asked:
+        taken, new = (" and ".join(map(str, paths)) for paths in (asked, free))
+        notes.info(f"an earlier run is saved in {taken}: this one goes to {new}")
+    names = dict(zip(asked, free, strict=True))
+    return save and names[save], raw and names[raw]
 
 
 def unused_names(*paths: Path) -> list[Path]:
@@ -131,35 +89,10 @@ def _runs(path: Path) -> int:
     return max(int(run or 1) for run in runs) if None in runs else 0
 
 
-def complete_leftovers(path: Path, notes: Notes) -> None:
-    """Complete the bags that killed runs with the same ``--save FILE.mcap`` left, and report each.
-
-    Each gets its final name. If that is taken, it gets its unfinished name without ".partial".
-    """
-    name = re.compile(re.escape(path.stem) + r"(?:-[1-9]\d{0,5})?(?:_\d{3,})?\.partial-[0-9a-f]{8}\.mcap")
-    for left in sorted(path.parent.iterdir()):
-        if not name.fullmatch(left.name) or left.is_symlink() or is_locked(left):
-            continue
-        try:
-            count = complete(left)
-            whole = _give_name(left)
-        except (OSError, UserError) as error:
-            notes.warn(f"{left.name}: left by a run that was killed; it stays as it is ({error})")
-        else:
-            notes.info(f"{whole}: {count} messages of a run that was killed, completed")
+# --- recordings --------------------------------------------------------------------------------
 
 
-def _give_name(left: Path) -> Path:
-    """Rename a completed bag and return its new path."""
-    stem, _, key = left.stem.rpartition(".partial-")
-    for whole in (left.with_stem(stem), left.with_stem(f"{stem}-{key}")):
-        with suppress(FileExistsError):
-            rename_new(left, whole)
-            return whole
-    raise UserError(f"{left}: its name is taken")
-
-
-class Saver(Output):
+class RecordingSaver(Output):
     """Output that writes every packet to ``path``. With a limit of size or time, ``path`` is numbered.
 
     No existing file is overwritten. ``unused_names`` gives free names. A full disk is reported once and ends
@@ -219,7 +152,6 @@ class Saver(Output):
 
     @property
     def _next(self) -> Path:
-        """Path of the next part."""
         if self._size is None and self._time is None:
             return self._path
         return self._path.with_stem(f"{self._path.stem}_{len(self.paths):03d}")
@@ -233,7 +165,6 @@ class Saver(Output):
         return large or (self._time is not None and packet.time - self._started >= self._time)
 
     def _open(self) -> None:
-        """Create the file of the next part."""
         path = self._next
         if path.exists() and not path.is_file():
             self._file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)  # a device
@@ -265,3 +196,235 @@ class Saver(Output):
                 path.unlink()
             self._notes.info(f"{path}: no frame came, so there is no recording")
         os.close(self._file)
+
+
+class Indexer:
+    """Worker that gives finished recordings an index and merges their small chunks, in the background.
+
+    A recording without an index opens too, but slowly. If the work fails, the file stays as it is. The work
+    ends with this process. The next process removes the leftovers of a killed one in the same folder.
+    """
+
+    def __init__(self) -> None:
+        self._worker = ThreadPoolExecutor(1, "index")
+        self._waiting = 0
+
+    @property
+    def waiting(self) -> int:
+        """Number of files that are not done."""
+        return self._waiting
+
+    def add(self, path: Path) -> None:
+        """Queue a file, unless it is too large."""
+        if path.stat().st_size <= INDEXED:
+            with suppress(RuntimeError):  # the indexer is closed, so the file stays as it is
+                self._worker.submit(self._index, path)
+                self._waiting += 1
+
+    def close(self) -> None:
+        """Finish the queued files."""
+        self._worker.shutdown()
+
+    def _index(self, path: Path) -> None:
+        indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
+        optimize = ["nice", "-n", "19", rerun_cli.rerun_program(), "rrd", "optimize", str(path)]
+        handle = create_file(indexed)
+        try:
+            lock_file(handle, f"{indexed}: another process is writing it")
+            done = subprocess.run(
+                rerun_cli.ending_with_parent([*optimize, "-o", str(indexed)]),
+                capture_output=True,
+                check=False,
+                env=rerun_cli.environment(),
+                start_new_session=True,
+            )
+            if done.returncode == 0 and indexed.stat().st_size:
+                indexed.replace(path)
+            else:
+                indexed.unlink(missing_ok=True)
+        finally:
+            os.close(handle)
+            self._waiting -= 1
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete unfinished index files of ended processes. Their recordings are complete without them."""
+    for path in folder.glob(f"*{INDEX}????????"):
+        with suppress(OSError, UserError):
+            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                lock_file(handle, "")
+                path.unlink()
+            finally:
+                os.close(handle)
+
+
+# --- bags --------------------------------------------------------------------------------------
+
+
+class BagSaver(Closable):
+    """Writer of every message to a bag. It begins with the messages that the recorder holds.
+
+    A part in progress is NAME.partial-XXXXXXXX.mcap. It begins with the earlier messages that are still valid
+    and with the last seconds of the part before, so that its first scan is complete. A full disk is reported
+    once and ends the saving only. The file is then complete. Messages that a slow disk cannot take are
+    dropped and counted. No existing file is overwritten.
+
+    Args:
+        path: the .mcap file. With a limit of size or time it is numbered.
+        config: the limits.
+        raw: source of the messages.
+        notes: takes messages to the user.
+        follows: a new part begins only with ``next_part``. It is used beside an .rrd file, whose parts lead.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+
+    name = "messages"
+
+    def __init__(
+        self, path: Path, config: LiveConfig, raw: RawRecorder, notes: Notes, *, follows: bool = False
+    ) -> None:
+        self.paths: list[Path] = []
+        self.dropped = 0  # messages
+        self._path, self._raw, self._notes = path, raw, notes
+        self._size = config.split_size and config.split_size * MEGABYTE
+        self._time = config.split_time and config.split_time * 1e9
+        self._numbered = self._size is not None or self._time is not None
+        if follows:
+            self._size = self._time = None
+        # A list begins a part, None ends the last one.
+        self._queue: SimpleQueue[RawMessage | list[RawMessage] | None] = SimpleQueue()
+        self._queued = self._taken = 0  # bytes of messages; each number is changed by one thread only
+        self._ended = False
+        self._part: McapWriter | None = self._open()
+        self._thread = threading.Thread(target=self._run, name="raw", daemon=True)
+        raw.attach(self._put, self._queue.put)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write the waiting messages and end."""
+        self._raw.detach()
+        self._ended = True
+        self._queue.put(None)
+        self._thread.join()
+
+    def next_part(self) -> None:
+        """Begin a new part. Any thread may call it."""
+        if not self._ended:
+            self._raw.begin_again(self._queue.put)
+
+    def _put(self, message: RawMessage) -> None:
+        """Queue a message, or drop it if too many bytes wait."""
+        if self._ended or self._queued - self._taken + len(message.data) > WAITING:
+            self.dropped += not self._ended
+            return
+        self._queued += len(message.data)
+        self._queue.put(message)
+
+    def _open(self) -> McapWriter:
+        number = f"_{len(self.paths):03d}" if self._numbered else ""
+        # No compression, as with `ros2 bag record`. It would take CPU time from the robot.
+        path = self._path.with_stem(f"{self._path.stem}{number}")
+        part = McapWriter(path, define, compress=False, replace=False)
+        part.__enter__()
+        self.paths.append(path)
+        return part
+
+    def _run(self) -> None:
+        """Write until closed. Report an error and end the saving."""
+        try:
+            self._write()
+        except UserError as error:
+            self._notes.warn(f"saving of the messages ends here, the rest goes on: {error}")
+            self._ended = True
+            self._raw.detach()
+            self._queue = SimpleQueue()  # frees the messages that wait
+        try:
+            self._finish()
+        except UserError as error:
+            self._notes.warn(str(error))
+
+    def _write(self) -> None:
+        """Write the queued messages. Ask for a new part when the current one is complete."""
+        begun, asked = 0, False  # start of the part, and whether the next was requested
+        while (item := self._queue.get()) is not None:
+            if isinstance(item, list):
+                if begun:
+                    self._finish()
+                    self._part = self._open()
+                for message in item:
+                    self._append(message)
+                begun, asked = item[-1].received if item else 1, False
+                continue
+            self._taken += len(item.data)
+            self._append(item)
+            complete = self._time is not None and item.received - begun >= self._time
+            if self._size is not None and self._part is not None:
+                complete |= self._part.size + CHUNK_SIZE > self._size
+            if complete and not asked:
+                asked = True
+                self.next_part()
+
+    def _append(self, message: RawMessage) -> None:
+        assert self._part is not None
+        self._part.write(message.connection, message.received, message.data, message.sent)
+
+    def _finish(self) -> None:
+        part, self._part = self._part, None
+        if part is not None:
+            part.__exit__(None, None, None)
+
+
+def write_bag(path: Path, messages: Sequence[RawMessage]) -> None:
+    """Write messages as an MCAP file. The file appears when it is complete.
+
+    Raises:
+        UserError: the file exists already, or cannot be written.
+    """
+    if path.exists():
+        raise UserError(f"{path}: is already there")
+    with McapWriter(path, define, replace=False) as bag:
+        for message in messages:
+            bag.write(message.connection, message.received, message.data, message.sent)
+
+
+def define(connection: Connection) -> MessageDefinition:
+    """Return the definition of a connection's message type."""
+    return _defined(connection.msgtype)
+
+
+@cache
+def _defined(kind: str) -> MessageDefinition:
+    text = definition(kind)
+    form = MessageDefinitionFormat.NONE if text is None else MessageDefinitionFormat.MSG
+    return MessageDefinition(form, text or "")
+
+
+def complete_leftovers(path: Path, notes: Notes) -> None:
+    """Complete the bags that killed runs with the same ``--save FILE.mcap`` left, and report each.
+
+    Each gets its final name. If that is taken, it gets its unfinished name without ".partial".
+    """
+    name = re.compile(re.escape(path.stem) + r"(?:-[1-9]\d{0,5})?(?:_\d{3,})?\.partial-[0-9a-f]{8}\.mcap")
+    for left in sorted(path.parent.iterdir()):
+        if not name.fullmatch(left.name) or left.is_symlink() or is_locked(left):
+            continue
+        try:
+            count = complete(left)
+            whole = _give_name(left)
+        except (OSError, UserError) as error:
+            notes.warn(f"{left.name}: left by a run that was killed; it stays as it is ({error})")
+        else:
+            notes.info(f"{whole}: {count} messages of a run that was killed, completed")
+
+
+def _give_name(left: Path) -> Path:
+    """Rename a completed bag and return its new path."""
+    stem, _, key = left.stem.rpartition(".partial-")
+    for whole in (left.with_stem(stem), left.with_stem(f"{stem}-{key}")):
+        with suppress(FileExistsError):
+            rename_new(left, whole)
+            return whole
+    raise UserError(f"{left}: its name is taken")

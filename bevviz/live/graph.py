@@ -1,17 +1,24 @@
-"""Topics of the ROS graph: their publishers and quality of service."""
+"""Topics of the ROS graph: their publishers, their quality of service, and subscriptions to them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
+from bevviz.errors import UserError
 from bevviz.live.node import Node
+from bevviz.live.typesupport import message_type
+from bevviz.messages.decoders import reads_bytes
+from bevviz.messages.definitions import learn, store_of
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's node name for a publisher that is discovered before its node
 LATCHED_DEPTH = 100  # one message of each node that publishes static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
+FIRST = 1.0  # seconds after subscribing in which lost messages are expected and not counted
+PATIENCE = 3.0  # seconds until a missing answer is reported and the request is repeated
 PACKET_DEPTH = 512  # LiDAR packets, about 1000 a second: those that arrive while a scan is decoded
 
 
@@ -82,13 +89,185 @@ def full_name(publisher: Any) -> str:
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
-def mismatches(topic: PublishedTopic, qos: Any) -> Iterable[str]:
-    """Yield one sentence for each publisher that a subscription with ``qos`` cannot receive."""
-    from rclpy.qos import QoSCompatibility, qos_check_compatible
+# --- subscriptions -----------------------------------------------------------------------------
 
-    for publisher in topic.publishers:
-        compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
-        if compatible == QoSCompatibility.ERROR:
-            who = full_name(publisher)
-            text = reason.removeprefix("ERROR: ").rstrip(".;")
-            yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"
+Receive = Callable[[PublishedTopic, bytes, dict[str, Any]], None]  # topic, message, rclpy's message info
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """Subscription with its type and quality of service."""
+
+    handle: Any
+    type: str
+    qos: Any
+
+
+class Subscriptions:
+    """Subscriptions of the input node to serialised messages. Only the receiving thread may use it.
+
+    Args:
+        node: the nodes of bevviz.
+        requests: asks publishers for the definitions of unknown types.
+        receive: called with each message.
+        on_loss: called with topic and number of messages that the middleware has lost. None: not watched.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        requests: TypeRequests,
+        receive: Receive,
+        on_loss: Callable[[str, int], None] | None = None,
+    ) -> None:
+        self._node, self._requests = node, requests
+        self._receive, self._on_loss = receive, on_loss
+        self._by_topic: dict[str, _Subscription] = {}
+
+    @property
+    def topics(self) -> Set[str]:
+        """Names of the subscribed topics."""
+        return self._by_topic.keys()
+
+    def listen(self, topic: PublishedTopic, *, decoded: bool = True) -> str | None:
+        """Subscribe to a topic, or again if the offered type or quality of service has changed.
+
+        ``decoded``: the definition of the type is needed, too, unless a decoder reads the bytes.
+
+        Returns:
+            None, or the reason why the type is not known. It is empty while a publisher may answer.
+        """
+        try:
+            kind = message_type(topic.type)
+            if decoded and not reads_bytes(topic.type):
+                store_of(topic.type)
+        except UserError as error:
+            why = self._requests.ask(topic)
+            return f"{error}; {why}" if why is not None else ""
+        qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
+        former = self._by_topic.get(topic.name)
+        if former is not None and (former.type, former.qos) == (topic.type, qos):
+            return None
+        self.drop(topic.name)
+
+        def receive(data: bytes, info: dict[str, Any]) -> None:
+            self._receive(topic, data, info)
+
+        handle = self._node.input.create_subscription(
+            kind, topic.name, receive, qos, event_callbacks=self._events(topic.name), raw=True
+        )
+        self._by_topic[topic.name] = _Subscription(handle, topic.type, qos)
+        return None
+
+    def _events(self, topic: str) -> Any:
+        """Return callbacks that count the lost messages of a topic. None: the losses are not watched."""
+        if self._on_loss is None:
+            return None
+        from rclpy.event_handler import SubscriptionEventCallbacks
+
+        since, on_loss = time.monotonic(), self._on_loss
+
+        def count_lost(event: Any) -> None:
+            if time.monotonic() - since >= FIRST:
+                on_loss(topic, event.total_count_change)
+
+        return SubscriptionEventCallbacks(
+            message_lost=count_lost,
+            incompatible_qos=lambda event: None,  # ``mismatches`` reports it by name
+            use_default_callbacks=False,
+        )
+
+    def drop(self, name: str) -> None:
+        """Unsubscribe from a topic, if it is subscribed."""
+        if (subscription := self._by_topic.pop(name, None)) is not None:
+            self._node.input.destroy_subscription(subscription.handle)
+
+    def mismatches(self, topic: PublishedTopic) -> Iterable[str]:
+        """Yield one sentence for each publisher of a subscribed topic that cannot be received."""
+        from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+        for publisher in topic.publishers:
+            qos = self._by_topic[topic.name].qos
+            compatible, reason = qos_check_compatible(publisher.qos_profile, qos)
+            if compatible == QoSCompatibility.ERROR:
+                who = full_name(publisher)
+                text = reason.removeprefix("ERROR: ").rstrip(".;")
+                yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"
+
+
+# --- definitions of unknown types --------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Question:
+    """Request to one node for the definition of one type."""
+
+    client: Any
+    since: float
+    sent: float = 0.0
+    future: Any = None
+    why: str = ""  # reason why there is no answer
+
+
+class TypeRequests:
+    """Client that asks publishing nodes for unknown types. Only the receiving thread may use it."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._met: dict[str, float] = {}  # type without a node to ask -> time it was first met
+        self._questions: dict[tuple[str, str], _Question] = {}  # by type and node
+
+    def ask(self, topic: PublishedTopic) -> str | None:
+        """Ask a publisher of a topic for its type. Return why that fails, or None while an answer may come.
+
+        ``definitions.store_of`` knows the type after an answer.
+        """
+        now = time.monotonic()
+        publisher = next((p for p in topic.publishers if _can_say(p)), None)
+        if publisher is None:  # no node can answer, or it is not discovered yet
+            waited = now - self._met.setdefault(topic.type, now)
+            return "its publishers do not say what it is made of, either" if waited > PATIENCE else None
+        whom = full_name(publisher)
+        question = self._questions.get((topic.type, whom))
+        if question is None:
+            from type_description_interfaces.srv import GetTypeDescription
+
+            client = self._node.input.create_client(GetTypeDescription, f"{whom}/get_type_description")
+            question = self._questions[topic.type, whom] = _Question(client, now)
+        if question.why:
+            return f"{whom}, which publishes it, was asked: {question.why}"
+        if now - question.sent > PATIENCE and question.client.service_is_ready():
+            self._send(question, topic.type, str(publisher.topic_type_hash))
+        if now - question.since > PATIENCE:
+            return f"{whom}, which publishes it, was asked and does not answer"
+        return None
+
+    def _send(self, question: _Question, name: str, digest: str) -> None:
+        from type_description_interfaces.srv import GetTypeDescription
+
+        def answered(future: Any) -> None:
+            response = future.result()
+            question.why = str(response.failure_reason) if not response.successful else ""
+            try:
+                if response.successful:
+                    sources = {s.type_name: (s.encoding, s.raw_file_contents) for s in response.type_sources}
+                    learn(name, sources, digest)
+            except UserError as error:
+                question.why = str(error)
+
+        if question.future is not None:
+            question.client.remove_pending_request(question.future)
+        request = GetTypeDescription.Request(type_name=name, type_hash=digest, include_type_sources=True)
+        question.sent = time.monotonic()
+        question.future = question.client.call_async(request)
+        question.future.add_done_callback(answered)
+
+
+def _can_say(publisher: Any) -> bool:
+    """Return whether the node of an rclpy TopicEndpointInfo can be asked.
+
+    Older releases give no type hash.
+    """
+    return publisher.node_name != UNKNOWN and str(getattr(publisher, "topic_type_hash", "")).startswith(
+        "RIHS"
+    )

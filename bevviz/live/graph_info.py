@@ -96,7 +96,6 @@ def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
 
 
 def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, seconds: float) -> TopicInfo:
-    """Return the description of one topic."""
     heard = topic.name in source.received
     stream = heard and topic.name not in source.roles.tf_static
     role = source.roles.notes.get(topic.name, "")

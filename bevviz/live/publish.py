@@ -9,6 +9,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.live.status import Notes
 from bevviz.live.typesupport import message_type
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
@@ -20,6 +21,7 @@ from bevviz.messages.encode import (
 )
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image
+from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Tracks
 
 BEV = "/visualization/bev_image"
@@ -120,7 +122,6 @@ class Publisher:
             )
 
     def _wanted(self, topic: str) -> bool:
-        """Return whether a topic has a subscriber."""
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_subscription_count() > 0
 
@@ -135,5 +136,24 @@ def _moved(points: F32, pose: F64 | None) -> F32:
 
 
 def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:
-    """Return the boxes of the given rows."""
     return Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])
+
+
+class PublishingObserver(Observer[FrameResult]):
+    """Observer that publishes results to the robot, in its own thread."""
+
+    name = "publishing"
+    queue_size = 1
+
+    def __init__(self, publish: Callable[[FrameResult], None], notes: Notes) -> None:
+        self._publish, self._notes = publish, notes
+        self._failed = False
+
+    def observe(self, result: FrameResult) -> None:
+        """Publish a result. Warn once if that fails."""
+        try:
+            self._publish(result)
+        except Exception as error:
+            if not self._failed:
+                self._notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
+            self._failed = True

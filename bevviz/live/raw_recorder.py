@@ -1,4 +1,4 @@
-"""Buffer of the serialised messages of the last seconds, and the bag written from it."""
+"""Buffer of the serialised messages of the last seconds, and the choice of the topics that it records."""
 
 from __future__ import annotations
 
@@ -6,21 +6,33 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import suppress
-from functools import cache
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 
-from bevviz.bags.mcap_writer import McapWriter
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.live.files import MEGABYTE
-from bevviz.messages.definitions import definition
+from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests
+from bevviz.live.node import Node
+from bevviz.messages.definitions import store_of
 
+MEGABYTE = 1_000_000
 LEAD = 3.0  # seconds before the first frame, in which its synchronised messages and transforms came
+SMALL = 1_000_000  # bytes a second, limit for a topic without a role
+TRIAL = 5.0  # seconds over which that rate is measured
 BULKY = frozenset({"PointCloud2", "Image", "CompressedImage"})
 PACKETS = frozenset({"PacketMsg", "PandarScan", "VelodyneScan", "CustomMsg", "CompressedPointCloud2"})
 
@@ -42,7 +54,7 @@ class RawMessage(NamedTuple):
 Sink = Callable[[RawMessage], None]
 
 
-class Earlier:
+class LatchedMessages:
     """Messages that stay valid until replaced: the last one of each topic, and of each transform.
 
     So a map, a calibration, a robot description and a mounting are kept even if they were published once,
@@ -53,7 +65,7 @@ class Earlier:
         self._last: dict[tuple[str, tuple[bytes, ...]], RawMessage] = {}
         self.size = 0
 
-    def note(self, message: RawMessage) -> None:
+    def add(self, message: RawMessage) -> None:
         """Keep a message in place of the last one, if messages of this type stay valid."""
         if message.passing:
             return
@@ -63,9 +75,9 @@ class Earlier:
         self._last[key] = message
         self.size += len(message.data) - (0 if former is None else len(former.data))
 
-    def copy(self) -> Earlier:
+    def copy(self) -> LatchedMessages:
         """Return a copy that changes independently."""
-        other = Earlier()
+        other = LatchedMessages()
         other._last, other.size = dict(self._last), self.size
         return other
 
@@ -90,37 +102,37 @@ class RawRecorder:
         self.config = config
         self.left_out: dict[str, str] = {}  # published topic that is not recorded -> reason
         self._messages: deque[tuple[float, RawMessage]] = deque()  # with the monotonic time of ``put``
-        self._earlier = Earlier()
+        self._latched = LatchedMessages()
         self._size = 0
-        self._sinks: list[Sink] = []
-        self._held = threading.RLock()
+        self._sink: Sink | None = None
+        self._lock = threading.RLock()
 
     @property
     def size(self) -> int:
         """Bytes in the buffer."""
-        return self._size + self._earlier.size
+        return self._size + self._latched.size
 
     @property
     def seconds(self) -> float:
         """Seconds from the oldest to the newest message."""
-        with self._held:
+        with self._lock:
             return self._messages[-1][0] - self._messages[0][0] if self._messages else 0.0
 
     def put(self, message: RawMessage) -> None:
-        """Add a message, drop old ones, and pass it to the attached sinks."""
+        """Add a message, drop old ones, and pass it to the attached sink."""
         now = time.monotonic()
-        with self._held:
+        with self._lock:
             self._messages.append((now, message))
             self._size += len(message.data)
             self._forget(now)
-            for sink in self._sinks:
-                sink(message)
+            if self._sink is not None:
+                self._sink(message)
 
     def _forget(self, now: float) -> None:
         """Drop messages that are too old or too many."""
         config = self.config
         recording = config.flight_time > 0 and config.raw_size > 0
-        lead = LEAD if self._sinks else 0.0  # each part of a saved bag begins with these seconds
+        lead = LEAD if self._sink is not None else 0.0  # each part of a saved bag begins with these seconds
         oldest = now - (config.flight_time + LEAD if recording else lead)
         while self._messages and (
             self._messages[0][0] <= oldest
@@ -128,67 +140,41 @@ class RawRecorder:
         ):
             _, message = self._messages.popleft()
             self._size -= len(message.data)
-            self._earlier.note(message)
+            self._latched.add(message)
 
-    def held(self, seconds: float | None = None) -> list[RawMessage]:
+    def messages(self, seconds: float | None = None) -> list[RawMessage]:
         """Return the messages of the last seconds, or all, in order of receipt.
 
         The earlier messages that are still valid come first.
         """
-        with self._held:
+        with self._lock:
             since = -1.0 if seconds is None else time.monotonic() - seconds
             recent: list[RawMessage] = []
-            earlier = self._earlier.copy()
+            latched = self._latched.copy()
             for at, message in self._messages:
                 if at >= since:
                     recent.append(message)
                 else:
-                    earlier.note(message)
+                    latched.add(message)
         recent.sort(key=lambda message: message.received)
         first = recent[0].received if recent else time.time_ns()
-        return [*earlier.before(first), *recent]
+        return [*latched.before(first), *recent]
 
-    def attach(self, sink: Sink, begin: Callable[[Sequence[RawMessage]], None]) -> None:
+    def attach(self, sink: Sink, begin: Callable[[list[RawMessage]], None]) -> None:
         """Pass the held messages to ``begin``, and every later one to ``sink``, in the receiving thread."""
-        with self._held:
-            begin(self.held())
-            self._sinks.append(sink)
+        with self._lock:
+            begin(self.messages())
+            self._sink = sink
 
-    def begin_again(self, begin: Callable[[Sequence[RawMessage]], None]) -> None:
+    def begin_again(self, begin: Callable[[list[RawMessage]], None]) -> None:
         """Pass the messages that a new bag needs to ``begin``. No message comes meanwhile."""
-        with self._held:
-            begin(self.held(LEAD))
+        with self._lock:
+            begin(self.messages(LEAD))
 
-    def detach(self, sink: Sink) -> None:
-        """Stop passing messages to a sink."""
-        with self._held, suppress(ValueError):
-            self._sinks.remove(sink)
-
-
-def write_bag(path: Path, messages: Sequence[RawMessage]) -> None:
-    """Write messages as an MCAP file. The file appears when it is complete.
-
-    Raises:
-        UserError: the file exists already, or cannot be written.
-    """
-    if path.exists():
-        raise UserError(f"{path}: is already there")
-    with McapWriter(path, define, replace=False) as bag:
-        for message in messages:
-            bag.write(message.connection, message.received, message.data, message.sent)
-
-
-@cache
-def _defined(kind: str) -> MessageDefinition:
-    """Return the definition of a message type."""
-    text = definition(kind)
-    form = MessageDefinitionFormat.NONE if text is None else MessageDefinitionFormat.MSG
-    return MessageDefinition(form, text or "")
-
-
-def define(connection: Connection) -> MessageDefinition:
-    """Return the definition of a connection's message type."""
-    return _defined(connection.msgtype)
+    def detach(self) -> None:
+        """Stop passing messages to the sink."""
+        with self._lock:
+            self._sink = None
 
 
 def children(data: bytes) -> tuple[bytes, ...]:
@@ -213,3 +199,116 @@ def _children(data: bytes) -> Iterator[bytes]:
         yield data[at + 4 : at + 3 + size]
         at += 4 + size
         at += (4 - at) % 8 + 56  # numbers are aligned relative to the end of the four-byte header
+
+
+class RawTopics:
+    """Selection of the recorded topics: every topic with a role, and further topics with little data.
+
+    It passes the messages of further topics, and those of the source, to the recorder. Only the receiving
+    thread may use it.
+
+    Args:
+        node: nodes for the subscriptions.
+        recorder: takes the messages.
+        requests: asks publishers for unknown types.
+    """
+
+    def __init__(self, node: Node, recorder: RawRecorder, requests: TypeRequests) -> None:
+        self._recorder = recorder
+        self._connections: dict[str, Connection] = {}
+        self._further = Subscriptions(node, requests, self._receive)
+        self._sizes: dict[str, tuple[float, int]] = {}  # topic -> start of the measurement, bytes
+        self._refused: dict[str, str] = {}  # topic -> reason why it is left out for good
+
+    def put(self, topic: PublishedTopic, received: int, info: Mapping[str, Any], data: bytes) -> None:
+        """Record a message of any topic."""
+        connection = self._connections.get(topic.name)
+        if connection is None or connection.msgtype != topic.type:
+            connection = self._connections[topic.name] = connection_of(topic)
+        sent = info.get("source_timestamp") or received
+        self._recorder.put(RawMessage(connection, received, sent, data))
+
+    def follow(self, topics: Mapping[str, PublishedTopic], taken: Set[str]) -> None:
+        """Subscribe to topics that are not ``taken`` by the source, if they have little data."""
+        wanted = self._recorder.config.raw_topics
+        left_out = {}
+        for name, topic in topics.items():
+            if name in taken:
+                self._leave(name)
+                continue
+            bulky = topic.type.rpartition("/")[2] in BULKY
+            if wanted == "roles":
+                left_out[name] = "it plays no role"
+            elif wanted == "small" and bulky:
+                left_out[name] = "it plays no role and is no small one"
+            elif name in self._refused:
+                left_out[name] = self._refused[name]
+            elif name not in self._further.topics:
+                self._listen(topic)
+            if name in left_out:
+                self._leave(name)
+        for name in self._further.topics - topics.keys():
+            self._leave(name)
+        if wanted == "small":
+            self._refuse_large()
+        self._recorder.left_out = left_out
+
+    def _refuse_large(self) -> None:
+        """Leave topics whose data rate is above the limit."""
+        now = time.monotonic()
+        for name, (since, size) in list(self._sizes.items()):
+            if now - since < TRIAL:
+                continue
+            rate = size / (now - since)
+            self._sizes[name] = now, 0
+            if rate > SMALL:
+                self._refused[name] = f"it plays no role and has {rate / 1e6:.1f} MB/s"
+                self._leave(name)
+
+    def _leave(self, name: str) -> None:
+        self._further.drop(name)
+        self._sizes.pop(name, None)
+
+    def _listen(self, topic: PublishedTopic) -> None:
+        """Subscribe to a topic, if its type is known."""
+        problem = self._further.listen(topic, decoded=False)
+        if problem:
+            self._refused[topic.name] = problem
+        elif problem is None:
+            self._sizes[topic.name] = time.monotonic(), 0
+
+    def _receive(self, topic: PublishedTopic, data: bytes, info: dict[str, Any]) -> None:
+        if topic.name in self._sizes:
+            since, size = self._sizes[topic.name]
+            self._sizes[topic.name] = since, size + len(data)
+        self.put(topic, info["received_timestamp"] or time.time_ns(), info, data)
+
+
+def connection_of(topic: PublishedTopic) -> Connection:
+    """Return the rosbags connection of a topic, as of a bag."""
+    try:
+        digest = store_of(topic.type).hash_rihs01(topic.type)
+    except UserError:
+        digest = ""
+    extra = ConnectionExtRosbag2("cdr", [_qos(publisher.qos_profile) for publisher in topic.publishers])
+    nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
+    return Connection(0, topic.name, topic.type, nothing, digest, 0, extra, None)
+
+
+def _qos(profile: Any) -> Qos:
+    """Return the quality of service of a publisher. The graph does not report history and depth."""
+
+    def duration(value: Any) -> QosTime:
+        return QosTime(*divmod(value.nanoseconds, 10**9))
+
+    return Qos(
+        history=QosHistory[profile.history.name],
+        depth=profile.depth,
+        reliability=QosReliability[profile.reliability.name],
+        durability=QosDurability[profile.durability.name],
+        deadline=duration(profile.deadline),
+        lifespan=duration(profile.lifespan),
+        liveliness=QosLiveliness[profile.liveliness.name],
+        liveliness_lease_duration=duration(profile.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=profile.avoid_ros_namespace_conventions,
+    )

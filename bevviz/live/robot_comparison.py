@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -27,12 +26,11 @@ from bevviz.model.frame import F64, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult
 
 SECOND = 1_000_000_000
-T = TypeVar("T")
 WAITING = 50  # frames that may wait for the robot's boxes
 
 
 @dataclass(frozen=True, slots=True)
-class Ours:
+class OurFrame:
     """Our result of one frame, reduced to the data for the comparison."""
 
     index: int
@@ -44,20 +42,20 @@ class Ours:
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class ComparedFrame:
     """Differences in one frame."""
 
-    found: FrameDifferences
+    differences: FrameDifferences
     received: int
     world_from_points: F64
 
 
-class AgainstRobot:
+class RobotComparison:
     """Comparison of each frame with the robot's boxes of the same stamp, when they come.
 
     Frames without boxes of the robot are left out. So are frames in which a failed stage left no objects of
     ours. The robot's image boxes are compared if they come before its 3D boxes. Later ones are counted. Only
-    one thread may use it, except for ``reason``.
+    one thread may use it.
 
     Args:
         asked: the robot's Detection3DArray topic. Empty: the topic is recognised by its name.
@@ -73,14 +71,13 @@ class AgainstRobot:
         self.late_images = 0  # image boxes of the robot that came after the comparison of their frame
         self._asked = asked
         self._topics: set[str] = set()
-        self._waiting: dict[int, Ours] = {}  # stamp -> frame that waits for the robot's boxes
+        self._waiting: dict[int, OurFrame] = {}  # stamp -> frame that waits for the robot's boxes
         self._late: dict[int, LabelledBoxes3D] = {}  # stamp of the frame -> boxes that wait for our result
         self._images: dict[int, dict[str, ImageBoxes]] = {}  # stamp -> camera -> boxes
         self._compared: deque[int] = deque(maxlen=WAITING)  # stamps
         self._since: int | None = None  # stamp since which both differ in every frame
         self._fired = False
         self._reason = ""
-        self._lock = threading.Lock()
 
     @property
     def names(self) -> tuple[str, str]:
@@ -89,7 +86,7 @@ class AgainstRobot:
 
     def compare(
         self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes2D | LabelledBoxes3D]] = ()
-    ) -> list[Compared]:
+    ) -> list[ComparedFrame]:
         """Take in a frame.
 
         Args:
@@ -112,7 +109,7 @@ class AgainstRobot:
             self.without_ours += 1
         else:
             about = frame.index, frame.stamp, frame.received, frame.pose
-            self._waiting[frame.stamp] = Ours(*about, seen(result), images)
+            self._waiting[frame.stamp] = OurFrame(*about, seen(result), images)
         for stamp, labelled_boxes in late:
             if isinstance(labelled_boxes, LabelledBoxes2D):
                 self._add_images(stamp, labelled_boxes)
@@ -124,26 +121,26 @@ class AgainstRobot:
         for stamp in sorted(self._late.keys() & self._waiting.keys()):
             ours, boxes = self._waiting.pop(stamp), self._late.pop(stamp)
             compared.append(self._compare(ours, _placed(boxes, ours.world_from_points)))
-        _forget(self._waiting)
-        _forget(self._late)
-        _forget(self._images)
-        return sorted(compared, key=lambda one: one.found.stamp)
+        waiting: dict[int, Any]
+        for waiting in (self._waiting, self._late, self._images):
+            while len(waiting) > WAITING:
+                del waiting[next(iter(waiting))]
+        return sorted(compared, key=lambda one: one.differences.stamp)
 
     def reason(self) -> str | None:
         """Return the reason to save the flight recorder, or None.
 
         There is one if both have differed for ``live.robot_time``. It is returned once.
         """
-        with self._lock:
-            reason, self._reason = self._reason, ""
+        reason, self._reason = self._reason, ""
         return reason or None
 
-    def _add_images(self, stamp: int, found: LabelledBoxes2D) -> None:
+    def _add_images(self, stamp: int, boxes: LabelledBoxes2D) -> None:
         """Keep late image boxes, or count them if their frame is compared already."""
-        if stamp in self._compared or not found.camera:
+        if stamp in self._compared or not boxes.camera:
             self.late_images += 1
         else:
-            self._images.setdefault(stamp, {})[found.camera] = _image_boxes(found)
+            self._images.setdefault(stamp, {})[boxes.camera] = _image_boxes(boxes)
 
     def _choose(self, topic: str) -> None:
         """Choose the topic to compare with, after a new topic has appeared."""
@@ -155,7 +152,7 @@ class AgainstRobot:
         except UserError as error:
             self.topic, self.problem = "", str(error)
 
-    def _compare(self, ours: Ours, theirs: SideResult) -> Compared:
+    def _compare(self, ours: OurFrame, theirs: SideResult) -> ComparedFrame:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
@@ -173,9 +170,8 @@ class AgainstRobot:
                 self._fired = True
                 words = ", ".join(f"{_words(d)} {frame_differences.position_of(d)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
-                with self._lock:
-                    self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
-        return Compared(frame_differences, ours.received, ours.world_from_points)
+                self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
+        return ComparedFrame(frame_differences, ours.received, ours.world_from_points)
 
     def _differs(self, difference: Difference) -> bool:
         """Return whether a difference is large enough to count."""
@@ -184,14 +180,7 @@ class AgainstRobot:
         return difference.change is not Change.SAME
 
 
-def _forget(waiting: dict[int, T]) -> None:
-    """Drop the oldest items beyond ``WAITING``."""
-    while len(waiting) > WAITING:
-        del waiting[next(iter(waiting))]
-
-
 def _words(difference: Difference) -> str:
-    """Return a difference in words."""
     if difference.change is Change.ONLY_A:
         return f"{difference.name_a} of ours alone"
     if difference.change is Change.ONLY_B:
@@ -201,9 +190,9 @@ def _words(difference: Difference) -> str:
     return f"{difference.name_a} {difference.distance:.2f} m apart"
 
 
-def _image_boxes(found: LabelledBoxes2D) -> ImageBoxes:
+def _image_boxes(boxes: LabelledBoxes2D) -> ImageBoxes:
     """Return the robot's image boxes for the comparison."""
-    return ImageBoxes(found.xyxy, found.labels)
+    return ImageBoxes(boxes.xyxy, boxes.labels)
 
 
 def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> SideResult:

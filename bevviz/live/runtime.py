@@ -5,9 +5,9 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,27 +15,16 @@ from typing import Any
 from bevviz.config import Config
 from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
 from bevviz.errors import UserError
-from bevviz.live.control import Control
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import (
-    Indexer,
-    Saver,
-    check_name,
-    complete_leftovers,
-    unused_names,
-)
-from bevviz.live.flight_recorder import FlightRecorder
-from bevviz.live.health import Health, set_nice
-from bevviz.live.notes import Notes
-from bevviz.live.output import Output
+from bevviz.live.files import BagSaver, Indexer, RecordingSaver, free_names
+from bevviz.live.flight_recorder import FlightRecorder, Triggers
+from bevviz.live.frames import ThinnedSource, warm_up
+from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
+from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
-from bevviz.live.raw_saver import RawSaver
-from bevviz.live.robot_comparison import AgainstRobot
-from bevviz.live.snapshots import Snapshots
-from bevviz.live.thinning import Thinned
-from bevviz.live.triggers import Triggers
-from bevviz.live.viewers import LATE, Viewer, remote, server, window
-from bevviz.live.warm_up import warm_up
+from bevviz.live.requests import Control, answer_sigusr1
+from bevviz.live.robot_comparison import RobotComparison
+from bevviz.live.status import Health, Notes, set_nice
 from bevviz.model.frame import Frame, RobotContext, Scene, Source
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -44,7 +33,6 @@ from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording import entities
 
-BEHIND = 3.0  # seconds of lag at which the user is warned
 LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -112,32 +100,33 @@ class Live:
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # frames logged so far
-        self._source, self._settings = Thinned(source, lambda: self.config), settings
+        self._source, self._settings = ThinnedSource(source, lambda: self.config), settings
         self._on_result = on_result
         self._shown = settings.config  # the configuration last passed to ``on_change``
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = 0.0  # seconds, monotonic
-        self._behind: set[str] = set()  # viewers about which the user was warned
+        self._lag_watch = LagWatch(notes)
         self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
 
-        self._nice(live.nice)
+        self._set_nice(live.nice)
         self._observes = observe
-        self._session = Observing(settings.config) if observe else Session(settings.config, loader=loader)
-        self._robot_problem = ""
-        self.against = None if robot is None else AgainstRobot(robot, live)
+        self.session = (
+            ObservingSession(settings.config) if observe else Session(settings.config, loader=loader)
+        )
+        self.against = None if robot is None else RobotComparison(robot, live)
+        self._robot_problem = ""  # as last reported
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
-        network = "" if observe else self._session.stages.provider
+        network = "" if observe else self.session.stages.provider
         self.encoder = Encoder(
             self.config, source.scene, outputs.blueprint, whole, self.against, network=network
         )
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
-        self.flight = FlightRecorder(live, self.encoder, self._indexer)
+        self.flight = FlightRecorder(live, self.encoder, self._indexer, notes, raw)
         self._raw = raw
-        self._snapshots = Snapshots(self.flight, raw, notes)
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = DropPolicy()
@@ -149,17 +138,17 @@ class Live:
             self.urls.append(address)
         if outputs.window:
             programs.append(window())
-        self.saver: Saver | None = None
+        self.saver: RecordingSaver | None = None
         self._outputs: list[Output] = []
-        outputs = _with_unused_names(outputs, notes)
-        if outputs.save is not None:
-            self.saver = Saver(outputs.save, live, self.encoder, self._indexer, notes)
+        save, raw_path = free_names(outputs.save, outputs.raw, notes)
+        if save is not None:
+            self.saver = RecordingSaver(save, live, self.encoder, self._indexer, notes)
             self._outputs.append(self.saver)
-        self.raw_saver: RawSaver | None = None
-        if outputs.raw is not None:
+        self.raw_saver: BagSaver | None = None
+        if raw_path is not None:
             if raw is None:
-                raise UserError(f"--save {outputs.raw}: only a robot's messages can be saved")
-            self.raw_saver = RawSaver(outputs.raw, live, raw, notes, follows=self.saver is not None)
+                raise UserError(f"--save {raw_path}: only a robot's messages can be saved")
+            self.raw_saver = BagSaver(raw_path, live, raw, notes, follows=self.saver is not None)
             if self.saver is not None:
                 self.saver.on_part = self.raw_saver.next_part
         sparse = live.viewer_rate is not None
@@ -170,30 +159,13 @@ class Live:
     @property
     def config(self) -> Config:
         """Current configuration."""
-        return self._session.config
-
-    @property
-    def thinned(self) -> int:
-        """Frames left out on purpose, by live.every and live.max_rate."""
-        return self._source.thinned
+        return self.session.config
 
     @property
     def status(self) -> Status:
         """Current statistics."""
-        health = self.health
-        return Status(
-            self.frames,
-            health.percentile(50),
-            health.percentile(99),
-            health.cpu,
-            health.memory,
-            self._drops(),
-        )
-
-    @property
-    def session(self) -> Session:
-        """Session that processes every frame."""
-        return self._session
+        p50, p99 = (self.health.percentile(percent) for percent in (50, 99))
+        return Status(self.frames, p50, p99, self.health.cpu, self.health.memory, self._drops())
 
     @property
     def scene(self) -> Scene:
@@ -222,12 +194,12 @@ class Live:
             "memory, MB": status.memory,
         }
         numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
-        numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, (_, lag) in self._lags.items()}
-        return numbers | {path.rpartition("/")[2]: n for path, n in self._snapshots.scalars.items()}
+        numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, lag in self._lags.items()}
+        return numbers | {path.rpartition("/")[2]: n for path, n in self.flight.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
-        """Save the last seconds, see ``Snapshots.save``. Any thread may call it."""
-        return self._snapshots.save(path)
+        """Save the last seconds, see ``FlightRecorder.save``. Any thread may call it."""
+        return self.flight.save(path)
 
     def stop(self) -> None:
         """End ``run``. Any thread may call it."""
@@ -242,64 +214,45 @@ class Live:
             UserError: the source or the runtime failed. All outputs are closed then.
         """
 
+        def ask_to_save() -> None:  # It takes no lock, because a signal may interrupt code that holds it.
+            self._asked_to_save = True
+
         def tick() -> None:
             if self._asked_to_save:
                 self._asked_to_save = False
-                self._snapshots.save_soon("SIGUSR1")
+                self.flight.save_soon("SIGUSR1")
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
-                self._look()
+                self._check()
                 on_tick(self.status)
 
-        observers: list[Observer[FrameResult]] = [LiveRecorder(self)]
+        observers: list[Observer[FrameResult]] = [LoggingObserver(self)]
         if self._on_result is not None:
-            observers.append(Publishing(self._on_result, self.notes))
+            observers.append(PublishingObserver(self._on_result, self.notes))
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.callback(self._close)
             if self._control is None:
                 stack.enter_context(Control(self.save, self.notes.warn))
-            stack.enter_context(self._signal())
+            stack.enter_context(answer_sigusr1(ask_to_save))
             # A second Ctrl-C must not leave half a file or a viewer. Closing takes a limited time.
             stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
             try:
-                run(
-                    self._source,
-                    self._session,
-                    observers,
-                    dropping=self._dropping,
-                    stop=self._over,
-                    tick=tick,
-                )
+                drops, stop = self._dropping, self._over
+                run(self._source, self.session, observers, dropping=drops, stop=stop, tick=tick)
             except UserError:
                 raise
             except Exception as error:
                 raise UserError(f"ended by {type(error).__name__}: {error}") from error
 
-    @contextmanager
-    def _signal(self) -> Iterator[None]:
-        """Save the flight recorder on SIGUSR1.
-
-        The handler takes no lock, because it may interrupt code that holds that lock.
-        """
-
-        def ask(number: int, stack: object) -> None:
-            self._asked_to_save = True
-
-        before = signal.signal(signal.SIGUSR1, ask)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGUSR1, before)
-
-    def _look(self) -> None:
+    def _check(self) -> None:
         """Check the configuration file, the clock, the topics and the viewers."""
         if self._settings.changed():
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
         self._log_meanwhile()
-        self._watch_viewers()
+        self._lag_watch.check(self._outputs)
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
@@ -310,7 +263,7 @@ class Live:
             output.close()
         if self.raw_saver is not None:
             self.raw_saver.close()
-        self._snapshots.close()
+        self.flight.close()
         if self._indexer.waiting:
             self.notes.info("the recording gets its index; it is complete already")
         self._indexer.close()
@@ -319,13 +272,13 @@ class Live:
     def warm_up(self) -> None:
         """Compile and load everything that the first frame needs. Scans of that time count as no drops."""
         if not self._observes:
-            warm_up(self.config, self._session.loader)
+            warm_up(self.config, self.session.loader)
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        lags = {entities.viewer_lag(name): 1e3 * lag for name, (_, lag) in self._lags.items()}
-        health = self.health.scalars() | drops | lags | self._snapshots.scalars
+        lags = {entities.viewer_lag(name): 1e3 * lag for name, lag in self._lags.items()}
+        health = self.health.scalars() | drops | lags | self.flight.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
         boxes = [(late_result.frame_stamp, late_result.boxes) for late_result in late]
@@ -338,9 +291,9 @@ class Live:
         self.health.logged(result.frame.received)
         self.frames += 1
         if reason := self._triggers.check(result):
-            self._snapshots.save_soon(reason, self.config.live.trigger_after)
+            self.flight.save_soon(reason, self.config.live.trigger_after)
         if self.against is not None:
-            self._watch_robot(self.against)
+            self._check_robot(self.against)
 
     def _with_marks(self, result: FrameResult) -> FrameResult:
         """Return the result with the marks of earlier frames that were dropped. Each states its age."""
@@ -355,33 +308,19 @@ class Live:
         around = replace(around, marks=(*texts, *around.marks))
         return replace(result, frame=replace(frame, around=around))
 
-    def _watch_robot(self, against: AgainstRobot) -> None:
+    def _check_robot(self, against: RobotComparison) -> None:
         """Report problems of the comparison, and save when robot and ours differ for long."""
         if against.problem != self._robot_problem:
             self._robot_problem = against.problem
             if against.problem:
                 self.notes.warn(against.problem)
         if reason := against.reason():
-            self._snapshots.save_soon(reason, self.config.live.trigger_after)
+            self.flight.save_soon(reason, self.config.live.trigger_after)
 
     @property
-    def _lags(self) -> dict[str, tuple[Output, float]]:
-        """Viewers by name, with the seconds that each is behind."""
-        return {output.name: (output, lag) for output in self._outputs if (lag := output.lag) is not None}
-
-    def _watch_viewers(self) -> None:
-        """Report viewers that fall behind or catch up."""
-        for name, (viewer, lag) in self._lags.items():
-            if lag > BEHIND and name not in self._behind:
-                self._behind.add(name)
-                self.notes.warn(
-                    f"the {name} viewer is {lag:.0f} s behind: it gets the newest frames, the others it "
-                    f"misses; --set live.viewer_points=20000 and --set live.viewer_rate=2 send it less"
-                )
-            elif lag < LATE and name in self._behind:
-                self._behind.remove(name)
-                missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
-                self.notes.info(f"the {name} viewer keeps up again; it has missed {missed} so far")
+    def _lags(self) -> dict[str, float]:
+        """Seconds that each viewer is behind, by name."""
+        return {output.name: lag for output in self._outputs if (lag := output.lag) is not None}
 
     def _log_meanwhile(self) -> None:
         """Log messages and topic states while no frame comes."""
@@ -438,7 +377,7 @@ class Live:
     def _apply(self, config: Config) -> None:
         """Apply a configuration and report what changed."""
         nice = self.config.live.nice
-        changed = self._session.configure(config)
+        changed = self.session.configure(config)
         self._settings.keep(config)
         self.flight.config = self._triggers.config = config.live
         if self._raw is not None:
@@ -446,14 +385,14 @@ class Live:
         if self.against is not None:
             self.against.config = config.live
         if config.live.nice != nice:
-            self._nice(config.live.nice)
+            self._set_nice(config.live.nice)
         for key, change in changed.items():
             if ".params." in key and "absent" in (change.before, change.after):
                 continue  # the change of the method is reported instead
             late = "; takes effect at the next start" if key.startswith(FIXED_KEYS) else ""
             self.notes.info(f"configuration: {key} {change}{late}")
 
-    def _nice(self, nice: int) -> None:
+    def _set_nice(self, nice: int) -> None:
         """Set the priority of the process, or warn if that is not permitted."""
         try:
             set_nice(nice)
@@ -461,33 +400,12 @@ class Live:
             self.notes.warn(f"live.nice={nice}: only root may take priority back")
 
 
-def _with_unused_names(outputs: Outputs, notes: Notes) -> Outputs:
-    """Return the outputs with free file names. Complete the bags that killed runs left."""
-    asked = [path for path in (outputs.save, outputs.raw) if path is not None]
-    for path in asked:
-        check_name(path, ".rrd", ".mcap")
-    if outputs.raw is not None:
-        complete_leftovers(outputs.raw, notes)
-    free = unused_names(*asked)
-    if free == asked:
-        return outputs
-    taken, new = (" and ".join(map(str, paths)) for paths in (asked, free))
-    notes.info(f"an earlier run is saved in {taken}: this one goes to {new}")
-    names = dict(zip(asked, free, strict=True))
-    return replace(
-        outputs,
-        save=None if outputs.save is None else names[outputs.save],
-        raw=None if outputs.raw is None else names[outputs.raw],
-    )
-
-
 def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
-    """Install signal handlers."""
     for number, handler in handlers.items():
         signal.signal(number, handler)
 
 
-class LiveRecorder(Observer[FrameResult]):
+class LoggingObserver(Observer[FrameResult]):
     """Observer that logs in its own thread. The stages and the publisher do not wait for it."""
 
     name = "logging"
@@ -505,27 +423,7 @@ class LiveRecorder(Observer[FrameResult]):
         self._live.log(result)
 
 
-class Publishing(Observer[FrameResult]):
-    """Observer that publishes results to the robot, in its own thread."""
-
-    name = "publishing"
-    queue_size = 1
-
-    def __init__(self, publish: Callable[[FrameResult], None], notes: Notes) -> None:
-        self._publish, self._notes = publish, notes
-        self._failed = False
-
-    def observe(self, result: FrameResult) -> None:
-        """Publish a result. Warn once if that fails."""
-        try:
-            self._publish(result)
-        except Exception as error:
-            if not self._failed:
-                self._notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
-            self._failed = True
-
-
-class Observing(Session):
+class ObservingSession(Session):
     """Session that runs no stage. Only the robot's topics are shown."""
 
     def __init__(self, config: Config) -> None:

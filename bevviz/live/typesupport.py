@@ -40,7 +40,6 @@ def message_type(name: str) -> Any:
 
 
 def _from_definition(name: str) -> Any:
-    """Build the class from the definition of the type."""
     from rclpy.utilities import get_rmw_implementation_identifier
     from std_msgs.msg import Empty
 
@@ -169,13 +168,11 @@ class _TypeSupport:
 
     @staticmethod
     def _max_size(bounds: Any) -> int:
-        """Report an unbounded message size."""
         bounds[0] = _UNBOUNDED
         return 0
 
 
 def _pointer(capsule: Any) -> int:
-    """Return the address in a PyCapsule."""
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -186,7 +183,6 @@ def _pointer(capsule: Any) -> int:
 
 
 def _capsule(address: int) -> Any:
-    """Return a PyCapsule of an address."""
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     return new(address, None, None)

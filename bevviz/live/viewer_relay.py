@@ -46,7 +46,6 @@ def main(url: str, recording_id: str) -> NoReturn:
 
 
 def _pieces(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the pieces of the input."""
     while length := stream.read(8):
         yield stream.read(int.from_bytes(length, "little"))
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import rerun as rr
 
 from bevviz.live.encoder import Packet
-from bevviz.live.output import Output
+from bevviz.live.outputs import Output
 from bevviz.live.runtime import Live
 from bevviz.recording import blueprints
 from bevviz.recording.frame_logger import RecordingContext

@@ -13,8 +13,8 @@ import rerun as rr
 from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
+from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live
-from bevviz.live.thinning import chosen
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations
@@ -189,7 +189,7 @@ class RunningRobot(Source):
         result = self.look(number)
         points = result.config.live.viewer_points
         if instance is not None and points is not None and path == entities.points(result.frame.lidar):
-            rows = chosen(len(result.frame.points), points, result.frame.index)
+            rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
         picked = pick(result, result.tracks, path, instance, position)
         return None if picked is None else selection_of(picked)

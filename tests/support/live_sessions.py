@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.notes import Notes
-from bevviz.live.replay import Replay
+from bevviz.live.frames import Replay
 from bevviz.live.runtime import Live, Outputs
+from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.running_robot import RunningRobot

@@ -1,16 +1,17 @@
-"""Viewers as outputs. Each is fed by its own thread and process, so that none delays the run."""
+"""Outputs of a run, and viewers as outputs. Each has its own thread, so that a slow one delays no other."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.notes import Notes
-from bevviz.live.output import Output
+from bevviz.live.status import Notes
 from bevviz.recording import rerun_cli
 from bevviz.recording.frame_logger import RecordingContext
 from bevviz.recording.ports import (
@@ -25,9 +26,69 @@ from bevviz.recording.ports import (
     viewer_address,
 )
 from bevviz.recording.sinks import check_viewer
+from bevviz.support.queues import NewestQueue
 
 RETRY = 3.0  # seconds between two attempts to reach a lost viewer
+BEHIND = 3.0  # seconds of lag at which the user is warned
 LATE = 1.0  # seconds of lag from which on no old packets are sent
+
+
+class Output(ABC):
+    """Consumer of packets. Packets that overflow its queue are dropped and counted.
+
+    After a gap it continues at a whole packet.
+
+    Args:
+        name: name in the health of the run.
+        queue: most packets that may wait.
+    """
+
+    def __init__(self, name: str, queue: int) -> None:
+        self.name = name
+        self._packets: NewestQueue[Packet] = NewestQueue(queue)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @property
+    def dropped(self) -> int:
+        """Packets dropped so far."""
+        return self._packets.dropped
+
+    @property
+    def lag(self) -> float | None:
+        """Seconds that the viewer is behind. None: there is no viewer, or its lag is unknown."""
+        return None
+
+    def put(self, packet: Packet) -> None:
+        """Queue a packet. It never waits."""
+        self._packets.put(packet)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write the waiting packets and end."""
+
+    @abstractmethod
+    def _take(self, packet: Packet, fresh: bool) -> bool:
+        """Write a packet. Return False if that failed; the output then continues at a whole packet.
+
+        ``fresh``: the packet is the first after a gap.
+        """
+
+    def _end(self) -> None:
+        """Accept no more packets."""
+        self._ended.set()
+        self._packets.close()
+
+    def _run(self) -> None:
+        """Write the queued packets until the queue is closed."""
+        dropped, in_step = 0, False
+        for packet in self._packets:
+            if self._ended.is_set():
+                return
+            in_step = in_step and dropped == self.dropped
+            dropped = self.dropped
+            if in_step or packet.whole:
+                in_step = self._take(packet, fresh=not in_step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +194,6 @@ class Viewer(Output):
         self._thread.join(patience)
 
     def _start(self) -> subprocess.Popen[bytes]:
-        """Start the program."""
         return rerun_cli.spawn(self._program.command)
 
     def _run(self) -> None:
@@ -159,7 +219,6 @@ class Viewer(Output):
         return self._send(packet.shown) or self._recover(packet.context)
 
     def _begin(self, context: RecordingContext) -> bool:
-        """Send the beginning of a recording."""
         if self._program.framed and not self._send(self._encoder.header):
             return False
         return self._send(self._encoder.prelude(context))
@@ -194,3 +253,26 @@ class Viewer(Output):
         except OSError:
             return False
         return True
+
+
+class LagWatch:
+    """Reporter of viewers that fall behind or catch up."""
+
+    def __init__(self, notes: Notes) -> None:
+        self._notes = notes
+        self._behind: set[str] = set()  # viewers about which the user was warned
+
+    def check(self, outputs: Sequence[Output]) -> None:
+        """Report each viewer once when it falls behind, and once when it keeps up again."""
+        lags = {output.name: (output, lag) for output in outputs if (lag := output.lag) is not None}
+        for name, (viewer, lag) in lags.items():
+            if lag > BEHIND and name not in self._behind:
+                self._behind.add(name)
+                self._notes.warn(
+                    f"the {name} viewer is {lag:.0f} s behind: it gets the newest frames, the others it "
+                    f"misses; --set live.viewer_points=20000 and --set live.viewer_rate=2 send it less"
+                )
+            elif lag < LATE and name in self._behind:
+                self._behind.remove(name)
+                missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
+                self._notes.info(f"the {name} viewer keeps up again; it has missed {missed} so far")

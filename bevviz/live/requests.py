@@ -1,4 +1,4 @@
-"""Requests of ``bevviz snap`` to a running ``bevviz live``, through one Unix socket for each process."""
+"""Requests to a running bevviz: through its socket (``bevviz snap``), by ROS parameters and a ROS service."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ import socket
 import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
 from bevviz.support.files import check_owned
 
+if TYPE_CHECKING:  # the client of the socket starts without the configuration
+    from bevviz.config import Config
+
 ANSWER = 5.0  # seconds that a healthy process needs at most to acknowledge a request
 PATIENCE = 120.0  # seconds that saving may take
 LONGEST = 1 << 16  # bytes, longest request or answer
 _CREDENTIALS = struct.Struct("3i")  # SO_PEERCRED of a socket: process, user, group
+NO_LIMIT = 0  # a ROS parameter cannot be empty
 
 
 class Control(Closable):
@@ -65,7 +69,6 @@ class Control(Closable):
         self._thread.join(PATIENCE)  # a save may be in progress
 
     def _listen(self, folder: Path) -> None:
-        """Open the socket in a folder."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_owned(folder)
         path = folder / f"{os.getpid()}.sock"
@@ -91,7 +94,6 @@ class Control(Closable):
                 connection.sendall(json.dumps(self._answer(request)).encode() + b"\n")
 
     def _answer(self, request: bytes) -> dict[str, str]:
-        """Carry out a request and return the answer."""
         try:
             content = json.loads(request)
             path = content.get("path") if isinstance(content, dict) else 0
@@ -109,9 +111,9 @@ class Control(Closable):
 
 
 @contextmanager
-def unasked(say: Callable[[], None]) -> Iterator[None]:
-    """Answer SIGUSR1 with ``say`` until the run handles it. The default action would end the process."""
-    before = signal.signal(signal.SIGUSR1, lambda number, stack: say())
+def answer_sigusr1(answer: Callable[[], None]) -> Iterator[None]:
+    """Call a function at each SIGUSR1. The default action would end the process."""
+    before = signal.signal(signal.SIGUSR1, lambda number, stack: answer())
     try:
         yield
     finally:
@@ -159,18 +161,12 @@ def snap(path: Path | None = None, pid: int | None = None) -> Path:
 
 def folders() -> Iterator[Path]:
     """Yield the folders that may hold the sockets, the best one first."""
-    runtime_folder = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime_folder:
+    if runtime_folder := os.environ.get("XDG_RUNTIME_DIR"):
         yield Path(runtime_folder, "bevviz")
-    yield (
-        Path(f"/run/user/{os.getuid()}/bevviz") if Path(f"/run/user/{os.getuid()}").is_dir() else _temporary()
-    )
-    yield _temporary()
-
-
-def _temporary() -> Path:
-    """Return this user's folder in the folder for temporary files."""
-    return Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
+    user_folder = Path(f"/run/user/{os.getuid()}")
+    if user_folder.is_dir():
+        yield user_folder / "bevviz"
+    yield Path(tempfile.gettempdir(), f"bevviz-{os.getuid()}")
 
 
 def _running() -> dict[int, socket.socket]:
@@ -203,3 +199,124 @@ def _line(lines: BinaryIO) -> bytes | None:
     """Read the next line. Return None if the other side has closed or the line is too long."""
     line = lines.readline(LONGEST)
     return line if line.endswith(b"\n") else None
+
+
+# --- ROS ---------------------------------------------------------------------------------------
+
+
+class RosRequests:
+    """ROS parameters for every key of the configuration, and the service ``~/save_recording``.
+
+    Each key is a parameter (``clustering.eps``). The tutorial's names (``range_x``, ``voxel_size`` ...) exist
+    too. Values given with ``--ros-args -p`` are applied before the constructor returns. ``config``,
+    ``change`` and ``save`` may be replaced later.
+
+    Args:
+        node: an rclpy node that another thread spins.
+        config: initial values of the parameters.
+        change: applies settings ``key=value``, or raises a UserError with the reason.
+        save: writes the recording of the last seconds and returns its path, or raises a UserError.
+
+    Raises:
+        UserError: a value given with ``-p`` is refused.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        config: Config,
+        change: Callable[[list[str]], None],
+        save: Callable[[], Path] | None = None,
+    ) -> None:
+        from bevviz.config import TUTORIAL_NAMES, keys
+
+        self._node = node
+        self.config = config
+        self.change = change
+        self.save = save
+        about = keys(config)
+        self._keys = {**{key: key for key in about}, **TUTORIAL_NAMES}  # parameter name -> key
+        parameters = [
+            node.declare_parameter(name, value, _descriptor(about[self._keys[name]]))
+            for name, value in self._parameters(config).items()
+        ]
+        if settings := self._settings(parameters):
+            change(settings)
+        node.add_on_set_parameters_callback(self._set)
+        if save is not None:
+            from std_srvs.srv import Trigger
+
+            node.create_service(Trigger, "~/save_recording", self._trigger)
+
+    def show(self, config: Config) -> None:
+        """Set the parameters to a configuration that was changed elsewhere."""
+        from rclpy.parameter import Parameter
+
+        self.config = config
+        parameters = self._parameters(config).items()
+        self._node.set_parameters(
+            [Parameter(n, value=v) for n, v in parameters if self._node.get_parameter(n).value != v]
+        )
+
+    def _parameters(self, config: Config) -> dict[str, Any]:
+        """Return a configuration as ROS parameters. Lists become YAML, and None an empty text."""
+        from bevviz.config import values
+
+        current, parameters = values(config), dict[str, Any]()
+        for name, key in self._keys.items():
+            value = current[key]
+            if value is None:
+                value = NO_LIMIT if name == "max_cluster_size" else ""
+            parameters[name] = value if isinstance(value, bool | int | float | str) else _yaml(value)
+        return parameters
+
+    def _settings(self, parameters: Sequence[Any]) -> list[str]:
+        """Return the parameters that differ from the configuration, as settings ``key=value``."""
+        from bevviz.config import values
+
+        current, unchanged = values(self.config), self._parameters(self.config)
+        ordered = []
+        for parameter in parameters:
+            name, value = parameter.name, parameter.value
+            key = self._keys.get(name)
+            if key is None or value == unchanged[name]:
+                continue
+            empty = value == NO_LIMIT if name == "max_cluster_size" else value in ("", None)
+            none = empty and not isinstance(current[key], str)
+            ordered.append(f"{key}={'null' if none else _text(value)}")
+        return ordered
+
+    def _set(self, parameters: Sequence[Any]) -> Any:
+        """Apply changed parameters. Return whether they were accepted."""
+        from rcl_interfaces.msg import SetParametersResult
+
+        try:
+            if settings := self._settings(parameters):
+                self.change(settings)
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _trigger(self, request: Any, response: Any) -> Any:
+        assert self.save is not None
+        try:
+            response.success, response.message = True, str(self.save())
+        except UserError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+
+def _text(value: Any) -> str:
+    return _yaml(value) if isinstance(value, bool | list | tuple) or hasattr(value, "tolist") else str(value)
+
+
+def _yaml(value: Any) -> str:
+    """Return a value as YAML on one line. JSON is YAML."""
+    return json.dumps(value, default=lambda other: other.tolist() if hasattr(other, "tolist") else str(other))
+
+
+def _descriptor(about: str) -> Any:
+    from rcl_interfaces.msg import ParameterDescriptor
+
+    # The configuration checks the type. `ros2 param set` takes 20 for an integer where 20.0 is meant.
+    return ParameterDescriptor(description=about, dynamic_typing=True)

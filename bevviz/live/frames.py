@@ -1,0 +1,252 @@
+"""Frames of a run: thinned on purpose, replayed as of a robot, and artificial ones to warm up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.live.encoder import Encoder, sample_rows
+from bevviz.model.frame import (
+    F64,
+    Camera,
+    Cloud,
+    Frame,
+    Image,
+    Intrinsics,
+    LateBoxes,
+    Scene,
+    Source,
+    UserMark,
+)
+from bevviz.model.geometry import inverse
+from bevviz.model.results import Detections, DetectionState, FrameResult, Masks
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
+
+SCENE = Scene("warm", "lidar", ("lidar",), ("camera",))
+PERIOD = 100_000_000  # nanoseconds
+CAMERA_FROM_LIDAR: F64 = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+class ThinnedSource:
+    """Source that leaves out frames and points as the configuration asks.
+
+    Args:
+        source: source of the frames. If it has a method ``stop``, that ends it.
+        config: returns the current configuration.
+        clock: returns seconds, for tests.
+    """
+
+    def __init__(
+        self, source: Source, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.thinned = 0
+        self._source, self._config, self._clock = source, config, clock
+
+    @property
+    def scene(self) -> Scene:
+        """Names of the sensors."""
+        return self._source.scene
+
+    @property
+    def total(self) -> int | None:
+        """Number of frames of the source, if known."""
+        return self._source.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Warnings of the source."""
+        return self._source.warnings
+
+    @property
+    def dropped(self) -> int:
+        """Frames that the source itself has dropped."""
+        return int(getattr(self._source, "dropped", 0))
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """State of each topic, if the source has topics."""
+        return getattr(self._source, "states", {})
+
+    def overtaken(self) -> tuple[LateBoxes, ...]:
+        """Return the robot's results that came too late for their frames, since the last call."""
+        overtaken = getattr(self._source, "overtaken", None)
+        return () if overtaken is None else tuple(overtaken())
+
+    def marks(self, index: int) -> tuple[UserMark, ...]:
+        """Return the users' marks up to the frame of this index, since the last call."""
+        marks = getattr(self._source, "marks", None)
+        return () if marks is None else tuple(marks(index))
+
+    def stop(self) -> None:
+        """End the iteration of the source."""
+        stop = getattr(self._source, "stop", None)
+        if stop is not None:
+            stop()
+
+    def __iter__(self) -> Iterator[Frame]:
+        earliest = 0.0
+        for number, frame in enumerate(self._source):
+            live, now = self._config().live, self._clock()
+            if number % live.every or now < earliest:
+                self.thinned += 1
+                continue
+            if live.max_rate is not None:
+                # A frame that comes a little early keeps its turn. A pause permits no burst afterwards.
+                earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
+            yield thin(frame, live.points)
+
+
+def thin(frame: Frame, points: int | None) -> Frame:
+    """Return the frame with at most ``points`` points, chosen at random as in ``sample_rows``.
+
+    A fixed step would choose the same ring of the LiDAR again and again.
+    """
+    count = len(frame.points)
+    if points is None or count <= points:
+        return frame
+    rows = sample_rows(count, points, frame.index)
+    ends = np.cumsum([len(cloud.xyz) for cloud in frame.clouds])
+    clouds = []
+    for cloud, end in zip(frame.clouds, ends.tolist(), strict=True):
+        kept = rows[(rows >= end - len(cloud.xyz)) & (rows < end)] - (end - len(cloud.xyz))
+        fields = {name: values[kept] for name, values in cloud.fields.items()}
+        clouds.append(replace(cloud, xyz=cloud.xyz[kept], fields=fields))
+    return replace(
+        frame,
+        points=frame.points[rows],
+        fields={name: values[rows] for name, values in frame.fields.items()},
+        clouds=tuple(clouds),
+    )
+
+
+class Replay:
+    """Endless source that plays frames forward and backward at a steady rate, so that nothing jumps.
+
+    Stamps and times of receipt are shifted to the current time.
+
+    Args:
+        frames: frames in order of time.
+        scene: names of the sensors.
+        rate: frames a second.
+        total: frames until it ends. None: it does not end.
+    """
+
+    def __init__(
+        self, frames: Sequence[Frame], scene: Scene, *, rate: float = 10.0, total: int | None = None
+    ) -> None:
+        self.scene = scene
+        self.total = total
+        self.warnings: tuple[str, ...] = ()
+        self._frames = [*frames, *frames[-2:0:-1]]
+        self._period = 1 / rate
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        """End the iteration. Any thread may call it."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[Frame]:
+        start = time.monotonic()
+        index = 0
+        while self.total is None or index < self.total:
+            if self._stopped.wait(max(0.0, start + index * self._period - time.monotonic())):
+                return
+            yield _at(self._frames[index % len(self._frames)], index, time.time_ns())
+            index += 1
+
+
+def _at(frame: Frame, index: int, now: int) -> Frame:
+    """Return the frame with its times shifted, so that its cloud is received now."""
+    shift = now - frame.received
+    stamp = frame.stamp + shift
+    cameras = [
+        replace(c, image=c.image and replace(c.image, stamp=c.image.stamp + shift, received=now))
+        for c in frame.cameras
+    ]
+    return replace(
+        frame,
+        index=index,
+        stamp=stamp,
+        received=now,
+        clouds=tuple(replace(c, stamp=c.stamp + shift, received=now) for c in frame.clouds),
+        cameras=tuple(cameras),
+        robot_boxes=tuple(replace(b, stamp=b.stamp + shift) for b in frame.robot_boxes),
+        robot_detections=tuple(replace(d, stamp=d.stamp + shift) for d in frame.robot_detections),
+        truth=frame.truth and replace(frame.truth, stamp=frame.truth.stamp + shift),
+    )
+
+
+def warm_up(config: Config, loader: StageLoader) -> None:
+    """Run the stages, the network and the logging on small artificial frames. The results are discarded.
+
+    User-defined stages are left out, because they may not accept artificial frames.
+
+    Args:
+        config: configuration of the run.
+        loader: loader that has the network.
+    """
+    config = _without_user_stages(config)
+    network, seen = Session(config, loader=loader), Session(config, lambda camera: _one_car())
+    network.run(_frame(0))
+    results = [seen.run(_frame(index)) for index in range(2)]
+    with closing(Encoder(config, SCENE, "live")) as encoder:
+        for result in (*results, FrameResult.unprocessed(_frame(2), config)):
+            encoder.encode(result, SCENE, {}, ())
+
+
+def _without_user_stages(config: Config) -> Config:
+    """Return the configuration without user-defined stages and without robot topics."""
+    changes: dict[str, Any] = {
+        name: getattr(Config(), name)
+        for name in ("ground", "clustering", "objects")
+        if ":" in getattr(config, name).method
+    }
+    if ":" in config.detector.model:
+        changes["detector"] = config.detector.model_copy(update={"model": ""})
+    return config.model_copy(update=changes)
+
+
+def _frame(index: int) -> Frame:
+    """Return a frame with level ground and a box of points before the camera."""
+    ground = np.mgrid[-20:20:0.5, -20:20:0.5, -1.8:-1.7:1].reshape(3, -1).T
+    car = np.mgrid[8:10:0.1, -1:1:0.1, -1.5:0:0.2].reshape(3, -1).T
+    points = np.concatenate([ground, car]).astype(np.float32)
+    fields = {"intensity": np.ones(len(points), np.float32)}
+    stamp = PERIOD * (1 + index)
+    image = Image(stamp, "camera", np.zeros((360, 640, 3), np.uint8))
+    intrinsics = Intrinsics(640, 360, np.array([[300.0, 0, 320], [0, 300, 180], [0, 0, 1]]))
+    return Frame(
+        index,
+        stamp,
+        stamp,
+        "lidar",
+        points,
+        "lidar",
+        fields,
+        world_frame="map",
+        world_from_points=np.eye(4),
+        clouds=(Cloud(stamp, "lidar", points, fields, name="lidar"),),
+        points_from_clouds=(np.eye(4),),
+        cameras=(Camera("camera", image, intrinsics, CAMERA_FROM_LIDAR, inverse(CAMERA_FROM_LIDAR)),),
+    )
+
+
+def _one_car() -> Detections:
+    """Return the detection of one car, with a mask."""
+    first = np.zeros(1, np.int32)
+    box = np.array([[260, 170, 380, 240]], np.float32)
+    score = np.ones(1, np.float32)
+    cells = Masks(
+        np.packbits(np.ones(120 * 70, np.uint8)),
+        np.array([[260, 170, 120, 70]], np.int32),
+        np.array([1, 1, 0, 0], np.float32),
+    )
+    return Detections(box, score, first, ("car",), first + DetectionState.KEPT, first - 1, 0 * score, cells)

@@ -1,0 +1,323 @@
+"""Inputs of the frames: topics with a role, watch over their messages, and the way to the synchroniser."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from statistics import median
+from typing import Any, Literal
+
+from bevviz.config import Config, SourceConfig, stage_topics
+from bevviz.drivers import ouster
+from bevviz.errors import UserError
+from bevviz.live.graph import PublishedTopic
+from bevviz.live.live_message import LiveMessage, OusterSensors
+from bevviz.messages import surroundings
+from bevviz.messages.decoders import declared_decoder
+from bevviz.messages.foreign_boxes import holds_boxes
+from bevviz.messages.guard import guard
+from bevviz.messages.roles import STAGE_KINDS, Roles, find_roles
+from bevviz.messages.topics import Topic, unsupported_reason
+from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
+from bevviz.sync.report import UnusableMessages
+from bevviz.sync.synchronizer import Synchronizer
+
+SILENCE = 2.0  # seconds without a message that are reported, unless five usual steps are longer
+STREAM = 5  # messages after which a topic counts as a stream that should continue
+AGAIN = 10  # unusable messages in a row that are reported once more
+
+TopicState = Literal["ok", "silent", "unusable", "no publisher"]
+KINDS = {
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/CameraInfo",
+    "tf2_msgs/msg/TFMessage",
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+    *surroundings.TYPES,
+}
+
+
+@dataclass(slots=True)
+class _Arrivals:
+    """Arrivals of one topic."""
+
+    count: int = 0
+    bytes: int = 0
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=20))  # seconds, monotonic
+    row: int = 0  # unusable messages since the last usable one
+
+
+class TopicWatch:
+    """Counter of received messages and record of the current problems.
+
+    Args:
+        tell: called with one sentence each time a problem begins or ends.
+        clock: returns seconds, for tests.
+    """
+
+    def __init__(self, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self.tell, self._clock = tell, clock
+        self._reported: set[str] = set()
+        self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
+        self._damage = UnusableMessages()
+        self._notes: dict[str, str] = {}  # subject -> its sentence, while it holds
+
+    # --- messages ------------------------------------------------------------------------------
+
+    @property
+    def received(self) -> Counter[str]:
+        """Messages since the start, by topic."""
+        return Counter({name: topic.count for name, topic in self._topics.items()})
+
+    @property
+    def volume(self) -> Counter[str]:
+        """Bytes since the start, by topic."""
+        return Counter({name: topic.bytes for name, topic in self._topics.items()})
+
+    def count(self, topic: str, size: int) -> bool:
+        """Count a message. Return whether it is the first of its topic."""
+        arrivals = self._topics[topic]
+        arrivals.count += 1
+        arrivals.bytes += size
+        arrivals.times.append(self._clock())
+        return arrivals.count == 1
+
+    def mark_usable(self, topic: str) -> None:
+        """Record that a message of a topic could be used."""
+        arrivals = self._topics[topic]
+        arrivals.row = 0
+        self.report(f"{topic} unusable", "", f"{topic}: its messages can be used again")
+
+    def mark_unusable(self, topic: str, reason: str) -> None:
+        """Record a message that cannot be used. The reason names the topic."""
+        arrivals = self._topics[topic]
+        arrivals.row += 1
+        if self._damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
+            self.report(f"{topic} unusable", f"a message cannot be used: {reason}")
+
+    def silent_for(self, topic: str) -> float:
+        """Return the seconds since the last message of a stream, or 0 if that is a usual time."""
+        if topic not in self._topics or len(self._topics[topic].times) < STREAM:
+            return 0.0
+        times = self._topics[topic].times
+        steps = [after - before for before, after in zip(times, list(times)[1:], strict=False)]
+        silent = self._clock() - times[-1]
+        return silent if silent > max(SILENCE, 5 * median(steps)) else 0.0
+
+    def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
+        """Return the state of each topic, given whether it has a publisher."""
+        return {name: self._state(name, is_published) for name, is_published in published.items()}
+
+    def _state(self, topic: str, published: bool) -> TopicState:
+        if not published:
+            return "no publisher"
+        if self.silent_for(topic):
+            return "silent"
+        return "unusable" if topic in self._topics and self._topics[topic].row else "ok"
+
+    # --- current problems ----------------------------------------------------------------------
+
+    def report(self, about: str, text: str, over: str = "") -> None:
+        """Report ``text`` when it begins to hold, and ``over`` when ``text`` is empty again."""
+        before = self._notes.pop(about, "")
+        if text:
+            self._notes[about] = text
+        if text != before and (text or over):
+            self.tell(text or over)
+
+    def report_once(self, text: str) -> None:
+        """Report a sentence the first time, and never again."""
+        if text not in self._reported:
+            self._reported.add(text)
+            self.tell(text)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences that hold now, followed by the counts of unusable messages."""
+        holds = [text for about, text in self._notes.items() if not about.endswith(" unusable")]
+        return [*holds, *self._damage.sentences]
+
+
+class Inputs:
+    """Roles of the topics, and a handler for each topic with a role. Only the receiving thread may use it.
+
+    Args:
+        config: states topics and synchronisation.
+        resolve: returns the name on the graph of a topic that the user states.
+        watch: takes reports of problems.
+        results: also the robot's bird's-eye view and obstacles have roles.
+    """
+
+    def __init__(
+        self, config: Config, resolve: Callable[[str], str], watch: TopicWatch, *, results: bool
+    ) -> None:
+        self._config, self._resolve, self._watch, self._results = config, resolve, watch, results
+        self.roles = Roles()
+        self.sync = Synchronizer(self.roles, config)
+        self.handlers: dict[str, Handler[LiveMessage]] = {}
+        self.frame_ids: dict[str, str] = {}  # topic -> frame id of its first message
+        self.changed = time.monotonic()  # seconds, last change of roles
+        self._ousters = OusterSensors()
+
+    @cached_property
+    def stated(self) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Topics of the configuration, each with its key and its permitted types. None: any type."""
+        source, images = self._source, ("Image", "CompressedImage")
+        stated: dict[str, tuple[str, tuple[str, ...]]] = {}
+        for key, names, kinds in (
+            ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
+            ("source.camera_topics", source.camera_topics, images),
+            ("source.camera_info_topics", source.camera_info_topics, images),
+            ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
+            ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
+            ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
+        ):
+            stated |= dict.fromkeys(names, (key, kinds))
+        return stated | {name: (key, (STAGE_KINDS[key],)) for key, name in self._stages.items()}
+
+    @cached_property
+    def _source(self) -> SourceConfig:
+        """The configuration with the topic names on the graph."""
+        config, resolve = self._config.source, self._resolve
+        infos, boxes = config.camera_info_topics, config.boxes
+        return config.model_copy(
+            update={
+                "lidar_topics": tuple(map(resolve, config.lidar_topics)),
+                "camera_topics": tuple(map(resolve, config.camera_topics)),
+                "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
+                "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
+                "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
+                "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
+            }
+        )
+
+    @cached_property
+    def _stages(self) -> dict[str, str]:
+        """Topics whose messages replace a stage, by key."""
+        return {key: self._resolve(name) for key, name in stage_topics(self._config).items()}
+
+    def misstated(self, topics: Iterable[PublishedTopic]) -> dict[str, str]:
+        """Return the stated topics that nobody publishes, or that have another type, with the problem."""
+        problems = {}
+        published = {topic.name: topic for topic in self._describe(topics)}
+        for name, (key, kinds) in self.stated.items():
+            topic = published.get(name)
+            if topic is None:
+                problems[name] = f"nobody publishes {name}, which {key} states"
+            elif topic.aside and "PointCloud2" in kinds:
+                problems[name] = f"{name}, which {key} states, holds {topic.aside}"
+            elif kinds and topic.kind not in kinds:
+                problems[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
+        return problems
+
+    def candidates(self, topics: Mapping[str, PublishedTopic]) -> dict[str, PublishedTopic]:
+        """Return the topics that may have a role, or may hold sensor data in an unsupported form."""
+        packets = [name for name, topic in topics.items() if ouster.is_packet(topic.type)]
+        besides = {self._source.boxes.get("topic"), *map(ouster.metadata_topic, packets)}
+        return {name: topic for name, topic in topics.items() if name in besides or _concerns(topic)}
+
+    def assign(self, known: Mapping[str, PublishedTopic]) -> bool:
+        """Assign roles to the candidates. Return False if they do not fit the configuration."""
+        stated, topics = self._source, self._describe(known.values())
+        if stated.lidar_topics:  # packets without metadata do not have a role yet
+            topics = [t for t in topics if not (t.aside and t.name in stated.lidar_topics)]
+        names = {topic.name for topic in topics}
+        # An absent topic of a stage is waited for, as an absent sensor is.
+        stages = {key: name for key, name in self._stages.items() if name in names}
+        try:
+            roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
+        except UserError as error:
+            self._watch.report("roles", str(error))
+            return False
+        self._watch.report("roles", "", "the topics fit the configuration")
+        if replace(roles, notes={}) != replace(self.roles, notes={}):
+            self.changed = time.monotonic()
+            results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
+            former, self.sync = self.sync, Synchronizer(roles, self._config, beside=results)
+            self.sync.take_over(former)
+            self.handlers = make_handlers(self.sync, roles, self._decode)
+            for name in self._ousters.packets & self.handlers.keys():
+                self.handlers[name] = partial(self._gather, self.handlers[name])
+        elif roles.around != self.roles.around:
+            others = self.handlers.keys() - {topic for topic, _, _ in self.roles.around}
+            self.handlers = {topic: self.handlers[topic] for topic in others}
+            self.handlers |= make_around_handlers(self.sync, roles, LiveMessage.decode)
+        self.roles = roles
+        metadata_topics = [name for name in self._ousters.metadata if name in known]
+        self.handlers |= dict.fromkeys(metadata_topics, self._add_metadata)
+        return True
+
+    def handle(self, message: LiveMessage) -> bool:
+        """Pass a message to its handler. Return whether roles must be assigned again.
+
+        Raises:
+            UserError: the message cannot be used.
+        """
+        if (handler := self.handlers.get(message.topic)) is not None:
+            handler(message)
+        return message.topic in self._ousters.metadata
+
+    def _describe(self, topics: Iterable[PublishedTopic]) -> list[Topic]:
+        boxes = self._source.boxes.get("topic", "")
+        known = [
+            Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
+        ]
+        return [self._ousters.describe(topic, self._source.lidar_calibration) for topic in known]
+
+    def _add_metadata(self, message: LiveMessage) -> None:
+        text = guard(message, surroundings.decode_mark, message.decode())
+        if self._ousters.add_metadata(message.topic, text):
+            self._watch.tell(f"the metadata on {message.topic} have changed")
+
+    def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
+        """Gather packets to scans and pass these on. A scan has the time of receipt of its last packet."""
+        sensor = self._ousters.sensor(message.topic)
+        for packets in self._ousters.add_packet(message.topic, message.received, message.data):
+            handler(replace(message, received=packets[-1][0], data=b"", sensor=sensor, packets=packets))
+
+    def _decode(self, message: LiveMessage) -> Any:
+        """Decode a message with the calibration of the configuration."""
+        return message.decode(self._source.lidar_calibration)
+
+
+def _concerns(topic: PublishedTopic) -> bool:
+    """Return whether a topic may have a role, or may hold sensor data in an unsupported form."""
+    return (
+        topic.type in KINDS
+        or declared_decoder(topic.type) is not None
+        or holds_boxes(topic.type)
+        or bool(unsupported_reason(Topic(topic.name, topic.type, None, "")))
+    )
+
+
+def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Topic], SourceConfig]:
+    """Remove stated topics that are absent, and the topics that could take over their roles.
+
+    A stated topic that is absent is waited for. No other topic may take its role meanwhile.
+    """
+    names = {topic.name for topic in topics}
+    changes: dict[str, Any] = {}
+    for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
+        stated_names = getattr(config, key)
+        changes[key] = tuple(name for name in stated_names if name in names)
+        if stated_names and not changes[key]:
+            topics = [topic for topic in topics if topic.kind not in kinds]
+    changes["camera_info_topics"] = {
+        image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
+    }
+    if config.boxes.get("topic", "") not in names:
+        changes["boxes"] = {}
+    changes["lidar_calibration"] = {
+        name: file for name, file in config.lidar_calibration.items() if name in names
+    }
+    if config.odometry_topic and config.odometry_topic not in names:
+        changes["odometry_topic"] = ""
+        topics = [topic for topic in topics if topic.kind != "Odometry"]
+    return topics, config.model_copy(update=changes)
