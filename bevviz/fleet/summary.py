@@ -43,24 +43,6 @@ class BagTotals:
         return iso(self.first)[:19].replace("T", " ")
 
 
-@dataclass(frozen=True, slots=True)
-class WorstFrame:
-    """Row of the page. ``address`` and ``command`` open the frame in a browser and in a terminal."""
-
-    kind: str
-    badness: float
-    recording: str
-    number: int
-    stamp: str
-    clocks: str
-    remarks: Sequence[str]
-    more: int  # number of remarks not shown
-    address: str
-    command: str
-    picture: bytes | None  # JPEG of the first camera
-    above: bytes | None  # JPEG of the bird's-eye view
-
-
 def page(
     title: str,
     bags: Sequence[BagTotals],
@@ -92,23 +74,24 @@ def page(
     )
 
 
-def _worst_frame(row: Mapping[str, Any], viewer: str) -> WorstFrame:
+def _worst_frame(row: Mapping[str, Any], viewer: str) -> dict[str, Any]:
+    """Return a row of the page. ``address`` opens the frame in a browser, ``command`` in a terminal."""
     stamp = iso(row["stamp"])
     address, command = _opened_by(row["link"], row["recording"], stamp, viewer)
-    return WorstFrame(
-        kind=severity(row),
-        badness=row["badness"],
-        recording=row["recording"],
-        number=row["frame"],
-        stamp=stamp,
-        clocks=f"sync {_ms(row['sync_error_ms'])}, TF {_ms(row['tf_age_ms'])}",
-        remarks=row["remarks"][:SHOWN],
-        more=max(0, len(row["remarks"]) - SHOWN),
-        address=address,
-        command=command,
-        picture=row["picture"],
-        above=row["above"],
-    )
+    return {
+        "kind": severity(row),
+        "badness": row["badness"],
+        "recording": row["recording"],
+        "number": row["frame"],
+        "stamp": stamp,
+        "clocks": f"sync {_ms(row['sync_error_ms'])}, TF {_ms(row['tf_age_ms'])}",
+        "remarks": row["remarks"][:SHOWN],
+        "more": max(0, len(row["remarks"]) - SHOWN),
+        "address": address,
+        "command": command,
+        "picture": row["picture"],
+        "above": row["above"],
+    }
 
 
 def _opened_by(link: str | None, recording: str, stamp: str, viewer: str) -> tuple[str, str]:
@@ -145,18 +128,12 @@ def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple
     return frames.sort_by(order), bags
 
 
-def head(frames: pa.Table, count: int) -> list[dict[str, Any]]:
-    """Return the first rows, with stamps in nanoseconds."""
-    at = frames.schema.get_field_index("stamp")
-    stamps = frames["stamp"].cast(pa.int64())
-    rows: list[dict[str, Any]] = frames.set_column(at, "stamp", stamps).slice(0, count).to_pylist()
-    return rows
-
-
 def _totals(name: str, info: RunInfo, bag_frames: pa.Table) -> BagTotals:
     stamps = np.sort(bag_frames["stamp"].to_numpy().astype(np.int64))
     times = bag_frames["time_ms_total"].to_numpy()
     counts = [field.name for field in SCHEMA if field.type == pa.int32()]
+    columns = ["failures", "problems", "missed", "false", "anomalies", "unmatched"]
+    kinds = Counter(severity(row) for row in bag_frames.select(columns).to_pylist())
     return BagTotals(
         name=name,
         info=info,
@@ -165,15 +142,9 @@ def _totals(name: str, info: RunInfo, bag_frames: pa.Table) -> BagTotals:
         totals={count: int(bag_frames[count].to_numpy().sum(dtype=np.int64)) for count in counts},
         median_ms=float(np.median(times)),
         p95_ms=float(np.percentile(times, 95)),
-        kinds=_kinds(bag_frames),
+        kinds={kind: kinds[kind] for kind in SEVERITIES},
         worst=float(bag_frames["badness"].to_numpy().max()),
     )
-
-
-def _kinds(bag_frames: pa.Table) -> dict[str, int]:
-    columns = ["failures", "problems", "missed", "false", "anomalies", "unmatched"]
-    counts = Counter(severity(row) for row in bag_frames.select(columns).to_pylist())
-    return {kind: counts[kind] for kind in SEVERITIES}
 
 
 def write_summary(
@@ -196,7 +167,9 @@ def write_summary(
     """
     frames, bags = collect(results, link)
     path = folder / f"{NAME}.html"
-    text = page(folder.resolve().name, bags, head(frames, top), failed, viewer)
+    stamp_column = frames.schema.get_field_index("stamp")
+    in_nanoseconds = frames.set_column(stamp_column, "stamp", frames["stamp"].cast(pa.int64()))
+    text = page(folder.resolve().name, bags, in_nanoseconds.slice(0, top).to_pylist(), failed, viewer)
     with atomic_write(folder / f"{NAME}.parquet", "summary") as file:
         pq.write_table(frames, file.path)
     save_text(path, text, "-o")
