@@ -256,27 +256,37 @@ class Tally:
             )
 
     def figures(self) -> dict[str, str]:
+        """Return the figures by name. Shares have their 95 % interval, from a bootstrap over frames."""
         objects, cars = self.objects, [v for v in self.objects if v.label.kind == "Car"]
         people = [v for v in self.objects if v.label.kind in ("Pedestrian", "Person_sitting")]
-        near = [v for v in objects if v.distance <= FOUND]
-        errors = [v.distance for v in near]
+        errors = [v.distance for v in objects if v.distance <= FOUND]
         wrong = [b for b in self.boxes if b.nearest > FOUND]
         return {
-            "found within 2 m": _of(len(near), len(objects)),
+            "found within 2 m": _share([(v.frame, v.distance <= FOUND) for v in objects]),
             "error, median m": f"{np.median(errors):.2f}" if errors else "-",
             "90 % m": f"{np.quantile(errors, 0.9):.2f}" if errors else "-",
-            "IoU 0.5": _of(sum(v.iou >= 0.5 for v in objects), len(objects)),
-            "cars 0.5": _of(sum(v.iou >= 0.5 for v in cars), len(cars)),
-            "cars 0.7": _of(sum(v.iou >= 0.7 for v in cars), len(cars)),
-            "people 1 m": _of(sum(v.distance <= 1 for v in people), len(people)),
-            "wrong": _of(len(wrong), len(self.boxes)),
+            "IoU 0.5": _share([(v.frame, v.iou >= 0.5) for v in objects]),
+            "cars 0.5": _share([(v.frame, v.iou >= 0.5) for v in cars]),
+            "cars 0.7": _share([(v.frame, v.iou >= 0.7) for v in cars]),
+            "people 0.5": _share([(v.frame, v.iou >= 0.5) for v in people]),
+            "wrong": _share([(b.frame, b.nearest > FOUND) for b in self.boxes]),
             "wrong, unlabelled ground aside": str(sum(not b.ignored for b in wrong)),
             "largest": f"{max((b.size.max() for b in self.boxes), default=0):.1f} m",
         }
 
 
-def _of(part: int, whole: int) -> str:
-    return f"{part} of {whole}"
+def _share(cases: Sequence[tuple[str, bool]]) -> str:
+    """Return how many of the cases hold, with the 95 % interval from a bootstrap over frames."""
+    if not cases:
+        return "0 of 0"
+    frames = sorted({frame for frame, _ in cases})
+    held, total = np.zeros((2, len(frames)))
+    for frame, holds in cases:
+        held[frames.index(frame)] += holds
+        total[frames.index(frame)] += 1
+    draws = np.random.default_rng(0).integers(0, len(frames), (2000, len(frames)))
+    low, high = np.percentile(held[draws].sum(axis=1) / total[draws].sum(axis=1), (2.5, 97.5))
+    return f"{held.sum():.0f} of {total.sum():.0f} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def shots(root: Path, names: Iterable[str] | None = None) -> Iterator[Shot]:
