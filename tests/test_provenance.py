@@ -45,6 +45,7 @@ NEUTRAL = {
     "apsw": "bytes out of SQLite files",
     "backports.zstd": "lossless compression",
     "lz4": "lossless compression",
+    "mcap": "writes bags; ours reads them",
     "open3d": "the simulator, whose scans are input like any other",
     "libusb-package": "a library that open3d loads",
     "distributed": "brings jobs to other machines",

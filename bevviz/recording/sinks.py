@@ -314,19 +314,19 @@ class FileWriter(Closable):
         """
         if self._handle < 0:
             return
-        if self._write_end >= 0:
-            self.begin()
+        with suppress(OSError):  # An interrupt may have come after the end was closed, before that was noted.
+            if self._write_end >= 0:
+                self.begin()
         self._thread.join()
-        os.close(self._handle)
-        os.close(self._read_end)
+        for end in (self._handle, self._read_end):
+            with suppress(OSError):
+                os.close(end)
         self._handle = -1
 
     def _run(self) -> None:
         buffer = memoryview(bytearray(BUFFER_BYTES))
-        size, message_end = (
-            0,
-            HEADER_BYTES,
-        )  # bytes in the buffer, and up to the end of its last known message
+        size = 0  # bytes in the buffer
+        message_end = HEADER_BYTES  # bytes up to the end of the last message seen so far
         while count := os.readv(self._read_end, [buffer[size:]]):
             size += count
             complete = 0

@@ -31,6 +31,8 @@ CustomPoint[] points      # Pointcloud data
 
 def messages(ros1: bool, package: str, point: str = POINT) -> bags.Messages:
     found = bags.Messages(ros1)
+    for name in [name for name in found.store.fielddefs if name.startswith(f"{package}/")]:
+        del found.store.fielddefs[name]  # the definition of a former driver may differ
     types = get_types_from_msg(point, f"{package}/msg/CustomPoint")
     found.store.register(types | get_types_from_msg(CUSTOM, f"{package}/msg/CustomMsg"))
     return found
