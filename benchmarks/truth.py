@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, I64
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import (
     ClusterState,
     Decision,
@@ -26,7 +27,6 @@ from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.synthetic.drive import IMAGE_DELAY, START, TRUTH_RANGE
 from bevviz.synthetic.mesh import Material, Mesh, merge
 from bevviz.synthetic.sensors import Caster, Lidar, RaycastView
-from bevviz.why.verdict import Reason
 
 IN_VIEW = 0.1  # share of an object's surface that lies in the direction of the image
 FEW = 3  # points that are as good as none
@@ -63,7 +63,7 @@ class Scene:
 class Cause:
     """What the rule says of an object."""
 
-    reason: Reason
+    reason: ReasonKind
     reported: bool
 
 
@@ -197,7 +197,7 @@ class Rule:
                     if right:
                         return Cause(self._flaw(row, j, k), True)
                     if not self._own(row, DetectionState.KEPT):
-                        return Cause(Reason.MISNAMED, False)
+                        return Cause(ReasonKind.MISNAMED, False)
         return Cause(self._loss(row), False)
 
     def _stands_for(self, row: int, j: int, k: int) -> bool:
@@ -210,37 +210,37 @@ class Rule:
             return False
         return all(self._purity(row, k) > self._purity(mate, k) for mate in mates)
 
-    def _flaw(self, row: int, j: int, k: int) -> Reason:
+    def _flaw(self, row: int, j: int, k: int) -> ReasonKind:
         d = int(self.objects.detection[j])
         matched = self.fusion.cluster_decision == Decision.MATCHED
         names_several = int((matched & (self.fusion.cluster_detection == d)).sum()) > 1
         if self._mates(row, k) or self._purity(row, k) < MOST:
-            return Reason.MERGED
+            return ReasonKind.MERGED
         if self.owner[d] != row:
-            return Reason.BORROWED
+            return ReasonKind.BORROWED
         if names_several:
-            return Reason.SHARED_BOX
+            return ReasonKind.SHARED_BOX
         labels = self._of(row)
         clustered = labels[labels >= 0]
         if (clustered == k).sum() < WHOLE * len(clustered):
-            return Reason.SPLIT
-        return Reason.REPORTED
+            return ReasonKind.SPLIT
+        return ReasonKind.REPORTED
 
-    def _loss(self, row: int) -> Reason:
+    def _loss(self, row: int) -> ReasonKind:
         scene, labels = self.scene, self._of(row)
         if scene.in_view[row] < IN_VIEW:
-            return Reason.OUT_OF_VIEW
+            return ReasonKind.OUT_OF_VIEW
         if scene.points[row] < FEW:
-            return Reason.HIDDEN if scene.blocked[row] > MOST else Reason.NO_POINTS
+            return ReasonKind.HIDDEN if scene.blocked[row] > MOST else ReasonKind.NO_POINTS
         ground, noise = int((self.ground_object == scene.number[row]).sum()), int((labels < 0).sum())
         found = np.flatnonzero([self._is_in(row, k) for k in range(len(self.clusters))])
         kept = found[self.clusters.state[found] == ClusterState.KEPT]
         if len(kept) == 0:
             held = [int((labels == k).sum()) for k in found]
             if not held or max(held) < max(ground, noise):
-                return Reason.GROUND if ground >= noise else Reason.NOISE
+                return ReasonKind.GROUND if ground >= noise else ReasonKind.NOISE
             small = self.clusters.state[found[int(np.argmax(held))]] == ClusterState.TOO_SMALL
-            return Reason.TOO_SMALL if small else Reason.TOO_LARGE
+            return ReasonKind.TOO_SMALL if small else ReasonKind.TOO_LARGE
         weak = self._weakness(row)
         if weak is not None:
             return weak
@@ -252,53 +252,57 @@ class Rule:
         rows = np.flatnonzero((self.owner == row) & (self.detections.state == state)).tolist()
         return [d for d in rows if self.detections.names[d] == self.labels[row]]
 
-    def _weakness(self, row: int) -> Reason | None:
+    def _weakness(self, row: int) -> ReasonKind | None:
         """Return what the detector did wrong, or None."""
         if self._own(row, DetectionState.KEPT):
             return None
         least = self.result.config.detector.conf_threshold
         suppressed = self._own(row, DetectionState.SUPPRESSED)
         if any(self.detections.score[d] >= least for d in suppressed):
-            return Reason.SUPPRESSED
+            return ReasonKind.SUPPRESSED
         if suppressed or self._own(row, DetectionState.BELOW_THRESHOLD):
-            return Reason.BELOW_THRESHOLD
-        return Reason.NOT_DETECTED
+            return ReasonKind.BELOW_THRESHOLD
+        return ReasonKind.NOT_DETECTED
 
-    def _refusal(self, row: int, main: int, ground: int, noise: int) -> Reason:
+    def _refusal(self, row: int, main: int, ground: int, noise: int) -> ReasonKind:
         """Of what has a cluster and a detection."""
         d = self._own(row, DetectionState.KEPT)[0]
         labels = self._of(row)
         if self._purity(row, main) < MOST:
-            return Reason.MERGED
+            return ReasonKind.MERGED
         inside, total = int((labels == main).sum()), len(labels) + ground
         taken = int(self.fusion.cluster_detection[main])
         if self.fusion.cluster_decision[main] == Decision.MATCHED and self.owner[taken] in self._mates(
             row, main
         ):
-            return Reason.MERGED
+            return ReasonKind.MERGED
         reason = self._pair(d, main)
-        if reason in (Reason.LOW_OVERLAP, Reason.TOO_FEW_POINTS) and inside < MOST * total:
+        if reason in (ReasonKind.LOW_OVERLAP, ReasonKind.TOO_FEW_POINTS) and inside < MOST * total:
             other = total - inside - ground - noise
-            worst = max((ground, Reason.GROUND), (noise, Reason.NOISE), (other, Reason.SPLIT))
+            worst = max((ground, ReasonKind.GROUND), (noise, ReasonKind.NOISE), (other, ReasonKind.SPLIT))
             return worst[1]
         return reason
 
-    def _pair(self, d: int, k: int) -> Reason:
+    def _pair(self, d: int, k: int) -> ReasonKind:
         """Return what the fusion's rules say about a detection and a cluster."""
         config, pairs = self.result.config.fusion, self.fusion.pairs
         (rows,) = np.nonzero((pairs.detection == d) & (pairs.cluster == k))
         if config.method == "centroid":
             far = len(rows) == 0 or pairs.distance[rows[0]] > config.match_radius
-            return Reason.TOO_FAR if far else Reason.TAKEN
+            return ReasonKind.TOO_FAR if far else ReasonKind.TAKEN
         if len(rows) == 0 or pairs.points[rows[0]] < config.min_points:
-            return Reason.TOO_FEW_POINTS
+            return ReasonKind.TOO_FEW_POINTS
         if pairs.depth[rows[0]] > config.max_depth:
-            return Reason.TOO_FAR
+            return ReasonKind.TOO_FAR
         if pairs.iou[rows[0]] < config.min_iou:
-            return Reason.LOW_OVERLAP
+            return ReasonKind.LOW_OVERLAP
         if self.fusion.detection_decision[d] == Decision.MISFIT:
-            return Reason.MISFIT
-        return Reason.OTHER_CLUSTER if self.fusion.detection_decision[d] == Decision.MATCHED else Reason.TAKEN
+            return ReasonKind.MISFIT
+        return (
+            ReasonKind.OTHER_CLUSTER
+            if self.fusion.detection_decision[d] == Decision.MATCHED
+            else ReasonKind.TAKEN
+        )
 
 
 def _majority(voxel: I32, owner: I32, count: int) -> I32:

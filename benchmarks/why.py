@@ -21,11 +21,12 @@ from benchmarks.pages import write_section
 from benchmarks.truth import Cause, Rule, Scene, scene_of
 from bevviz.config import Config, changed_config, load
 from bevviz.evaluate import MIN_HITS, RANGE
+from bevviz.model.reasons import ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.verdict import HOPELESS, Reason
+from bevviz.why.verdict import HOPELESS
 
 CLASSES = ("person", "cyclist", "car")
 MIN_HEIGHT = 20  # visible pixels in height of what is asked for by its place in the image
@@ -52,7 +53,7 @@ def configurations() -> dict[str, Config]:
 class Tally:
     """Counts of one configuration."""
 
-    verdicts: dict[Reason, Counter[str]] = field(
+    verdicts: dict[ReasonKind, Counter[str]] = field(
         default_factory=lambda: defaultdict(Counter)
     )  # by the rule's
     near: Counter[str] = field(default_factory=Counter)  # of what ought to be seen
@@ -63,7 +64,7 @@ class Tally:
     seconds: list[float] = field(default_factory=list)  # of processor time, of a question
     hint_seconds: list[float] = field(default_factory=list)
 
-    def of(self, reasons: Sequence[Reason]) -> Counter[str]:
+    def of(self, reasons: Sequence[ReasonKind]) -> Counter[str]:
         """Verdicts on what the rule gives one of these reasons for."""
         return sum((self.verdicts[reason] for reason in reasons), Counter())
 
@@ -97,7 +98,7 @@ class Bench:
             cause = rule.cause(row)
             answer = self._asked(known, Selection(truth=row))
             self._verdict(answer, cause, about)
-            if answer.verdict.reason is not Reason.REPORTED and answer.verdict.reason not in HOPELESS:
+            if answer.verdict.kind is not ReasonKind.REPORTED and answer.verdict.kind not in HOPELESS:
                 self._hint(known, answer, again, row, about)
             x0, y0, x1, y1 = scene.pixels[row].tolist()
             if y1 - y0 >= MIN_HEIGHT:
@@ -112,7 +113,7 @@ class Bench:
         return answer
 
     def _verdict(self, answer: Answer, cause: Cause, about: str) -> None:
-        right = (answer.verdict.reason, answer.verdict.reported) == (cause.reason, cause.reported)
+        right = (answer.verdict.kind, answer.verdict.reported) == (cause.reason, cause.reported)
         for counts in (
             self.tally.verdicts[cause.reason],
             *([self.tally.near] if _is_near(answer, cause) else []),
@@ -129,7 +130,7 @@ class Bench:
             self.tally.hints.update(none=1)
             return
         after = again.with_settings(hints[0].settings).cause(row)
-        holds = after.reported and after.reason is Reason.REPORTED
+        holds = after.reported and after.reason is ReasonKind.REPORTED
         self.tally.hints.update(given=1, hold=int(holds))
         if not holds:
             self.tally.wrong.append(f"{about}: {', '.join(hints[0].settings)} leaves it {_said(after)}")
@@ -150,7 +151,7 @@ class Bench:
         """As somebody asks who draws a box around it in a recording that has no ground truth."""
         verdict = self._asked(blind, Selection(box=box)).verdict
         reported = verdict.reported == cause.reported
-        right = reported and verdict.reason is cause.reason
+        right = reported and verdict.kind is cause.reason
         self.tally.blind.update(asked=1, reported=int(reported), right=int(right))
         if not right:
             self.tally.wrong.append(f"{about}, without truth: {_said(cause)}, not: {verdict.text}")
@@ -223,7 +224,7 @@ def main() -> None:
 
 def section_of(tallies: Mapping[str, Tally], what: str) -> str:
     """Format the section of docs/performance.md."""
-    visible = [reason for reason in Reason if reason not in HOPELESS]
+    visible = [reason for reason in ReasonKind if reason not in HOPELESS]
     mistuned = ", ".join(f"`{setting}`" for setting in MISTUNED)
     lines = [
         HEADING,
@@ -272,7 +273,7 @@ def details_of(tallies: Mapping[str, Tally]) -> str:
         lines.append(f"| box, no truth: the reason, too | {_row(name, tally.blind)}")
     lines += ["\n| reason, by the rule | " + " | ".join(f"{name} | right" for name in tallies) + " |"]
     lines.append("| --- |" + " ---: | ---: |" * len(tallies))
-    for reason in Reason:
+    for reason in ReasonKind:
         known = [tally.verdicts[reason] for tally in tallies.values()]
         if any(counts["asked"] for counts in known):
             cells = " | ".join(f"{counts['asked']} | {counts['right']}" for counts in known)

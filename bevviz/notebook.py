@@ -17,9 +17,9 @@ from bevviz.recording import blueprints, entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.recorder import Recorder
 from bevviz.recording.sinks import APPLICATION
+from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.why.pick import Pick, pick
-from bevviz.why.pick_answers import selection_of
+from bevviz.why.selection import Selection
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer, ViewerEvent
@@ -53,7 +53,7 @@ class Selected:
     """
 
     frame: int
-    pick: Pick | None
+    pick: Selection | None
     path: str
     place: tuple[float, ...] = ()
 
@@ -69,10 +69,10 @@ class Selected:
         if self.pick is None:
             raise UserError(f"nothing can be asked about {self.path}: click on a box, a point or a pixel")
         if same or not self.place:
-            return selection_of(self.pick)
+            return self.pick
         if len(self.place) == 2:
-            return selection_of(Pick("pixel", camera=self.pick.camera, place=self.place))
-        return selection_of(Pick("point", place=self.place))
+            return Selection(box=self.place, camera=self.pick.camera)
+        return Selection(point=self.place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,9 @@ class NotebookViewer(Recorder):
         click = self._click
         if click is None:
             return None
-        picked = pick(result, self._tracks.get(click.frame), click.path, click.instance, click.position)
+        picked = select_click(
+            result, self._tracks.get(click.frame), click.path, click.instance, click.position
+        )
         return Selected(click.frame, picked, click.path, _place(result, picked))
 
     def mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
@@ -211,7 +213,7 @@ def _viewer(recording: rr.RecordingStream, layout: Blueprint) -> Viewer:
         ) from None
 
 
-def _place(result: FrameResult, picked: Pick | None) -> tuple[float, ...]:
+def _place(result: FrameResult, picked: Selection | None) -> tuple[float, ...]:
     """Return the centre of an object identified by its row in a result. Empty for any other pick."""
     if picked is None:
         return ()

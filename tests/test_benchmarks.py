@@ -19,9 +19,10 @@ from benchmarks.truth import Rule, scene_of
 from benchmarks.why import Bench, ask_all, configurations, details_of, section_of
 from bevviz.bags.bag import Recording
 from bevviz.cli import main
+from bevviz.model.reasons import ReasonKind
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
-from bevviz.why.verdict import HOPELESS, Reason
+from bevviz.why.verdict import HOPELESS
 from tests.support import bags
 from tests.support.planted_faults import at, drive, planted
 from tests.support.planted_faults import run as run_fault
@@ -103,7 +104,9 @@ def test_memory_is_that_of_the_program_alone() -> None:
 def test_why_is_right_about_objects_and_its_hints_hold() -> None:
     """Two frames of a fixed drive, three configurations; the whole of it is in docs/performance.md."""
     tallies = ask_all([1040], frames=31, every=30)
-    every = [tally.of([reason for reason in Reason if reason not in HOPELESS]) for tally in tallies.values()]
+    every = [
+        tally.of([reason for reason in ReasonKind if reason not in HOPELESS]) for tally in tallies.values()
+    ]
     asked, right = (sum(counts[key] for counts in every) for key in ("asked", "right"))
     assert asked >= 100 and right / asked >= 0.95
     given, hold = (sum(tally.hints[key] for tally in tallies.values()) for key in ("given", "hold"))
@@ -115,20 +118,20 @@ def test_the_rule_judges_answers_about_planted_faults(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     reasons = {
-        "hidden_person": ("person", 16.3, Reason.HIDDEN),
-        "flat_car": ("car", 10.0, Reason.GROUND),
-        "merged_people": ("person", 9.9, Reason.MERGED),
-        "shared_box": ("person", 8.7, Reason.SHARED_BOX),
+        "hidden_person": ("person", 16.3, ReasonKind.HIDDEN),
+        "flat_car": ("car", 10.0, ReasonKind.GROUND),
+        "merged_people": ("person", 9.9, ReasonKind.MERGED),
+        "shared_box": ("person", 8.7, ReasonKind.SHARED_BOX),
     }
     for name, (label, ahead, reason) in reasons.items():
         preset = "lidar" if name == "merged_people" else "reference"
         scene = scene_of(drive(), at(name))
         rule = Rule(at(name), scene, run_fault(name, preset))
         assert {rule.cause(row).reason for row in planted(name, label, ahead)} == {reason}
-    monkeypatch.setattr("bevviz.why.answer.find_reason", lambda *_: (Reason.NOISE, False))
+    monkeypatch.setattr("bevviz.why.verdict._Decider.decide", lambda _: (ReasonKind.NOISE, False))
     bench = Bench(configurations()["default"], StageLoader())
     bench.frame(at("flat_car"), scene_of(drive(), at("flat_car")), "frame")
-    noise, all_ = bench.tally.of([Reason.NOISE]), bench.tally.of([*Reason])
+    noise, all_ = bench.tally.of([ReasonKind.NOISE]), bench.tally.of([*ReasonKind])
     assert noise["right"] == noise["asked"] == all_["right"] and len(bench.tally.wrong) > 50
 
 

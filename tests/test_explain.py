@@ -1,4 +1,4 @@
-"""Sentences, word for word."""
+"""Sentences of decisions, word for word."""
 
 from __future__ import annotations
 

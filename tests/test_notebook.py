@@ -16,7 +16,7 @@ from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.notebook import NotebookViewer
 from bevviz.recording import entities
-from bevviz.why.pick import Pick
+from bevviz.why import Selection
 
 pytest.importorskip("rerun_notebook")
 
@@ -109,7 +109,7 @@ def test_rows_are_those_of_the_run_that_is_shown(drive: Drive) -> None:
     drive.configure("clustering.min_cluster_points=100000")
     selected = drive.selected
     assert selected is not None
-    assert selected.pick == Pick("object", row)
+    assert selected.pick == Selection(object=row)
     (now,) = drive.why(hints=0)
     assert now.subject.box is not None
     assert now.subject.kind == "point"

@@ -27,6 +27,7 @@ from bevviz.model.colors import OPINION_COLORS as OPINION_COLORS
 from bevviz.model.counts import OPINIONS
 from bevviz.model.decisions import explain
 from bevviz.model.frame import F32, Boxes3D, Camera, LabelledBoxes3D
+from bevviz.model.reasons import ReasonKind, owner_of
 from bevviz.model.results import Explanation, FrameResult, Objects, Opinion, Opinions
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
@@ -40,9 +41,7 @@ from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.sweep.run import SweepOutcome
 from bevviz.synthetic import SyntheticSource
 from bevviz.why import FrameExplainer, Selection
-from bevviz.why.pick import Pick, pick
-from bevviz.why.stage_owner import owner_of
-from bevviz.why.verdict import Reason
+from bevviz.why.click import select_click
 from bevviz.workbench.findings import find_findings
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.trials import trial_effects
@@ -469,11 +468,11 @@ def test_the_images_and_the_look_from_above_show_what_is_said(tmp_path: Path) ->
         for instance, said in enumerate(says):
             assert f": {opinion} by " in said
             row = told[said]
-            asked = Pick("object", row)
+            asked = Selection(object=row)
             if opinion == "missed":
-                asked = Pick("detection", int(fused.detection[row]), fused.camera[row])
-            assert pick(result, None, path, instance, (0.0, 0.0)) == asked
-            assert pick(result, None, entities.names(path), instance, (0.0, 0.0)) == asked
+                asked = Selection(detection=int(fused.detection[row]), camera=fused.camera[row])
+            assert select_click(result, None, path, instance, (0.0, 0.0)) == asked
+            assert select_click(result, None, entities.names(path), instance, (0.0, 0.0)) == asked
         seen[opinion] += len({*says})
     assert seen["contradicted"] >= 2 and seen["confirmed"] >= 2
     assert seen["missed"] > result.opinions.missed.sum()
@@ -538,7 +537,7 @@ def test_why_tells_what_the_method_lost_and_the_fusion_has() -> None:
     questioner = FrameExplainer(result, classes=KNOWN)
     for j in np.flatnonzero(result.opinions.missed).tolist():
         [answer] = questioner.ask(Selection(detection=int(fused.detection[j]), camera=fused.camera[j]))
-        assert answer.verdict.reason is Reason.NOT_AMONG and not answer.folded
+        assert answer.verdict.kind is ReasonKind.NOT_AMONG and not answer.folded
         named = f"named by {fused.names[j]} {fused.score[j]:.2f} of {fused.camera[j]}"
         assert f"our fusion has it: cluster {fused.cluster[j]} (" in answer.verdict.text
         assert named in answer.verdict.text
@@ -553,12 +552,12 @@ def test_why_tells_what_the_method_lost_and_the_fusion_has() -> None:
 def test_why_tells_what_a_camera_denies() -> None:
     result = without_truth(foreign())
     questioner = FrameExplainer(result, classes=KNOWN)
-    [denied] = [a for a in questioner.ask(Selection()) if a.verdict.reason is Reason.CONTRADICTED]
+    [denied] = [a for a in questioner.ask(Selection()) if a.verdict.kind is ReasonKind.CONTRADICTED]
     assert (denied.subject.kind, denied.subject.row) == ("object", 1) and denied.verdict.reported
     assert "was reported, but it is contradicted by " in denied.verdict.text
     assert denied in questioner.explain(Selection(), hints=0)  # worth a word by itself
     [confirmed] = questioner.ask(Selection(object=0))
-    assert confirmed.verdict.reason is Reason.REPORTED and ", confirmed by car " in confirmed.verdict.text
+    assert confirmed.verdict.kind is ReasonKind.REPORTED and ", confirmed by car " in confirmed.verdict.text
     [numbers] = [step.numbers for step in confirmed.steps if step.stage == "cameras"]
     assert numbers["opinion"] == "confirmed" and numbers["seen"]
     assert numbers["iou"] > numbers["least"]["iou"] == 0.3 and numbers["cluster_share"] > 0.5
@@ -568,10 +567,10 @@ def test_a_click_on_either_box_asks_about_it() -> None:
     result = foreign()
     assert result.opinions is not None
     fused, place = result.opinions.fused, (1.0, 2.0, 3.0)
-    assert pick(result, None, entities.outlines(entities.FUSED), 1, place) == Pick("object", 1)
+    assert select_click(result, None, entities.outlines(entities.FUSED), 1, place) == Selection(object=1)
     for j in range(len(fused)):
-        found = pick(result, None, entities.outlines(entities.FUSION), j, place)
-        assert found == Pick("detection", int(fused.detection[j]), fused.camera[j])
+        found = select_click(result, None, entities.outlines(entities.FUSION), j, place)
+        assert found == Selection(detection=int(fused.detection[j]), camera=fused.camera[j])
 
 
 def test_the_list_contains_doubtful_objects() -> None:

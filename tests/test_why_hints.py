@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
+from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.hints import SURE, Hint, HintSearch
-from bevviz.why.verdict import Reason
 from tests.support.planted_faults import at, run
 
 CLASSES = ("car", "person", "cyclist")
@@ -31,7 +31,7 @@ def near(preset: str) -> tuple[Answer, ...]:
     chosen = [
         a
         for a in missed
-        if (a.distance < 25 if preset == "reference" else a.verdict.reason is Reason.TOO_SMALL)
+        if (a.distance < 25 if preset == "reference" else a.verdict.kind is ReasonKind.TOO_SMALL)
     ]
     return tuple(asked.with_hints(a) for a in chosen)
 
@@ -57,10 +57,10 @@ def test_changes_that_help_together_only_are_named_together() -> None:
     for answer in both[:1]:
         (hint,) = answer.hints
         assert f"; change {', '.join(hint.settings)}: it is cluster " in answer.verdict.text
-        assert again("reference", answer).verdict.reason is Reason.REPORTED
+        assert again("reference", answer).verdict.kind is ReasonKind.REPORTED
         for setting in hint.settings:  # none of them is there for nothing
             alone = replace(answer, hints=(replace(hint, settings=(setting,)),))
-            assert again("reference", alone).verdict.reason is not Reason.REPORTED, setting
+            assert again("reference", alone).verdict.kind is not ReasonKind.REPORTED, setting
 
 
 def test_a_change_of_limits_is_named_for_a_certain_detection() -> None:
@@ -70,12 +70,12 @@ def test_a_change_of_limits_is_named_for_a_certain_detection() -> None:
     assert keys == ["clustering.min_cluster_points", "detector.conf_threshold", "fusion.min_rating"]
     after = again("default", answer)
     named = after.evidence.named
-    assert after.verdict.reason is Reason.REPORTED and named is not None
+    assert after.verdict.kind is ReasonKind.REPORTED and named is not None
     assert max(c.overlap for c in after.evidence.candidates if c.row == named.detection) >= SURE
 
 
 def test_without_a_remedy_the_tried_range_is_stated() -> None:
-    vain = [a for a in near("reference") if not a.hints and a.verdict.reason is not Reason.REPORTED]
+    vain = [a for a in near("reference") if not a.hints and a.verdict.kind is not ReasonKind.REPORTED]
     searches = [questioner("reference").search(a) for a in vain]
     assert any(search.furthest for search in searches)
     for answer, search in zip(vain, searches, strict=True):
@@ -87,7 +87,7 @@ def test_without_a_remedy_the_tried_range_is_stated() -> None:
             assert answer.verdict.text.endswith(end)
             tried = replace(answer, hints=(_as_hint(search.furthest),))
             there = again("reference", tried).verdict
-            assert (there.reason, there.reported) == (search.then, search.reported)
+            assert (there.kind, there.reported) == (search.then, search.reported)
 
 
 def _as_hint(settings: tuple[str, ...]) -> Hint:
@@ -101,12 +101,12 @@ def _as_hint(settings: tuple[str, ...]) -> Hint:
         (HintSearch((), 1), "; the change that was tried does not help."),
         (HintSearch((), 7), "; none of the 7 changes that were tried helps."),
         (
-            HintSearch((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), Reason.TAKEN),
+            HintSearch((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), ReasonKind.TAKEN),
             "; none of the 7 changes that were tried helps:"
             " with clustering.eps=0.3, fusion.min_iou=0 it is lost as 'taken'.",
         ),
         (
-            HintSearch((), 1, ("fusion.method=frustum",), Reason.SPLIT, True),
+            HintSearch((), 1, ("fusion.method=frustum",), ReasonKind.SPLIT, True),
             "; the change that was tried does not help:"
             " with fusion.method=frustum it is reported, but 'split'.",
         ),
@@ -129,7 +129,7 @@ def test_only_valid_values_are_tried(eps: float) -> None:
     asked = FrameExplainer(Session(config).run(at("flat_car").frame), classes=CLASSES)
     answer = next(a for a in asked.ask(Selection()) if a.subject.kind == "truth" and a.evidence.parts)
     odd = replace(answer, evidence=replace(answer.evidence, apart=float("nan")))
-    split = replace(odd, verdict=replace(odd.verdict, reason=Reason.SPLIT))
+    split = replace(odd, verdict=replace(odd.verdict, reason=Reason(ReasonKind.SPLIT)))
     search = asked.search(split)
     assert search.tried > 0
     assert all("nan" not in setting for hint in search.hints for setting in hint.settings)

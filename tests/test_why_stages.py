@@ -14,10 +14,10 @@ import pytest
 
 from bevviz.config import load, plugins
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.verdict import Reason
 from tests.support.planted_faults import at
 
 CLASSES = ("car", "person", "cyclist")
@@ -77,8 +77,8 @@ def ask(result: FrameResult, hints: bool = False) -> list[Answer]:
     return [questioner.with_hints(a) for a in answers[:5]] if hints else answers
 
 
-def of(answers: Sequence[Answer], reason: Reason) -> list[Answer]:
-    return [a for a in answers if a.verdict.reason is reason]
+def of(answers: Sequence[Answer], reason: ReasonKind) -> list[Answer]:
+    return [a for a in answers if a.verdict.kind is reason]
 
 
 def parameters_in(answer: Answer, *sections: str) -> list[str]:
@@ -93,10 +93,10 @@ def parameters_in(answer: Answer, *sections: str) -> list[str]:
 def test_losses_of_a_user_clustering_name_it(here: Path) -> None:
     result = Session(load(settings=["detector.model=demo", "clustering.method=somebody:cells"])).run(frame())
     assert result.failures == ()
-    lost = of(ask(result), Reason.NO_CLUSTER)
-    assert lost and not of(ask(result), Reason.NOISE)
+    lost = of(ask(result), ReasonKind.NO_CLUSTER)
+    assert lost and not of(ask(result), ReasonKind.NOISE)
     for answer in lost:
-        assert "in a cluster of somebody:cells." in answer.verdict.text
+        assert answer.verdict.reason["by"] == "somebody:cells" and not answer.verdict.reason["robot"]
         assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
 
 
@@ -113,19 +113,20 @@ def test_a_hint_may_be_a_parameter_of_a_user_stage(here: Path) -> None:
 
 def test_user_ground_and_detector_are_named(here: Path) -> None:
     flat = Session(load(settings=["detector.model=demo", "ground.method=somebody:flat"])).run(frame())
-    ground = of(ask(flat), Reason.GROUND)
-    assert ground and all("(by somebody:flat)" in a.verdict.text for a in ground)
+    ground = of(ask(flat), ReasonKind.GROUND)
+    assert ground and all(a.verdict.reason["by"] == "somebody:flat" for a in ground)
+    assert all(a.verdict.reason.limit is None for a in ground)
     assert not any(parameters_in(a, "ground.") for a in ground)
     blind = Session(load(settings=["detector.model=somebody:blind"])).run(frame())
-    unseen = of(ask(blind), Reason.NOT_DETECTED)
-    assert unseen and all("somebody:blind gave no detection" in a.verdict.text for a in unseen)
+    unseen = of(ask(blind), ReasonKind.NOT_DETECTED)
+    assert unseen and all(a.verdict.reason["by"] == "somebody:blind" for a in unseen)
 
 
 def test_a_detector_of_objects_is_not_asked_for_its_clusters(here: Path) -> None:
     result = Session(load(settings=["objects.method=somebody:pillars"])).run(frame())
     answers = ask(result, hints=True)
-    missed = of(answers, Reason.NOT_AMONG)
-    assert missed and all("not among the objects of somebody:pillars" in a.verdict.text for a in missed)
+    missed = of(answers, ReasonKind.NOT_AMONG)
+    assert missed and all(a.verdict.reason["by"] == "somebody:pillars" for a in missed)
     assert not any(parameters_in(a, "fusion.") or a.hints for a in missed)
 
 
@@ -177,7 +178,7 @@ def reported_object() -> tuple[int, int]:
     gaps = {}
     for answer in ask(ours()):
         named = answer.evidence.named
-        if answer.verdict.reason is Reason.REPORTED and named is not None and answer.distance < 25:
+        if answer.verdict.kind is ReasonKind.REPORTED and named is not None and answer.distance < 25:
             others = clusters.kept & (np.arange(len(clusters)) != named.cluster)
             away = np.linalg.norm(centre - centre[named.cluster], axis=1) - radius
             gaps[answer.subject.row, named.row] = np.min(away[others]) - radius[named.cluster]
@@ -196,17 +197,17 @@ def test_each_of_the_robots_stages_is_blamed_for_what_it_lost() -> None:
     assert objects is not None
     k, d = int(objects.cluster[j]), int(objects.detection[j])
     well = robots_answer(published(), row, *ROBOT)
-    assert well.verdict.reported and "/fused has " in well.verdict.text
+    assert well.verdict.reported and well.verdict.reason["by"] == "/fused"
     fusion = robots_answer(published(drop_object=j), row, *ROBOT)
-    assert fusion.verdict.reason is Reason.LOST_IN_FUSION
-    assert "the robot's fusion lost it: cluster " in fusion.verdict.text
-    assert "of /clusters and " in fusion.verdict.text and "of /camera_2d are there" in fusion.verdict.text
+    assert fusion.verdict.kind is ReasonKind.LOST_IN_FUSION
+    owners = [fusion.verdict.reason[section] for section in ("clustering", "detector", "objects")]
+    assert owners == ["/clusters", "/camera_2d", "/fused"]
     clustering = robots_answer(published(drop_cluster=k, drop_object=j), row, *ROBOT)
-    assert clustering.verdict.reason is Reason.NO_CLUSTER
-    assert "the robot's clustering lost it" in clustering.verdict.text
+    assert clustering.verdict.kind is ReasonKind.NO_CLUSTER
+    assert clustering.verdict.reason["robot"]
     detector = robots_answer(published(drop_detection=d, drop_object=j), row, *ROBOT)
-    assert detector.verdict.reason is Reason.NOT_DETECTED
-    assert "the robot's detector lost it: /camera_2d has no detection" in detector.verdict.text
+    assert detector.verdict.kind is ReasonKind.NOT_DETECTED
+    assert detector.verdict.reason["robot"] and detector.verdict.reason["by"] == "/camera_2d"
     for answer in (well, fusion, clustering, detector):
         assert not parameters_in(answer, "detector.", "fusion."), answer.steps
         assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
@@ -218,6 +219,6 @@ def test_our_fusion_of_the_robots_clusters_and_detections() -> None:
     objects = ours().objects
     assert objects is not None
     answer = robots_answer(published(drop_cluster=int(objects.cluster[j])), row, *ROBOT[:2])
-    assert answer.verdict.reason is Reason.NO_CLUSTER and not answer.hints
-    assert "the robot's clustering lost it" in answer.verdict.text
+    assert answer.verdict.kind is ReasonKind.NO_CLUSTER and not answer.hints
+    assert answer.verdict.reason["robot"]
     assert not parameters_in(answer, "clustering.eps", "clustering.min_points")

@@ -29,12 +29,12 @@ from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.why import Selection
-from bevviz.why.pick import Pick, pick
+from bevviz.why.click import select_click
 from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.access import persistent_token
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.findings import find_findings
-from bevviz.workbench.page_messages import controls, parse_selection, selection_text
+from bevviz.workbench.page_messages import controls
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.session import WorkbenchSession
 from tests.support.small_disk import small_disk
@@ -159,7 +159,7 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     assert result.frame.truth is not None
     (camera,), boxes = result.frame.cameras, in_points_frame(result.frame, result.frame.truth)
     around = {
-        selection_text(find.selection): [float(p) for p in box]
+        str(find.selection): [float(p) for p in box]
         for find in find_findings(result, truth_of(result.frame, result.frame.truth))
         if find.what == "missed"
         and find.selection.truth is not None
@@ -630,30 +630,32 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     weak = [row for row, is_kept in enumerate(found.kept) if not is_kept]
     aside = [row for row, is_kept in enumerate(result.clusters.kept) if not is_kept]
     assert kept and weak and aside and len(result.objects)
-    assert pick(result, None, entities.detections(name), len(kept) - 1, ()) == Pick(
-        "detection", kept[-1], name
+    assert select_click(result, None, entities.detections(name), len(kept) - 1, ()) == Selection(
+        detection=kept[-1], camera=name
     )
-    assert pick(result, None, entities.weak(name), 0, ()) == Pick("detection", weak[0], name)
-    assert pick(result, None, entities.FUSED, 0, (1, 2, 3)) == Pick("object", 0)
-    assert pick(result, None, entities.outlines(entities.FUSED), 0, (1, 2, 3)) == Pick("object", 0)
-    assert pick(result, None, entities.names(entities.detections(name)), 0, ()) == pick(
+    assert select_click(result, None, entities.weak(name), 0, ()) == Selection(detection=weak[0], camera=name)
+    assert select_click(result, None, entities.FUSED, 0, (1, 2, 3)) == Selection(object=0)
+    assert select_click(result, None, entities.outlines(entities.FUSED), 0, (1, 2, 3)) == Selection(object=0)
+    assert select_click(result, None, entities.names(entities.detections(name)), 0, ()) == select_click(
         result, None, entities.detections(name), 0, ()
     )
-    assert pick(result, None, entities.TRUTH, 2, ()) == Pick("truth", 2)
+    assert select_click(result, None, entities.TRUTH, 2, ()) == Selection(truth=2)
     lidar = result.frame.lidar
-    assert pick(result, None, entities.set_aside(lidar), 0, ()) == Pick("cluster", aside[0])
-    assert pick(result, None, entities.image(name), None, (10.5, 20.5)) == Pick(
-        "pixel", camera=name, place=(10.0, 20.0)
+    assert select_click(result, None, entities.set_aside(lidar), 0, ()) == Selection(cluster=aside[0])
+    assert select_click(result, None, entities.image(name), None, (10.5, 20.5)) == Selection(
+        box=(10.0, 20.0), camera=name
     )
-    assert pick(result, None, entities.BEV, None, (12.7, 3.2)) == Pick("cell", place=(3, 12))
+    assert select_click(result, None, entities.BEV, None, (12.7, 3.2)) == Selection(cell=(3, 12))
     point = result.frame.points[5]
-    assert pick(result, None, entities.points(lidar), 5, ()) == Pick("point", place=tuple(map(float, point)))
+    assert select_click(result, None, entities.points(lidar), 5, ()) == Selection(
+        point=tuple(map(float, point))
+    )
     fixed = (result.frame.pose @ [*point, 1])[:3]
-    in_space = pick(result, None, entities.obstacles(lidar), None, tuple(fixed))
+    in_space = select_click(result, None, entities.obstacles(lidar), None, tuple(fixed))
     assert in_space is not None
     assert in_space.place == pytest.approx(point, abs=1e-4)
-    assert pick(result, None, entities.FUSED, 10_000, ()) is None
-    assert pick(result, None, "/health/time_ms/total", None, ()) is None
+    assert select_click(result, None, entities.FUSED, 10_000, ()) is None
+    assert select_click(result, None, "/health/time_ms/total", None, ()) is None
 
 
 @pytest.mark.parametrize(
@@ -666,13 +668,13 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     ],
 )
 def test_selections_stand_in_an_address(one: Selection) -> None:
-    assert parse_selection(selection_text(one)) == one
+    assert Selection.parse(str(one)) == one
 
 
 @pytest.mark.parametrize("text", ["", "car", "truth//", "truth//nan", "pixel/zed/1", "point//1,2", "x//1"])
 def test_an_invalid_pick_is_one_line(text: str) -> None:
     with pytest.raises(UserError, match="nothing that can be asked"):
-        parse_selection(text)
+        Selection.parse(text)
 
 
 # --- what is worth a look -----------------------------------------------------------------------

@@ -10,17 +10,19 @@ import numpy as np
 
 from bevviz.evaluate import MIN_HITS, RANGE
 from bevviz.model.frame import U8
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.why.chain import Step, steps_of
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.hints import Hint, HintFinder, HintSearch
-from bevviz.why.selection import select_subjects, subjects_at_place
-from bevviz.why.sentences import verdict_of
-from bevviz.why.subject import Selection, Subject
-from bevviz.why.verdict import HOPELESS, Reason, Verdict, find_reason
+from bevviz.why.resolve import select_subjects, subjects_at_place
+from bevviz.why.selection import Selection
+from bevviz.why.sentences import make_verdict
+from bevviz.why.steps import Step, steps_of
+from bevviz.why.subject import Subject
+from bevviz.why.verdict import HOPELESS, Verdict, find_reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,15 +57,35 @@ class Answer:
     @property
     def weak(self) -> bool:
         """Whether the subject is a weak detection without an object of the ground truth."""
-        reason, best = self.verdict.reason, self.evidence.best
-        low = reason in (Reason.BELOW_THRESHOLD, Reason.SUPPRESSED)
-        low |= reason is Reason.NOT_AMONG and best is not None and not best.kept
+        kind, best = self.verdict.kind, self.evidence.best
+        low = kind in (ReasonKind.BELOW_THRESHOLD, ReasonKind.SUPPRESSED)
+        low |= kind is ReasonKind.NOT_AMONG and best is not None and not best.kept
         return self.subject.kind == "detection" and low
 
     @property
     def folded(self) -> bool:
         """Whether no setting could help: it is hidden, out of view, without points, or a weak detection."""
-        return self.verdict.reason in HOPELESS or self.weak
+        return self.verdict.kind in HOPELESS or self.weak
+
+    @property
+    def selection(self) -> Selection | None:
+        """The selection of the subject; None: it is a place or a track."""
+        subject = self.subject
+        if subject.kind not in ("truth", "object", "cluster", "detection"):
+            return None
+        return Selection.of(subject.kind, subject.row, subject.camera)
+
+    @property
+    def surroundings(self) -> Selection | None:
+        """Everything around the subject, since a click may mean another one there; None: unknown place."""
+        subject = self.subject
+        if subject.kind == "detection" and subject.xyxy is not None:
+            u0, v0, u1, v1 = (float(v) for v in subject.xyxy)
+            return Selection(box=((u0 + u1) / 2, (v0 + v1) / 2), camera=subject.camera)
+        if subject.box is not None:
+            x, y, z = (float(v) for v in subject.box.center[0])
+            return Selection(point=(x, y, z), radius=max(0.5, float(subject.box.size[0].min()) / 2))
+        return None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the answer for JSON, without the points."""
@@ -81,7 +103,7 @@ class Answer:
             "distance": None if np.isnan(self.distance) else round(self.distance, 2),
             "points": self.points,
             "reported": verdict.reported,
-            "reason": verdict.reason.value,
+            "reason": verdict.kind.value,
             "verdict": verdict.text,
             "folded": self.folded,
             "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
@@ -160,7 +182,7 @@ class FrameExplainer:
         if not everything and (selection.label or selection.one):
             answers = unfolded or answers
         elif not everything:
-            answers = [answer for answer in unfolded if answer.verdict.reason is not Reason.REPORTED]
+            answers = [answer for answer in unfolded if answer.verdict.kind is not ReasonKind.REPORTED]
         return [*map(self.with_hints, progress(answers[:hints])), *answers[hints:]]
 
     def candidates(self, selection: Selection) -> list[Answer]:
@@ -197,7 +219,7 @@ class FrameExplainer:
         search, verdict = self.search(answer), answer.verdict
         hints = search.hints
         if not hints:
-            if verdict.reason is Reason.REPORTED or answer.folded or not search.tried:
+            if verdict.kind is ReasonKind.REPORTED or answer.folded or not search.tried:
                 return answer
             text = f"{verdict.text.removesuffix('.')}; {_no_help_text(search)}."
             return replace(answer, verdict=replace(verdict, text=text))
@@ -213,7 +235,7 @@ class FrameExplainer:
             return self._answers[subject.key]
         evidence = collect_evidence(subject, self.traces)
         reason, reported = find_reason(subject, evidence, self.traces)
-        verdict = verdict_of(subject, reason, reported, evidence, self.traces)
+        verdict = make_verdict(subject, reason, reported)
         steps = tuple(steps_of(subject, evidence, self.traces))
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
         if not subject.is_place:  # The number of possible places has no limit.
@@ -253,7 +275,7 @@ def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:
         answer.folded,
         False,
         verdict.reported,
-        verdict.reason is Reason.REPORTED,
+        verdict.kind is ReasonKind.REPORTED,
         not answer.near,
         _sort_distance(answer),
     )
@@ -262,7 +284,7 @@ def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:
 def _place_rank(answer: Answer, shows: bool) -> tuple[bool, bool, int, bool, float]:
     """Return the sort key of the answers at one place."""
     kind = 2 if answer.weak else 1 if answer.subject.kind == "cluster" else 0
-    hopeless = answer.verdict.reason in HOPELESS
+    hopeless = answer.verdict.kind in HOPELESS
     return hopeless, not shows, kind, answer.verdict.reported, _sort_distance(answer)
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bevviz.evaluate import MIN_HITS, RANGE
+from bevviz.model.reasons import ReasonKind
 from bevviz.support.text import markdown, printable
 from bevviz.why.answer import Answer
 from bevviz.why.subject import count
-from bevviz.why.verdict import HOPELESS, Reason
+from bevviz.why.verdict import HOPELESS
 
 LISTED = 5  # other subjects at the place, at most
 
@@ -44,10 +45,10 @@ def summary_line(answers: Sequence[Answer]) -> str:
     """Return one line about a frame. It needs the answers about all objects, reported ones included."""
     things = [answer for answer in answers if not answer.weak]
     reported = [answer for answer in things if answer.verdict.reported]
-    flawed = [answer for answer in reported if answer.verdict.reason is not Reason.REPORTED]
-    hopeless = [answer for answer in things if answer.verdict.reason in HOPELESS]
+    flawed = [answer for answer in reported if answer.verdict.kind is not ReasonKind.REPORTED]
+    hopeless = [answer for answer in things if answer.verdict.kind in HOPELESS]
     missed = [
-        answer for answer in things if not answer.verdict.reported and answer.verdict.reason not in HOPELESS
+        answer for answer in things if not answer.verdict.reported and answer.verdict.kind not in HOPELESS
     ]
     near = [answer for answer in missed if answer.near]
     parts = [f"{len(reported)} reported" + (f" ({len(flawed)} with a flaw)" if flawed else "")]
@@ -59,7 +60,7 @@ def summary_line(answers: Sequence[Answer]) -> str:
     weak = len(answers) - len(things)
     if weak:
         parts.append(count(weak, "weak detection"))
-    if any(answer.verdict.reason is Reason.NOT_RUN for answer in missed):
+    if any(answer.verdict.kind is ReasonKind.NOT_RUN for answer in missed):
         parts.append("the detector never ran")
     folded = " (folded: --all)" if any(answer.folded for answer in answers) else ""
     return f"{count(len(things), 'object')}: {', '.join(parts)}{folded}"
@@ -73,7 +74,7 @@ def markdown_page(answers: Sequence[Answer], chains: int) -> str:
 def _page(answers: Sequence[Answer], chains: int) -> Iterator[str]:
     """Yield the lines of the page."""
     for answer in answers[:chains]:
-        yield f"### {answer.verdict.reason.value}"
+        yield f"### {answer.verdict.kind.value}"
         yield ""
         yield f"**{markdown(answer.verdict.text)}**"
         yield ""

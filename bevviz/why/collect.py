@@ -11,11 +11,10 @@ from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import ClusterState, FrameResult
 from bevviz.stages.visibility import share_in_image
 from bevviz.support.kernel import kernel
-from bevviz.why.detection_candidates import find_candidates, sort_candidates
+from bevviz.why.belonging import find_candidates, find_reported_object, sort_candidates
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence
 from bevviz.why.frame_index import FEW, PART, Fate, FrameIndex
-from bevviz.why.merged import LOOKED_AT, find_mates, least_distance, separation
-from bevviz.why.outcome import find_reported_object
+from bevviz.why.merged_clusters import LOOKED_AT, find_mates, least_distance, separation
 from bevviz.why.subject import IN_VIEW, Subject
 
 NEARER = 0.5  # metres by which a return must be nearer to hide the subject

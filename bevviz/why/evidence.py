@@ -1,10 +1,11 @@
-"""Evidence about one subject: its points, clusters and detections, and their results."""
+"""Evidence about one subject: its points, clusters and detections, stage by stage."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from bevviz.model.frame import F32, I64, U8
+from bevviz.model.reasons import Scored
 from bevviz.model.results import (
     CameraResult,
     ClusterState,
@@ -44,6 +45,11 @@ class Candidate:
     overlap: float  # IoU with the projected subject; 1 for the subject itself
     decision: Decision
     cluster: int  # the matched cluster, or the best one that was refused, else -1
+
+    @property
+    def label(self) -> Scored:
+        """Its class and score."""
+        return Scored(self.name, self.score)
 
     @property
     def kept(self) -> bool:
@@ -141,6 +147,11 @@ class Evidence:
     def part(self, cluster: int) -> ClusterPart | None:
         """Return its part in a cluster, None if it has no points there."""
         return next((part for part in self.parts if part.cluster == cluster), None)
+
+    @property
+    def aside(self) -> ClusterPart | None:
+        """Its largest part in a cluster outside the size limits."""
+        return next((part for part in self.parts if not part.kept), None)
 
     @property
     def purity(self) -> float:

@@ -12,10 +12,10 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
+from bevviz.model.reasons import StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, Detections, FrameResult
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.stages.visibility import share_in_image
-from bevviz.why.stage_owner import StageOwner, owner_of
 from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, points_in_box, projected_box, single_box
 
 SAME_CLASS = 1.3  # factor on the overlap of a detection with an object of its class

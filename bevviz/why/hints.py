@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from bevviz.config import Config, plugin_of
 from bevviz.errors import UserError
 from bevviz.model.frame import Camera
+from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import Detections, DetectionState, FrameResult
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
@@ -23,7 +24,7 @@ from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import FLAWED, Reason, find_reason
+from bevviz.why.verdict import FLAWED, find_reason
 
 TRIES = 10  # configurations to run for one subject
 SURE = 0.5  # IoU from which a detection surely belongs to its object
@@ -34,20 +35,25 @@ Change = Mapping[str, Any]  # dotted key -> value
 
 # Parameters that bevviz applies to the output of user functions, too.
 _SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
-_SECTION = {  # reason -> section whose parameters may help
-    Reason.GROUND: "ground",
-    Reason.NOISE: "clustering",
-    Reason.NO_CLUSTER: "clustering",
-    Reason.MERGED: "clustering",
-    Reason.SPLIT: "clustering",
-    Reason.NOT_DETECTED: "detector",
-    Reason.BELOW_THRESHOLD: "detector",
-    Reason.NOT_AMONG: "objects",
-    Reason.MISNAMED: "objects",
+_SECTION = {  # kind of reason -> section whose parameters may help
+    ReasonKind.GROUND: "ground",
+    ReasonKind.NOISE: "clustering",
+    ReasonKind.NO_CLUSTER: "clustering",
+    ReasonKind.MERGED: "clustering",
+    ReasonKind.SPLIT: "clustering",
+    ReasonKind.NOT_DETECTED: "detector",
+    ReasonKind.BELOW_THRESHOLD: "detector",
+    ReasonKind.NOT_AMONG: "objects",
+    ReasonKind.MISNAMED: "objects",
 }
-
-
-_ORDER = {reason: place for place, reason in enumerate(Reason)}  # in the order of the stages
+_OTHER_OWNER = {  # another subject has the detection or the cluster
+    ReasonKind.SHARED_BOX,
+    ReasonKind.BORROWED,
+    ReasonKind.TAKEN,
+    ReasonKind.OTHER_CLUSTER,
+    ReasonKind.MISNAMED,
+}
+_ORDER = {kind: place for place, kind in enumerate(ReasonKind)}  # in the order of the stages
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +61,20 @@ class _ReachedStage:
     """The stage that a subject reached. A later stage is greater."""
 
     reported: bool
-    reason: Reason
+    kind: ReasonKind
 
     def __gt__(self, other: _ReachedStage) -> bool:
-        return (self.reported, _ORDER[self.reason]) > (other.reported, _ORDER[other.reason])
+        return (self.reported, _ORDER[self.kind]) > (other.reported, _ORDER[other.kind])
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """The mildest change that brings a subject to a stage, and the result there."""
+
+    change: Change
+    reason: Reason
+    evidence: Evidence
+    traces: FrameIndex
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +100,14 @@ class HintSearch:
         hints: the best change that changes the verdict; empty: no tried change does.
         tried: number of configurations that were run.
         furthest: settings that bring the subject to a later stage, if no hint helps; empty: none does.
-        then: reason of the subject with these settings.
+        then: kind of the reason of the subject with these settings.
         reported: whether the subject is reported with these settings.
     """
 
     hints: tuple[Hint, ...]
     tried: int
     furthest: tuple[str, ...] = ()
-    then: Reason | None = None
+    then: ReasonKind | None = None
     reported: bool = False
 
 
@@ -116,7 +132,8 @@ class HintFinder:
         there.
         """
         hints: list[Hint] = []
-        reached: dict[_ReachedStage, tuple[Change, Evidence, FrameIndex]] = {}  # by the mildest change
+        start = _ReachedStage(reported, reason.kind)
+        reached: dict[_ReachedStage, _Step] = {}  # by the mildest change
         tried = 0
 
         def ways() -> Iterator[Change]:
@@ -132,7 +149,8 @@ class HintFinder:
             tried += 1
             then = collect_evidence(subject, after)
             new, now_reported = find_reason(subject, then, after)
-            text, object_row = _new_outcome(subject, (reason, reported), (new, now_reported), then, after)
+            old_kind, new_kind = (reason.kind, reported), (new.kind, now_reported)
+            text, object_row = _new_outcome(subject, old_kind, new_kind, then, after)
             if text and _is_sure(subject, change, then):
                 row = subject.row if subject.kind == "truth" else -1
                 objects, then_objects = self._result.objects, after.result.objects
@@ -140,12 +158,12 @@ class HintFinder:
                 hints.append(Hint(_settings(change), text, harm))
                 if not hints[-1].effects.harm:
                     break
-            elif not text and (stage := _ReachedStage(now_reported, new)) > _ReachedStage(reported, reason):
-                reached.setdefault(stage, (change, then, after))
+            elif not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
+                reached.setdefault(stage, _Step(change, new, then, after))
         if hints or not reached:
             return HintSearch(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tried)
         last = max(reached)
-        return HintSearch((), tried, _settings(reached[last][0]), last.reason, last.reported)
+        return HintSearch((), tried, _settings(reached[last].change), last.kind, last.reported)
 
     def _run(self, change: Change) -> FrameIndex | None:
         """Run the frame with a change, once. None: the configuration cannot be run."""
@@ -201,17 +219,17 @@ def with_changes(config: Config, change: Change) -> Config:
 
 def _new_outcome(
     subject: Subject,
-    old_verdict: tuple[Reason, bool],
-    new_verdict: tuple[Reason, bool],
+    old_verdict: tuple[ReasonKind, bool],
+    new_verdict: tuple[ReasonKind, bool],
     evidence: Evidence,
     after: FrameIndex,
 ) -> tuple[str, int]:
     """Return the new result of the subject, empty if it is no better, and the row of its object."""
-    (reason, reported), (new, now_reported), named = old_verdict, new_verdict, evidence.named
-    if reason is Reason.BORROWED and subject.kind != "truth":
+    (old, reported), (new, now_reported), named = old_verdict, new_verdict, evidence.named
+    if old is ReasonKind.BORROWED and subject.kind != "truth":
         return ("" if named is not None else "it is not named any more"), -1
-    better = now_reported and (not reported or reason in FLAWED | {Reason.BORROWED})
-    if not better or named is None or new is not Reason.REPORTED:
+    better = now_reported and (not reported or old in FLAWED | {ReasonKind.BORROWED})
+    if not better or named is None or new is not ReasonKind.REPORTED:
         return "", -1
     if named.cluster < 0 or not after.origin("objects").ours:
         return f"{after.origin('objects').name} has {named.name} there then", named.row
@@ -237,16 +255,16 @@ def _settings(change: Change) -> tuple[str, ...]:
 
 
 def _combined_changes(
-    reached: Mapping[_ReachedStage, tuple[Change, Evidence, FrameIndex]],
+    reached: Mapping[_ReachedStage, _Step],
 ) -> Iterator[Change]:
     """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
     done: set[_ReachedStage] = set()
     while left := reached.keys() - done:
         stage = max(left)
         done.add(stage)
-        change, evidence, after = reached[stage]
-        for more in _changes_for(evidence, stage.reason, after):
-            yield {**change, **more}
+        step = reached[stage]
+        for more in _changes_for(step.evidence, step.reason, step.traces):
+            yield {**step.change, **more}
 
 
 # --- changes to try ----------------------------------------------------------------------------
@@ -255,7 +273,7 @@ def _combined_changes(
 def _changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Iterator[Change]:
     """Yield changes that may help: parameters of our stages, or of the user's function."""
     result = traces.result
-    section = _SECTION.get(reason, "")
+    section = _SECTION.get(reason.kind, "")
     if section and not traces.origin(section).ours:
         yield from _function_changes(result, section)
     if not traces.origin("objects").ours:
@@ -299,10 +317,10 @@ def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
 
 def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
     """Yield changes of our parameters that may help against the reason."""
-    clustering, best = config.clustering, evidence.best
-    if reason is Reason.GROUND:
+    kind, clustering, best = reason.kind, config.clustering, evidence.best
+    if kind is ReasonKind.GROUND:
         yield from _ground_changes(config)
-    elif reason is Reason.NOISE:
+    elif kind is ReasonKind.NOISE:
         for points in _smaller_min_points(evidence.neighbours, clustering.min_points):
             yield {"clustering.min_points": points}
             if points < clustering.min_cluster_points:
@@ -310,35 +328,30 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator
         for factor in (1.5, 2.0):
             yield {"clustering.eps": round(clustering.eps * factor, 3)}
         yield from _ground_changes(config)
-    elif reason is Reason.TOO_SMALL:
-        yield {"clustering.min_cluster_points": max(_set_aside_points(evidence), 1)}
+    elif kind is ReasonKind.TOO_SMALL:
+        yield {"clustering.min_cluster_points": max(reason["count"], 1)}
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
-    elif reason is Reason.TOO_LARGE:
-        yield {"clustering.max_cluster_points": _set_aside_points(evidence)}
-    elif reason is Reason.MERGED:
+    elif kind is ReasonKind.TOO_LARGE:
+        yield {"clustering.max_cluster_points": reason["count"]}
+    elif kind is ReasonKind.MERGED:
         if config.fusion.method == "frustum" and not config.fusion.split:
             yield {"fusion.split": True}
         if evidence.finer:
             yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
         elif not evidence.others:
             yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 0.6, 0.4))
-    elif reason is Reason.SPLIT:
+    elif kind is ReasonKind.SPLIT:
         # The distance is unknown if one of the parts is not a cluster.
         yield {"clustering.eps": round(max(np.nan_to_num(evidence.apart), clustering.eps) * 1.1, 3)}
         yield {"clustering.min_points": max(1, clustering.min_points // 2)}
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif best is not None:
-        yield from _detection_changes(reason, best, config)
+        yield from _detection_changes(kind, best, config)
 
 
-def _set_aside_points(evidence: Evidence) -> int:
-    """Return the number of points of the cluster outside the size limits."""
-    return next(part.count for part in evidence.parts if not part.kept)
-
-
-def _detection_changes(reason: Reason, best: Candidate, config: Config) -> Iterator[Change]:
+def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Iterator[Change]:
     """Yield changes that may help a subject that has a detection."""
-    if reason is Reason.BELOW_THRESHOLD:
+    if kind is ReasonKind.BELOW_THRESHOLD:
         # A threshold that lets noise pass is no advice.
         if best.score >= 0.05:
             passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
@@ -347,28 +360,28 @@ def _detection_changes(reason: Reason, best: Candidate, config: Config) -> Itera
                 # The rating of a match is proportional to the score.
                 weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
                 yield from ({**passes, "fusion.min_rating": round(weak * factor, 4)} for factor in (1.0, 0.5))
-    elif reason is Reason.SUPPRESSED:
+    elif kind is ReasonKind.SUPPRESSED:
         yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
-    elif reason is Reason.LOW_OVERLAP:
+    elif kind is ReasonKind.LOW_OVERLAP:
         yield from (
             {"fusion.min_iou": round(config.fusion.min_iou * factor, 3)} for factor in (0.5, 0.2, 0.0)
         )
         yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
-    elif reason is Reason.MISFIT:
+    elif kind is ReasonKind.MISFIT:
         yield from (
             {"fusion.min_rating": round(config.fusion.min_rating * factor, 4)} for factor in (0.5, 0.2)
         )
         yield {"fusion.split": False}
-    elif reason is Reason.TOO_FEW_POINTS:
+    elif kind is ReasonKind.TOO_FEW_POINTS:
         yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
-    elif reason in (Reason.SHARED_BOX, Reason.BORROWED, Reason.TAKEN, Reason.OTHER_CLUSTER, Reason.MISNAMED):
+    elif kind in _OTHER_OWNER:
         if config.fusion.method == "centroid":
             yield {"fusion.method": "frustum"}
-    elif reason is Reason.TOO_FAR and config.fusion.method == "centroid":
+    elif kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
         # The subject has no cluster of its own: the fusion compared the nearest other one.
         yield from _ground_changes(config)
         yield {"fusion.method": "frustum"}
-    elif reason is Reason.TOO_FAR:
+    elif kind is ReasonKind.TOO_FAR:
         yield {"fusion.max_depth": 200.0}
 
 

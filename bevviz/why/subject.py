@@ -19,33 +19,6 @@ FOOT = 0.03  # metres above the bottom of a box that belong to the road, because
 Kind = Literal["truth", "object", "detection", "cluster", "track", "pixel", "point", "cell"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Selection:
-    """The user's question. An empty selection means the whole frame.
-
-    The rows are those of ``Frame.truth``, of ``FrameResult.objects`` and ``clusters``, and of the detections
-    of ``camera``.
-    """
-
-    label: str = ""  # class name
-    box: tuple[float, ...] = ()  # u, v or u0, v0, u1, v1 in pixels
-    point: tuple[float, ...] = ()  # x, y, z in Frame.points_frame
-    cell: tuple[int, ...] = ()  # row, column of the bird's-eye view
-    radius: float = 0.5  # metres around the point or cell
-    camera: str = ""  # name; required if there are several
-    truth: int | None = None
-    object: int | None = None
-    detection: int | None = None
-    cluster: int | None = None
-    track: int | None = None  # id
-
-    @property
-    def one(self) -> bool:
-        """Whether the selection is one subject or place, and not a whole class or frame."""
-        rows = self.truth, self.object, self.detection, self.cluster, self.track
-        return bool(self.box or self.point or self.cell) or any(row is not None for row in rows)
-
-
 @dataclass(frozen=True, slots=True)
 class Subject:
     """One object or place to explain.

@@ -1,14 +1,12 @@
-"""Reason why a subject was reported or lost."""
+"""The reason why a subject was reported or lost, with the values that decided."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
-import numpy as np
-
+from bevviz.model.decisions import pair_reason
+from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import (
-    CameraResult,
     ClusterState,
     Decision,
     DetectionState,
@@ -16,58 +14,24 @@ from bevviz.model.results import (
     Fusion,
     Opinion,
 )
+from bevviz.why.belonging import find_fused
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.frame_index import FEW, PART, FrameIndex
-from bevviz.why.outcome import find_fused
+from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
 from bevviz.why.subject import Subject
 
 WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 
-
-class Reason(StrEnum):
-    """The stage or rule that decided about a subject."""
-
-    REPORTED = "reported"
-    SHARED_BOX = "shared box"  # reported, but its box also names other clusters
-    BORROWED = "borrowed name"  # named by a detection that is not its own
-    SPLIT = "split"
-    MERGED = "merged"
-    MISNAMED = "misnamed"
-    FAILED = "failed"
-    OUT_OF_VIEW = "out of view"
-    HIDDEN = "hidden"
-    NO_POINTS = "no points"
-    GROUND = "ground"
-    NOISE = "noise"
-    NO_CLUSTER = "no cluster"  # of a user's function or the robot; the cause is unknown
-    TOO_SMALL = "too small"
-    TOO_LARGE = "too large"
-    NOT_RUN = "detector not run"
-    NOT_DETECTED = "not detected"
-    BELOW_THRESHOLD = "below threshold"
-    SUPPRESSED = "suppressed"
-    NOT_FUSED = "not fused"
-    LOW_OVERLAP = "low overlap"
-    TOO_FEW_POINTS = "too few points"
-    TOO_FAR = "too far"
-    TAKEN = "taken"
-    MISFIT = "misfit"
-    OTHER_CLUSTER = "other cluster"
-    CONTRADICTED = "contradicted"  # reported by a stage that is not ours, and a camera sees nothing there
-    NOT_AMONG = "not among the objects"  # of a 3D detector, or of a robot whose stages are unknown
-    LOST_IN_FUSION = "lost in the fusion"  # in the robot's fusion, although it had a cluster and a detection
-
-
-FLAWED = {Reason.SHARED_BOX, Reason.MERGED, Reason.SPLIT}
-HOPELESS = {Reason.OUT_OF_VIEW, Reason.HIDDEN, Reason.NO_POINTS}
+FLAWED = {ReasonKind.SHARED_BOX, ReasonKind.MERGED, ReasonKind.SPLIT}
+HOPELESS = {ReasonKind.OUT_OF_VIEW, ReasonKind.HIDDEN, ReasonKind.NO_POINTS}
 
 _REFUSED = {
-    Decision.LOW_OVERLAP: Reason.LOW_OVERLAP,
-    Decision.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
-    Decision.TOO_FAR: Reason.TOO_FAR,
-    Decision.TAKEN: Reason.TAKEN,
-    Decision.MISFIT: Reason.MISFIT,
-    Decision.NO_CLUSTER: Reason.TOO_FEW_POINTS,
+    Decision.LOW_OVERLAP: ReasonKind.LOW_OVERLAP,
+    Decision.TOO_FEW_POINTS: ReasonKind.TOO_FEW_POINTS,
+    Decision.TOO_FAR: ReasonKind.TOO_FAR,
+    Decision.TAKEN: ReasonKind.TAKEN,
+    Decision.MISFIT: ReasonKind.MISFIT,
+    Decision.NO_CLUSTER: ReasonKind.TOO_FEW_POINTS,
 }
 
 
@@ -82,242 +46,222 @@ class Verdict:
     reported: bool
     text: str
 
+    @property
+    def kind(self) -> ReasonKind:
+        """The kind of the reason."""
+        return self.reason.kind
+
 
 def find_reason(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tuple[Reason, bool]:
     """Find the first stage that lost the subject, or the fault of its reported object.
 
     Returns:
-        reason: that stage or fault.
+        reason: that stage or fault, with its values.
         reported: whether it still is an object of a right class.
     """
-    if not traces.result.frame.lidar:
-        return _reason_of_cameras(subject, evidence, traces)
-    accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
-    if evidence.named is not None and accepts(evidence.named.name):
-        return _flaw(subject, evidence, evidence.named, traces), True
-    if evidence.named is not None and (
-        not any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
-        or _is_in_reported_box(subject, evidence, evidence.named, traces)
-    ):
-        return Reason.MISNAMED, False
-    if traces.result.objects is None:
-        return Reason.FAILED, False
-    if traces.origin("objects").ours:
-        return _loss(subject, evidence, traces), False
-    return _loss_of_other_stages(subject, evidence, traces), False
+    kind, reported = _Decider(subject, evidence, traces).decide()
+    return ReasonValues(subject, evidence, traces).reason(kind), reported
 
 
-def _reason_of_cameras(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tuple[Reason, bool]:
-    """Return the reason with cameras alone, where a kept detection is reported."""
-    best = evidence.best
-    if not detector_ran(traces.result, subject.camera):
-        return Reason.NOT_RUN, False
-    if best is None or not subject.accepts(best.name):
-        return Reason.NOT_DETECTED, False
-    return (Reason.REPORTED, True) if best.kept else (_weakness(best, traces), False)
+class _Decider:
+    """The order in which the stages are blamed.
 
-
-def _flaw(subject: Subject, evidence: Evidence, named: ReportedObject, traces: FrameIndex) -> Reason:
-    """Return the fault of a reported object, REPORTED without a fault."""
-    opinions = traces.result.opinions
-    if opinions is not None and subject.kind == "object":
-        denied = opinions.opinion[named.row] == Opinion.CONTRADICTED
-        return Reason.CONTRADICTED if denied else Reason.REPORTED
-    if named.detection < 0 or subject.kind == "object":
-        return Reason.SHARED_BOX if named.also else Reason.REPORTED
-    if evidence.mates or (subject.kind == "truth" and evidence.purity < MOST):
-        return Reason.MERGED
-    if not named.own and (subject.kind == "truth" or traces.result.config.fusion.method == "centroid"):
-        return Reason.BORROWED
-    if named.also:
-        return Reason.SHARED_BOX
-    whole = sum(part.points for part in evidence.parts)
-    part = evidence.part(named.cluster)
-    several = subject.kind == "truth" and len([part for part in evidence.parts if part.kept]) > 1
-    return Reason.SPLIT if several and part is not None and part.points < WHOLE * whole else Reason.REPORTED
-
-
-def _loss(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Reason:
-    """Return the reason why our fusion reported no object."""
-    if subject.kind == "detection":
-        return _loss_of_detection(evidence, traces)
-    if not subject.is_place and not evidence.in_view:
-        return Reason.OUT_OF_VIEW
-    if evidence.raw < FEW:
-        return _without_points(evidence)
-    if evidence.main < 0:
-        return _unclustered(evidence, traces)
-    if not detector_ran(traces.result, subject.camera):
-        return Reason.NOT_RUN
-    if all(camera.fusion is None for camera in cameras_of(traces.result, subject.camera)):
-        return Reason.NOT_FUSED
-    if not evidence.in_view:
-        return Reason.OUT_OF_VIEW
-    best = evidence.best
-    if best is None or not subject.accepts(best.name):
-        return Reason.NOT_DETECTED
-    if not best.kept:
-        return _weakness(best, traces)
-    return _refusal(subject, evidence, best, traces)
-
-
-def _without_points(evidence: Evidence) -> Reason:
-    """Return the reason for a subject without points."""
-    return Reason.HIDDEN if evidence.in_front > MOST * evidence.aimed else Reason.NO_POINTS
-
-
-def _unclustered(evidence: Evidence, traces: FrameIndex) -> Reason:
-    """Return the reason for a subject with points but no kept cluster: the stage that took most of them."""
-    aside = next((part for part in evidence.parts if not part.kept), None)
-    if aside is not None and aside.points >= max(evidence.noise, len(evidence.ground)):
-        return Reason.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else Reason.TOO_LARGE
-    if len(evidence.ground) >= evidence.noise:
-        return Reason.GROUND
-    return Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
-
-
-def cameras_of(result: FrameResult, camera: str) -> list[CameraResult]:
-    """Return the camera of that name. An empty name means all cameras."""
-    return [c for c in result.cameras if camera in ("", c.camera.name)]
-
-
-def detector_ran(result: FrameResult, camera: str) -> bool:
-    """Return whether the detector ran on an image of the camera, or of any camera."""
-    return any(c.detections is not None for c in cameras_of(result, camera))
-
-
-def _weakness(best: Candidate, traces: FrameIndex) -> Reason:
-    """Return the reason for a detection that was not kept.
-
-    If a suppressed detection is below the threshold anyway, the threshold is the reason.
+    Args:
+        subject: the object or place in question.
+        evidence: the evidence about it.
+        traces: the index of the frame.
     """
-    least = traces.result.config.detector.conf_threshold
-    strong = best.state == DetectionState.SUPPRESSED and best.score >= least
-    return Reason.SUPPRESSED if strong else Reason.BELOW_THRESHOLD
 
+    def __init__(self, subject: Subject, evidence: Evidence, traces: FrameIndex) -> None:
+        self.subject, self.evidence, self.traces = subject, evidence, traces
+        self.result: FrameResult = traces.result
 
-def _refusal(subject: Subject, evidence: Evidence, best: Candidate, traces: FrameIndex) -> Reason:
-    """Return the reason why a cluster and a detection were not matched."""
-    _, fusion = camera_and_fusion(traces.result, best.camera)
-    if fusion is None:
-        return Reason.NOT_FUSED
-    reason = pair_reason(fusion, traces, best.row, evidence.main)
-    main = evidence.part(evidence.main)
-    if subject.kind != "truth" or main is None:
-        return reason
-    if evidence.purity < MOST or _is_named_by_mate(evidence, fusion, best.camera, traces):
-        return Reason.MERGED
-    if reason in (Reason.LOW_OVERLAP, Reason.TOO_FEW_POINTS):
-        return _fragment(evidence, main.points, traces) or reason
-    return reason
+    def decide(self) -> tuple[ReasonKind, bool]:
+        """Return the kind of the reason, and whether the subject is an object of a right class."""
+        subject, evidence, named = self.subject, self.evidence, self.evidence.named
+        if not self.result.frame.lidar:
+            return self._by_cameras()
+        ours = self.traces.origin("objects").ours
+        accepts = subject.accepts if ours else subject.accepts_of_others
+        if named is not None and accepts(named.name):
+            return self._flaw(named), True
+        if named is not None and (
+            not any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
+            or self._is_in_reported_box(named)
+        ):
+            return ReasonKind.MISNAMED, False
+        if self.result.objects is None:
+            return ReasonKind.FAILED, False
+        return self._loss() if ours else self._loss_of_other_stages(), False
 
+    def _by_cameras(self) -> tuple[ReasonKind, bool]:
+        """Return the reason with cameras alone, where a kept detection is reported."""
+        best = self.evidence.best
+        if not detector_ran(self.result, self.subject.camera):
+            return ReasonKind.NOT_RUN, False
+        if best is None or not self.subject.accepts(best.name):
+            return ReasonKind.NOT_DETECTED, False
+        return (ReasonKind.REPORTED, True) if best.kept else (self._weakness(best), False)
 
-def _is_named_by_mate(evidence: Evidence, fusion: Fusion, camera: str, traces: FrameIndex) -> bool:
-    """Return whether another object in the subject's cluster named the cluster."""
-    if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
-        return False
-    camera_result, _ = camera_and_fusion(traces.result, camera)
-    return int(traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]) in evidence.mates
+    def _flaw(self, named: ReportedObject) -> ReasonKind:
+        """Return the fault of a reported object, REPORTED without a fault."""
+        opinions, subject, evidence = self.result.opinions, self.subject, self.evidence
+        if opinions is not None and subject.kind == "object":
+            denied = opinions.opinion[named.row] == Opinion.CONTRADICTED
+            return ReasonKind.CONTRADICTED if denied else ReasonKind.REPORTED
+        if named.detection < 0 or subject.kind == "object":
+            return ReasonKind.SHARED_BOX if named.also else ReasonKind.REPORTED
+        if evidence.mates or (subject.kind == "truth" and evidence.purity < MOST):
+            return ReasonKind.MERGED
+        if not named.own and (subject.kind == "truth" or self.result.config.fusion.method == "centroid"):
+            return ReasonKind.BORROWED
+        if named.also:
+            return ReasonKind.SHARED_BOX
+        whole = sum(part.points for part in evidence.parts)
+        part = evidence.part(named.cluster)
+        several = subject.kind == "truth" and len([part for part in evidence.parts if part.kept]) > 1
+        is_split = several and part is not None and part.points < WHOLE * whole
+        return ReasonKind.SPLIT if is_split else ReasonKind.REPORTED
 
+    # --- our stages ----------------------------------------------------------------------------
 
-def _fragment(evidence: Evidence, inside: int, traces: FrameIndex) -> Reason | None:
-    """Return the stage that took most of an object, None if its cluster holds at least half of it."""
-    if inside >= MOST * evidence.voxels:
-        return None
-    rest = evidence.obstacles - inside - evidence.noise
-    noise = Reason.NOISE if traces.origin("clustering").ours else Reason.NO_CLUSTER
-    return max((len(evidence.ground), Reason.GROUND), (evidence.noise, noise), (rest, Reason.SPLIT))[1]
+    def _loss(self) -> ReasonKind:
+        """Return the reason why our fusion reported no object."""
+        subject, evidence = self.subject, self.evidence
+        if subject.kind == "detection":
+            return self._loss_of_detection()
+        if not subject.is_place and not evidence.in_view:
+            return ReasonKind.OUT_OF_VIEW
+        if evidence.raw < FEW:
+            return self._without_points()
+        if evidence.main < 0:
+            return self._unclustered()
+        if not detector_ran(self.result, subject.camera):
+            return ReasonKind.NOT_RUN
+        if all(camera.fusion is None for camera in cameras_of(self.result, subject.camera)):
+            return ReasonKind.NOT_FUSED
+        if not evidence.in_view:
+            return ReasonKind.OUT_OF_VIEW
+        best = evidence.best
+        if best is None or not subject.accepts(best.name):
+            return ReasonKind.NOT_DETECTED
+        return self._refusal(best) if best.kept else self._weakness(best)
 
+    def _without_points(self) -> ReasonKind:
+        """Return the reason for a subject without points."""
+        hidden = self.evidence.in_front > MOST * self.evidence.aimed
+        return ReasonKind.HIDDEN if hidden else ReasonKind.NO_POINTS
 
-def pair_reason(fusion: Fusion, traces: FrameIndex, detection: int, cluster: int) -> Reason:
-    """Return the rule of our fusion that separates a detection and a cluster; REPORTED: they match."""
-    config, pair = traces.result.config.fusion, fusion.pair(detection, cluster)
-    if config.method == "centroid":
-        if pair is None or not np.isfinite(pair.cost):
-            return Reason.TOO_FAR
-    elif pair is None or pair.points < config.min_points:
-        return Reason.TOO_FEW_POINTS
-    elif pair.depth > config.max_depth:
-        return Reason.TOO_FAR
-    elif pair.iou < config.min_iou:
-        return Reason.LOW_OVERLAP
-    decision, matched = fusion.detection_decision[detection], fusion.detection_cluster[detection]
-    if decision == Decision.MATCHED and matched == cluster:
-        return Reason.REPORTED
-    if decision == Decision.MISFIT:
-        return Reason.MISFIT
-    return Reason.OTHER_CLUSTER if decision == Decision.MATCHED else Reason.TAKEN
+    def _unclustered(self) -> ReasonKind:
+        """Return the stage that took most points of a subject without a kept cluster."""
+        evidence = self.evidence
+        aside = evidence.aside
+        if aside is not None and aside.points >= max(evidence.noise, len(evidence.ground)):
+            return ReasonKind.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else ReasonKind.TOO_LARGE
+        return ReasonKind.GROUND if len(evidence.ground) >= evidence.noise else self._noise()
 
+    def _noise(self) -> ReasonKind:
+        """Return the reason for points in no cluster. Only for our clustering the cause is known."""
+        return ReasonKind.NOISE if self.traces.origin("clustering").ours else ReasonKind.NO_CLUSTER
 
-def _loss_of_detection(evidence: Evidence, traces: FrameIndex) -> Reason:
-    """Return the reason why a detection gave no object."""
-    best = evidence.best
-    if best is None:
-        return Reason.NOT_DETECTED
-    if not best.kept:
-        return _weakness(best, traces)
-    _, fusion = camera_and_fusion(traces.result, best.camera)
-    if fusion is None:
-        return Reason.NOT_FUSED
-    if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
-        return Reason.NO_POINTS if evidence.raw < FEW else _unclustered(evidence, traces)
-    if best.decision is Decision.MATCHED:  # a detection of another camera named the object
-        return Reason.TAKEN
-    most_points = max((part.points for part in evidence.parts if part.kept), default=0)
-    if evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles):
-        return _unclustered(evidence, traces)
-    return Reason.MERGED if best.decision is Decision.TAKEN and evidence.mates else _REFUSED[best.decision]
+    def _weakness(self, best: Candidate) -> ReasonKind:
+        """Return the reason for a detection that was not kept.
 
+        If a suppressed detection is below the threshold anyway, the threshold is the reason.
+        """
+        least = self.result.config.detector.conf_threshold
+        strong = best.state == DetectionState.SUPPRESSED and best.score >= least
+        return ReasonKind.SUPPRESSED if strong else ReasonKind.BELOW_THRESHOLD
 
-# --- objects that our fusion did not make ------------------------------------------------------
+    def _refusal(self, best: Candidate) -> ReasonKind:
+        """Return the reason why a cluster and a detection were not matched."""
+        evidence = self.evidence
+        _, fusion = camera_and_fusion(self.result, best.camera)
+        if fusion is None:
+            return ReasonKind.NOT_FUSED
+        kind = pair_reason(fusion, self.result.config, best.row, evidence.main).kind
+        main = evidence.part(evidence.main)
+        if self.subject.kind != "truth" or main is None:
+            return kind
+        if evidence.purity < MOST or self._is_named_by_mate(fusion, best.camera):
+            return ReasonKind.MERGED
+        if kind in (ReasonKind.LOW_OVERLAP, ReasonKind.TOO_FEW_POINTS):
+            return self._fragment(main.points) or kind
+        return kind
 
+    def _is_named_by_mate(self, fusion: Fusion, camera: str) -> bool:
+        """Return whether another object in the subject's cluster named the cluster."""
+        evidence = self.evidence
+        if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
+            return False
+        camera_result, _ = camera_and_fusion(self.result, camera)
+        owner = self.traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]
+        return int(owner) in evidence.mates
 
-def _loss_of_other_stages(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Reason:
-    """Return the reason why a 3D detector or the robot has no object, as far as its stages are known."""
-    if subject.kind != "detection" and evidence.raw < FEW:
-        return _without_points(evidence)
-    robot = {
-        section for section in ("ground", "clustering", "detector", "objects") if traces.origin(section).topic
-    }
-    if "objects" not in robot:
-        return Reason.NOT_AMONG
-    cluster = has_cluster(subject, evidence)
-    if "clustering" in robot and traces.result.clusters is not None and not cluster:
-        return (
-            Reason.GROUND
-            if "ground" in robot and len(evidence.ground) >= evidence.noise
-            else Reason.NO_CLUSTER
+    def _fragment(self, inside: int) -> ReasonKind | None:
+        """Return the stage that took most of an object, None if its cluster holds at least half of it."""
+        evidence = self.evidence
+        if inside >= MOST * evidence.voxels:
+            return None
+        rest = evidence.obstacles - inside - evidence.noise
+        lost = (
+            (len(evidence.ground), ReasonKind.GROUND),
+            (evidence.noise, self._noise()),
+            (rest, ReasonKind.SPLIT),
         )
-    detected = any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
-    ran = detector_ran(traces.result, subject.camera)
-    if "detector" in robot and ran and not detected:
-        return Reason.NOT_DETECTED if subject.is_place or evidence.in_view else Reason.OUT_OF_VIEW
-    known = {"clustering", "detector"} <= robot and cluster and detected
-    return Reason.LOST_IN_FUSION if known else Reason.NOT_AMONG
+        return max(lost)[1]
 
+    def _loss_of_detection(self) -> ReasonKind:
+        """Return the reason why a detection gave no object."""
+        evidence, best = self.evidence, self.evidence.best
+        if best is None:
+            return ReasonKind.NOT_DETECTED
+        if not best.kept:
+            return self._weakness(best)
+        _, fusion = camera_and_fusion(self.result, best.camera)
+        if fusion is None:
+            return ReasonKind.NOT_FUSED
+        if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
+            return ReasonKind.NO_POINTS if evidence.raw < FEW else self._unclustered()
+        if best.decision is Decision.MATCHED:  # a detection of another camera named the object
+            return ReasonKind.TAKEN
+        most_points = max((part.points for part in evidence.parts if part.kept), default=0)
+        if evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles):
+            return self._unclustered()
+        is_merged = best.decision is Decision.TAKEN and evidence.mates
+        return ReasonKind.MERGED if is_merged else _REFUSED[best.decision]
 
-def _is_in_reported_box(
-    subject: Subject, evidence: Evidence, named: ReportedObject, traces: FrameIndex
-) -> bool:
-    """Return whether the object of our fusion is inside the reported box."""
-    row, opinions = find_fused(subject, evidence, traces), traces.result.opinions
-    return row >= 0 and opinions is not None and int(opinions.partner[row]) == named.row
+    # --- objects that our fusion did not make --------------------------------------------------
 
+    def _loss_of_other_stages(self) -> ReasonKind:
+        """Return the reason why a 3D detector or the robot has no object, as far as its stages are known."""
+        subject, evidence = self.subject, self.evidence
+        if subject.kind != "detection" and evidence.raw < FEW:
+            return self._without_points()
+        sections = "ground", "clustering", "detector", "objects"
+        robot = {section for section in sections if self.traces.origin(section).topic}
+        if "objects" not in robot:
+            return ReasonKind.NOT_AMONG
+        cluster = self._has_cluster()
+        if "clustering" in robot and self.result.clusters is not None and not cluster:
+            removed = "ground" in robot and len(evidence.ground) >= evidence.noise
+            return ReasonKind.GROUND if removed else ReasonKind.NO_CLUSTER
+        kept = [candidate for candidate in evidence.candidates if candidate.kept]
+        detected = any(subject.accepts(candidate.name) for candidate in kept)
+        if "detector" in robot and detector_ran(self.result, subject.camera) and not detected:
+            visible = subject.is_place or evidence.in_view
+            return ReasonKind.NOT_DETECTED if visible else ReasonKind.OUT_OF_VIEW
+        known = {"clustering", "detector"} <= robot and cluster and detected
+        return ReasonKind.LOST_IN_FUSION if known else ReasonKind.NOT_AMONG
 
-def has_cluster(subject: Subject, evidence: Evidence) -> bool:
-    """Return whether the subject has a cluster; for a detection, one that our fusion accepts."""
-    if subject.kind != "detection":
-        return evidence.main >= 0
-    return (
-        evidence.best is not None
-        and evidence.best.kept
-        and evidence.best.decision in (Decision.MATCHED, Decision.TAKEN)
-    )
+    def _has_cluster(self) -> bool:
+        """Return whether the subject has a cluster; for a detection, one that our fusion accepts."""
+        best = self.evidence.best
+        if self.subject.kind != "detection":
+            return self.evidence.main >= 0
+        return best is not None and best.kept and best.decision in (Decision.MATCHED, Decision.TAKEN)
 
-
-def name_of(result: FrameResult, cluster: int) -> str:
-    """Return the class of the object of a cluster, empty for none."""
-    if result.objects is None or cluster < 0:
-        return ""
-    rows = np.flatnonzero(result.objects.cluster == cluster)
-    return result.objects.names[rows[0]] if len(rows) else ""
+    def _is_in_reported_box(self, named: ReportedObject) -> bool:
+        """Return whether the object of our fusion is inside the reported box."""
+        row, opinions = find_fused(self.subject, self.evidence, self.traces), self.result.opinions
+        return row >= 0 and opinions is not None and int(opinions.partner[row]) == named.row

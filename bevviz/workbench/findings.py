@@ -19,7 +19,6 @@ from bevviz.model.frame import F32, Frame
 from bevviz.model.results import Anomaly, Decision, FrameResult, Opinion
 from bevviz.pipeline.session import Session
 from bevviz.why import FrameExplainer, Selection
-from bevviz.workbench.page_messages import selection_text
 
 FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
 
@@ -92,7 +91,7 @@ def with_reasons(findings: Sequence[Finding], result: FrameResult, session: Sess
 
     def with_reason(finding: Finding) -> Finding:
         answers = explainer.ask(finding.selection) if finding.what == "missed" else []
-        return replace(finding, reason=answers[0].verdict.reason.value) if answers else finding
+        return replace(finding, reason=answers[0].verdict.kind.value) if answers else finding
 
     return [with_reason(finding) for finding in findings]
 
@@ -227,7 +226,7 @@ class FindingList:
                 group = self._same(finding, taken_groups) or self._new(finding.what, finding.name)
                 taken_groups.add(group.number)
                 group.position, group.box = finding.position, finding.box
-                pick = selection_text(finding.selection)
+                pick = str(finding.selection)
                 group.frames.append(
                     FindingFrame(finding.frame, finding.stamp, finding.distance, pick, tried, finding.reason)
                 )

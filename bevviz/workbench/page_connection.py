@@ -161,7 +161,7 @@ class PageConnection:
 
     async def _ask(self, number: int, message: Message) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer message came."""
-        from bevviz.workbench.page_messages import other_answers, selection_text
+        from bevviz.workbench.page_messages import other_answers
 
         workbench, frame = self._workbench, await self._frame(message)
         settings = self._source.asked_settings(_settings(message), again="pick" in message)
@@ -172,7 +172,7 @@ class PageConnection:
             if selection is None:
                 return None
             answer, *others = workbench.ask(frame, settings, selection)
-            pick, beside = selection_text(selection), list(other_answers(others))
+            pick, beside = str(selection), list(other_answers(others))
             tree = {"pick": pick, **answer.as_dict(), "beside": beside}
             return selection, self._source.look(frame, settings), answer, tree
 
@@ -189,10 +189,10 @@ class PageConnection:
 
     def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""
-        from bevviz.workbench.page_messages import parse_selection
+        from bevviz.why.selection import Selection
 
         if "pick" in message:
-            return parse_selection(str(message["pick"]))
+            return Selection.parse(str(message["pick"]))
         instance = message.get("instance")
         row = None if instance is None else int(instance)
         position = [float(value) for value in message.get("position") or () if value is not None]
@@ -262,9 +262,9 @@ def _settings(message: Message) -> Settings:
 
 def _selection(message: Message) -> Selection | None:
     """Return the selection that a message names, if it names one."""
-    from bevviz.workbench.page_messages import parse_selection
+    from bevviz.why.selection import Selection
 
-    return parse_selection(str(message["pick"])) if message.get("pick") else None
+    return Selection.parse(str(message["pick"])) if message.get("pick") else None
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""JSON of the messages to and from the page: selections, other answers, notes and parameter controls."""
+"""JSON of the messages to the page: other answers, notes and parameter controls."""
 
 from __future__ import annotations
 
@@ -14,50 +14,23 @@ from pydantic_core import to_jsonable_python
 from bevviz.config import Config, unit, values
 from bevviz.config.keys import field_of
 from bevviz.pipeline.notes import Note
-from bevviz.why import Answer, Selection
-from bevviz.why.pick import Pick
-from bevviz.why.pick_answers import pick_of, selection_of
+from bevviz.why import Answer
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 BESIDE = 6  # further answers that are listed
 
-# --- selections --------------------------------------------------------------------------------
-
-
-def parse_selection(text: str) -> Selection:
-    """Return the selection of a text in the page's address, such as ``detection/front/3``.
-
-    Raises:
-        UserError: the text selects nothing.
-    """
-    return selection_of(Pick.parse(text))
-
-
-def selection_text(selection: Selection) -> str:
-    """Return the text that ``parse_selection`` reads: ``detection/front/3``, ``point//1.5,2,0``."""
-    rows = {
-        "truth": selection.truth,
-        "object": selection.object,
-        "cluster": selection.cluster,
-        "detection": selection.detection,
-    }
-    for kind, row in rows.items():
-        if row is not None:
-            return f"{kind}/{selection.camera}/{row}"
-    places = {"pixel": selection.box, "point": selection.point, "cell": selection.cell}
-    kind, place = next((kind, place) for kind, place in places.items() if place)
-    return f"{kind}/{selection.camera}/{','.join(f'{value:.4g}' for value in place)}"
+# --- answers and notes -------------------------------------------------------------------------
 
 
 def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
     """Yield the first other answers in brief, in the order of the explainer."""
     for answer in answers[:BESIDE]:
-        if (pick := pick_of(answer)) is not None:
+        if (selection := answer.selection) is not None:
             yield {
-                "pick": str(pick),
+                "pick": str(selection),
                 "name": answer.subject.name,
                 "reported": answer.verdict.reported,
-                "reason": answer.verdict.reason.value,
+                "reason": answer.verdict.kind.value,
             }
 
 

@@ -31,9 +31,8 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.why import Answer, Selection
+from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.why.pick import pick
-from bevviz.why.pick_answers import selection_of
 from bevviz.workbench.buffers import BufferReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.findings import Finding, find_findings, with_reasons
 from bevviz.workbench.findings_layer import FindingRows, log_layer
@@ -351,12 +350,11 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def select(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
-        """Return the selection of a click in a frame: a finding, or see ``pick``."""
+        """Return the selection of a click in a frame: a finding, or see ``select_click``."""
         rows = self._layers.get((number, bool(settings)), {}).get(path, ())
         if instance is not None and 0 <= instance < len(rows):
             return rows[instance].selection
-        picked = pick(self.look(number, settings), self._tracks.get(number), path, instance, position)
-        return None if picked is None else selection_of(picked)
+        return select_click(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
     def mark(self, result: FrameResult, answer: Answer) -> None:
         """Mark the object of an answer in every view."""

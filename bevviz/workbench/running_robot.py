@@ -23,9 +23,8 @@ from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION
 from bevviz.why import Answer, Selection
+from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.why.pick import pick
-from bevviz.why.pick_answers import selection_of
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.findings import find_findings, with_reasons
 from bevviz.workbench.live_buffer import LiveBuffer
@@ -185,14 +184,13 @@ class RunningRobot(Source):
     def select(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
-        """Return the selection of a click in a frame, see ``pick``."""
+        """Return the selection of a click in a frame, see ``select_click``."""
         result = self.look(number)
         points = result.config.live.viewer_points
         if instance is not None and points is not None and path == entities.points(result.frame.lidar):
             rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
-        picked = pick(result, result.tracks, path, instance, position)
-        return None if picked is None else selection_of(picked)
+        return select_click(result, result.tracks, path, instance, position)
 
     def mark(self, result: FrameResult, answer: Answer) -> None:
         """Mark the object of an answer in every view."""

@@ -10,8 +10,6 @@ from bevviz.errors import UserError
 from bevviz.pipeline.notes import Note, Notes
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.pick_answers import pick_of, surroundings_of
-from bevviz.workbench.page_messages import selection_text
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
@@ -101,11 +99,10 @@ class WorkbenchSession(Closable):
         """
         explainer, answers, candidates = self._answers_about(number, settings, selection)
         if not answers:
-            raise UserError(f"there is nothing to say about {selection_text(selection)}")
+            raise UserError(f"there is nothing to say about {selection}")
         answer = answers[0]
-        if not candidates and (pick := pick_of(answer)) is not None:
-            nearby = surroundings_of(pick, answer)
-            candidates = [] if nearby is None else explainer.candidates(nearby)
+        if not candidates and (nearby := answer.surroundings) is not None:
+            candidates = explainer.candidates(nearby)
         self._keep(number, settings, selection, answer)
         return [answer, *(other for other in candidates if other.subject.key != answer.subject.key)]
 
@@ -128,13 +125,12 @@ class WorkbenchSession(Closable):
         if self._explainer is None or self._explainer.traces.result is not result:
             pipeline = self.source.pipeline
             self._explainer = FrameExplainer(result, pipeline.loader, pipeline.stages.class_names)
-        is_place = selection.box or selection.point or selection.cell
-        candidates = self._explainer.candidates(selection) if is_place else []
+        candidates = self._explainer.candidates(selection) if selection.is_place else []
         return self._explainer, candidates or self._explainer.ask(selection), candidates
 
     def _keep(self, number: int, settings: Settings, selection: Selection, answer: Answer) -> None:
         """Keep an answer for reports. One with hints replaces one without."""
-        key = number, settings, selection_text(selection)
+        key = number, settings, str(selection)
         if answer.hints or key not in self._answers:
             self._answers[key] = self.source.look(number).frame.received, answer
         self._answers.move_to_end(key)
@@ -180,7 +176,7 @@ class WorkbenchSession(Closable):
         if selection is not None:
             answer = self.ask(number, (), selection)[0]
             self.source.mark(result, answer)
-            about, pick = answer.subject.name.removeprefix("the "), selection_text(selection)
+            about, pick = answer.subject.name.removeprefix("the "), str(selection)
         frame = result.frame
         self.tools.notes.add(Note(frame.stamp, frame.received, text.strip(), about, pick))
         self._tell_notes()

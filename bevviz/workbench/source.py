@@ -102,7 +102,7 @@ class Source(Closable):
     def select(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
-        """Return the selection of a click in a frame, see ``bevviz.why.pick.pick``."""
+        """Return the selection of a click in a frame, see ``bevviz.why.click.select_click``."""
 
     @abstractmethod
     def mark(self, result: FrameResult, answer: Answer) -> None:

@@ -21,8 +21,9 @@ from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why.frame_index import truth_subjects
+from bevviz.why.selection import Selection
 from bevviz.why.side_effects import Effects, effects
-from bevviz.why.subject import Selection, Subject
+from bevviz.why.subject import Subject
 from bevviz.workbench.findings import Finding, finding_at
 
 if TYPE_CHECKING:

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.model.decisions import detection_reason, not_kept_text
+from bevviz.model.reasons import ReasonKind, kind_of, limit, limit_of, scored
 from bevviz.model.results import Decision, DetectionState, Opinion
+from bevviz.why.belonging import find_fused, opinion_on
 from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex
-from bevviz.why.outcome import find_fused, in_box_of, opinion_on
-from bevviz.why.sentences import label, not_run, state_text
+from bevviz.why.reason_values import detector_ran, name_of, not_run
 from bevviz.why.subject import Subject, projected_box
-from bevviz.why.verdict import detector_ran, name_of
 
 _SHOWN = 5  # clusters or candidates listed in a step, at most
 
@@ -103,15 +104,12 @@ def _ground_step(evidence: Evidence, traces: FrameIndex) -> Step:
     if len(known):
         text += f", {float(known.min()):z.2f} to {float(known.max()):z.2f} m above the local ground"
         numbers |= {"lowest": round(float(known.min()), 3), "highest": round(float(known.max()), 3)}
-    config, owner = traces.result.config.ground, traces.origin("ground")
+    config, owner = traces.result.config, traces.origin("ground")
     if not owner.ours:
         return Step("ground", f"{text} ({owner.name})", {**numbers, "by": owner.name})
-    numbers["threshold"] = config.distance_threshold
-    return Step(
-        "ground",
-        f"{text} (ground.distance_threshold {config.distance_threshold:g} m, {config.method})",
-        numbers,
-    )
+    deciding = limit(config, "ground.distance_threshold")
+    numbers["threshold"] = deciding.value
+    return Step("ground", f"{text} ({deciding.short}, {config.ground.method})", numbers)
 
 
 def _clustering_step(evidence: Evidence, traces: FrameIndex) -> Step:
@@ -122,7 +120,7 @@ def _clustering_step(evidence: Evidence, traces: FrameIndex) -> Step:
     boxes = clusters.boxes(traces.result.config.clustering)
     for part in evidence.parts[:_SHOWN]:
         size = " x ".join(f"{v:.1f}" for v in boxes.size[part.cluster])
-        state = "" if part.kept else f", {state_text(part.state)}"
+        state = "" if part.kept else f", {kind_of(part.state).value}"
         name = _class_in_brackets(traces, part.cluster)
         texts.append(f"{part.points} in cluster {part.cluster}{name} of {part.count}, {size} m{state}")
         rows.append(
@@ -136,11 +134,10 @@ def _clustering_step(evidence: Evidence, traces: FrameIndex) -> Step:
     if len(evidence.parts) > _SHOWN:
         texts.append(f"{len(evidence.parts) - _SHOWN} clusters more")
     if evidence.noise and owner.ours:
-        config = traces.result.config.clustering
-        texts.append(
-            f"{evidence.noise} noise: at most {evidence.neighbours} neighbours within {config.eps:g} m, "
-            f"clustering.min_points is {config.min_points}"
-        )
+        config = traces.result.config
+        within = limit(config, "clustering.eps").number
+        most = f"at most {evidence.neighbours} neighbours within {within}"
+        texts.append(f"{evidence.noise} noise: {most}, {limit_of(ReasonKind.NOISE, config)}")
     elif evidence.noise:
         texts.append(f"{evidence.noise} in no cluster")
     if np.isfinite(evidence.apart):
@@ -169,7 +166,7 @@ def _merged_steps(evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
             if evidence.finer
             else "no smaller eps parts them"
         )
-        text += f", clustering.eps {traces.result.config.clustering.eps:g} m; {finer}"
+        text += f", {limit(traces.result.config, 'clustering.eps').short}; {finer}"
         numbers["eps_that_parts"] = evidence.finer
     yield Step("merged", text, numbers)
 
@@ -199,20 +196,11 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) ->
             "state": candidate.state.name.lower(),
             "row": candidate.row,
         }
-        text = f"{label(candidate)}{by}, overlap {candidate.overlap:.2f}: "
-        if candidate.state == DetectionState.BELOW_THRESHOLD:
-            text += f"below detector.conf_threshold {config.detector.conf_threshold:g}"
-        elif candidate.state == DetectionState.SUPPRESSED:
-            rival = int(detections.suppressed_by[candidate.row])
-            text += (
-                f"suppressed by {detections.names[rival]} {detections.score[rival]:.2f}, IoU "
-                f"{detections.overlap[candidate.row]:.2f} > "
-                f"detector.iou_threshold {config.detector.iou_threshold:g}"
-            )
-            numbers["suppressed_by"] = rival
-        else:
-            text += "kept"
-        yield Step("detector", text, numbers)
+        if candidate.state == DetectionState.SUPPRESSED:
+            numbers["suppressed_by"] = int(detections.suppressed_by[candidate.row])
+        reason = detection_reason(detections, candidate.row, config)
+        state = "kept" if candidate.kept else not_kept_text(reason)
+        yield Step("detector", f"{candidate.label}{by}, overlap {candidate.overlap:.2f}: {state}", numbers)
         if candidate.kept and fusion is not None:
             yield from _pair_steps(candidate, evidence, traces)
     more = len(evidence.candidates) - _SHOWN
@@ -240,11 +228,11 @@ def _pair_steps(candidate: Candidate, evidence: Evidence, traces: FrameIndex) ->
         cluster = int(pairs.cluster[row])
         if cluster not in interesting:
             continue
-        decision = state_text(Decision(int(fusion.cluster_decision[cluster])))
+        decision = kind_of(Decision(int(fusion.cluster_decision[cluster]))).value
         cost = "refused" if np.isinf(pairs.cost[row]) else f"cost {pairs.cost[row]:.2f}"
         yield Step(
             stage,
-            f"{label(candidate)} with cluster {cluster}: "
+            f"{candidate.label} with cluster {cluster}: "
             f"{pairs.points[row]} points, IoU {pairs.iou[row]:.2f}, "
             f"{pairs.distance[row]:.0f} px, {pairs.depth[row]:.1f} m, {cost}; that cluster ended {decision}",
             {
@@ -267,12 +255,11 @@ def _object_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) -> I
         yield Step("objects", f"none of the {number} objects of {owner.name} is there", {"by": owner.name})
         if fused_row >= 0 and opinions is not None:
             fused, object_row = opinions.fused, int(opinions.partner[fused_row])
-            text = f"{fused.names[fused_row]} {fused.score[fused_row]:.2f} of cluster "
-            text += f"{fused.cluster[fused_row]}, "
+            text = f"{scored(fused, fused_row)} of cluster {fused.cluster[fused_row]}, "
             if object_row < 0 or objects is None:
                 text += f"which {owner.name} has missed"
             else:
-                text += in_box_of(objects, object_row)
+                text += f"in the box of {scored(objects, object_row)}"
             yield Step("our fusion", text, {"row": fused_row, "missed": object_row < 0})
         return
     score = float(objects.score[evidence.named.row])

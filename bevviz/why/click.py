@@ -1,14 +1,11 @@
-"""Resolve a click in a view to the object or place that the user asks about."""
+"""Resolve a click in a view to the selection that the user asks about."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, Self, get_args
 
 import numpy as np
 
-from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.results import CameraResult, FrameResult, Tracks
 from bevviz.recording import entities
@@ -16,60 +13,12 @@ from bevviz.recording.boxes import confirmed_rows
 from bevviz.recording.labels import box_row
 from bevviz.recording.opinions import MISSED, opinion_outlines_in_bev, opinion_outlines_in_image
 from bevviz.recording.primitives import CORNER
-
-Kind = Literal["truth", "object", "detection", "cluster", "pixel", "point", "cell"]
-
-
-@dataclass(frozen=True, slots=True)
-class Pick:
-    """One object of a frame, or a place in it.
-
-    Attributes:
-        kind: kind of the object or place.
-        row: row in the ground truth, the objects, the clusters or the camera's detections.
-        camera: camera of a detection or pixel.
-        place: u, v in pixels, x, y, z in metres of ``Frame.points_frame``, or row, column of the BEV.
-    """
-
-    kind: Kind
-    row: int = -1
-    camera: str = ""
-    place: tuple[float, ...] = ()
-
-    @property
-    def is_place(self) -> bool:
-        """Whether the pick is a place, which may hold any number of objects."""
-        return self.kind in ("pixel", "point", "cell")
-
-    def __str__(self) -> str:
-        """As it stands in the page's address: ``detection/front/3``, ``point//1.5,2,0``."""
-        what = ",".join(f"{v:.4g}" for v in self.place) if self.place else str(self.row)
-        return f"{self.kind}/{self.camera}/{what}"
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Return the pick of an address such as ``detection/front/3``.
-
-        Raises:
-            UserError: the address is not valid.
-        """
-        kind, _, rest = text.partition("/")
-        camera, _, what = rest.rpartition("/")
-        size = {"pixel": 2, "point": 3, "cell": 2}.get(kind, 1)
-        try:
-            numbers = tuple(float(part) for part in what.split(","))
-        except ValueError:
-            numbers = ()
-        if kind not in get_args(Kind) or len(numbers) != size or not np.isfinite(numbers).all():
-            raise UserError(f"'{text}' is nothing that can be asked about")
-        if size == 1:
-            return cls(kind, int(numbers[0]), camera)  # type: ignore[arg-type]
-        return cls(kind, camera=camera, place=numbers)  # type: ignore[arg-type]
+from bevviz.why.selection import Selection
 
 
-def pick(
+def select_click(
     result: FrameResult, tracks: Tracks | None, path: str, instance: int | None, position: Sequence[float]
-) -> Pick | None:
+) -> Selection | None:
     """Return the object or place at a click in a view; None: nothing that can be explained.
 
     Args:
@@ -90,7 +39,7 @@ def pick(
     return _in_space(result, tracks, path, row) or _place_at(result, position)
 
 
-def _object_with_opinion(result: FrameResult, path: str, row: int) -> Pick | None:
+def _object_with_opinion(result: FrameResult, path: str, row: int) -> Selection | None:
     """Return an object with an opinion of the cameras, drawn over an image or the bird's-eye view."""
     views = [opinion_outlines_in_bev(result)] if path.startswith(f"{entities.BEV}/") else []
     views += [
@@ -102,21 +51,21 @@ def _object_with_opinion(result: FrameResult, path: str, row: int) -> Pick | Non
         if path in view and 0 <= (row := box_row(row, len(view[path].rows))) < len(view[path].rows):
             object_row = view[path].rows[row]
             is_missed = view[path].opinion == MISSED
-            return _fused_detection(result, object_row) if is_missed else Pick("object", object_row)
+            return _fused_detection(result, object_row) if is_missed else Selection(object=object_row)
     return None
 
 
-def _fused_detection(result: FrameResult, row: int) -> Pick | None:
+def _fused_detection(result: FrameResult, row: int) -> Selection | None:
     """Return the detection of an object of our fusion, where the objects are not ours."""
     if result.opinions is None:
         return None
     fused = result.opinions.fused
     if (row := box_row(row, len(fused))) >= len(fused):
         return None
-    return Pick("detection", int(fused.detection[row]), fused.camera[row])
+    return Selection(detection=int(fused.detection[row]), camera=fused.camera[row])
 
 
-def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[float]) -> Pick | None:
+def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[float]) -> Selection | None:
     """Return a detection or pixel of a camera."""
     name = camera.camera.name
     if camera.detections is not None and row >= 0:
@@ -124,25 +73,25 @@ def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[floa
         for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
             listed = np.flatnonzero(rows)
             if path == where and (row := box_row(row, len(listed))) < len(listed):
-                return Pick("detection", int(listed[row]), name)
+                return Selection(detection=int(listed[row]), camera=name)
     inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
         (f"{entities.image(name)}/", entities.why(f"{name}/"))
     )
     if not inside or len(position) < 2:
         return None
-    return Pick("pixel", camera=name, place=(position[0] - CORNER, position[1] - CORNER))
+    return Selection(box=(position[0] - CORNER, position[1] - CORNER), camera=name)
 
 
-def _cell(result: FrameResult, position: Sequence[float]) -> Pick | None:
+def _cell(result: FrameResult, position: Sequence[float]) -> Selection | None:
     """Return a cell of the bird's-eye view."""
     if result.bev is None:
         return None
     column, row = (int(np.floor(v)) for v in position[:2])
     height, width = result.bev.image.shape[:2]
-    return Pick("cell", place=(row, column)) if 0 <= row < height and 0 <= column < width else None
+    return Selection(cell=(row, column)) if 0 <= row < height and 0 <= column < width else None
 
 
-def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -> Pick | None:
+def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -> Selection | None:
     """Return the object, cluster, track or point that was clicked in a 3D view."""
     frame = result.frame
     if row < 0:
@@ -150,13 +99,12 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
     if path == entities.points(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
         return _point(frame.points[row])
     if path == entities.FUSED and (objects := result.objects) is not None:
-        return (
-            Pick("object", box_row(row, len(objects))) if box_row(row, len(objects)) < len(objects) else None
-        )
+        row = box_row(row, len(objects))
+        return Selection(object=row) if row < len(objects) else None
     if path == entities.FUSION:
         return _fused_detection(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
-        return Pick("truth", row)
+        return Selection(truth=row)
     if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:
         rows = confirmed_rows(tracks)
         named = tracks.object[rows] >= 0
@@ -164,26 +112,26 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
         return _track(result, tracks, int(listed[row])) if row < len(listed) else None
     if path == entities.set_aside(frame.lidar) and result.clusters is not None:
         aside = np.flatnonzero(~result.clusters.kept)
-        return Pick("cluster", int(aside[row])) if row < len(aside) else None
+        return Selection(cluster=int(aside[row])) if row < len(aside) else None
     return None
 
 
-def _track(result: FrameResult, tracks: Tracks, row: int) -> Pick | None:
+def _track(result: FrameResult, tracks: Tracks, row: int) -> Selection | None:
     """Return the cluster of a track, or the place where the track is expected."""
     if tracks.cluster[row] >= 0:
-        return Pick("cluster", int(tracks.cluster[row]))
+        return Selection(cluster=int(tracks.cluster[row]))
     center = tracks.boxes.center[row]
     return _place_at(result, center.tolist()) if tracks.absolute else _point(center)
 
 
-def _place_at(result: FrameResult, position: Sequence[float]) -> Pick | None:
+def _place_at(result: FrameResult, position: Sequence[float]) -> Selection | None:
     """Return the place at a position in the fixed frame."""
     if len(position) != 3:
         return None
     return _point(geometry.apply(geometry.inverse(result.frame.pose), np.array([position]))[0])
 
 
-def _point(xyz: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Pick:
+def _point(xyz: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Selection:
     """Return a point in Frame.points_frame."""
     x, y, z = map(float, xyz)
-    return Pick("point", place=(x, y, z))
+    return Selection(point=(x, y, z))

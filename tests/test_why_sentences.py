@@ -1,0 +1,155 @@
+"""The sentence of each kind of reason, as it stands in ``references/why_sentences.txt``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from bevviz.config import Config, load
+from bevviz.model.reasons import PARAMETERS, Limit, Reason, ReasonKind, Scored, limit_of
+from bevviz.model.results import Pair
+from bevviz.why.sentences import SENTENCES, make_verdict
+from bevviz.why.subject import Subject
+
+REFERENCE = Path(__file__).parent / "references/why_sentences.txt"
+CAR = Subject("truth", "the car at 10.1 m", "Car", frozenset({"car"}), 3)
+DETECTION = Subject("detection", "the car 0.46 in zed", "car", frozenset({"car"}), 1, "zed")
+POINT = Subject("point", "what is at 1, 2, 3 m")
+NAN = float("nan")
+OBJECT: dict[str, Any] = {
+    "object": Scored("car", 0.814),
+    "cluster": 7,
+    "by": "",
+    "opinion": "",
+    "camera": "zed",
+    "own": True,
+    "also": (8, 9),
+    "box_owner": "the van at 12.0 m",
+    "split_off": (),
+}
+PAIR: dict[str, Any] = {
+    "detection": Scored("car", 0.46),
+    "cluster": 7,
+    "matched": 4,
+    "compared": True,
+    "pair": Pair(12, 10.2, 0.07, 66.4, 1.0),
+    "centroid": False,
+    "mask": "",
+}
+SEEN: dict[str, Any] = {"detection": Scored("car", 0.0125), "by": "", "robot": False}
+GROUND = {"points": 540, "ground_points": 540, "removed": 429, "voxels": 430, "lowest": -0.1, "highest": 0.4}
+NOISE = {"obstacles": 9, "noise": 6, "neighbours": 4, "eps": 0.5, "by": "", "robot": False}
+K = ReasonKind
+CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
+    (K.REPORTED, True, OBJECT, CAR),
+    (K.REPORTED, True, {**OBJECT, "split_off": ((3, 120, 1500), (-1, 12, 80))}, CAR),
+    (K.REPORTED, True, {**OBJECT, "by": "/fused", "camera": ""}, CAR),
+    (K.REPORTED, True, {**OBJECT, "by": "/fused", "opinion": "confirmed by car 0.5 of zed"}, CAR),
+    (K.REPORTED, True, SEEN, DETECTION),
+    (K.SHARED_BOX, True, OBJECT, CAR),
+    (K.BORROWED, True, OBJECT, CAR),
+    (K.BORROWED, True, {**OBJECT, "box_owner": ""}, CAR),
+    (K.SPLIT, True, {"clusters": (1, 2, 3, 4, 5), "apart": 0.61, "by": ""}, CAR),
+    (K.SPLIT, False, {"clusters": (1, 2), "apart": NAN, "by": "/clusters"}, CAR),
+    (
+        K.MERGED,
+        False,
+        {"cluster": 7, "others": ("the van at 12.0 m",), "rest": 0, "gap": 0.31, "by": ""},
+        CAR,
+    ),
+    (K.MERGED, True, {"cluster": 7, "others": (), "rest": 31, "gap": NAN, "by": ""}, CAR),
+    (K.MISNAMED, False, {**OBJECT, "own": False, "object": Scored("truck", 0.6)}, CAR),
+    (K.FAILED, False, {"failures": (("ground", "no plane fits"),)}, CAR),
+    (K.FAILED, False, {"failures": ()}, CAR),
+    (K.OUT_OF_VIEW, False, {}, CAR),
+    (K.HIDDEN, False, {"points": 1, "in_front": 40, "aimed": 44, "front": 2, "front_name": "van"}, CAR),
+    (K.NO_POINTS, False, {"points": 0, "radius": None, "nearest": NAN}, CAR),
+    (K.NO_POINTS, False, {"points": 0, "radius": 0.5, "nearest": 3.14}, POINT),
+    (K.GROUND, False, {**GROUND, "by": ""}, CAR),
+    (K.GROUND, False, {**GROUND, "by": ""}, POINT),
+    (K.GROUND, False, {**GROUND, "ground_points": 400, "by": "my:ground"}, POINT),
+    (K.NOISE, False, NOISE, CAR),
+    (K.NO_CLUSTER, False, {**NOISE, "by": "my:cells"}, CAR),
+    (K.NO_CLUSTER, False, {**NOISE, **PAIR, "by": "/clusters", "robot": True}, CAR),
+    (K.TOO_SMALL, False, {"cluster": 7, "count": 5}, CAR),
+    (K.TOO_LARGE, False, {"cluster": 7, "count": 90_000}, CAR),
+    (K.NOT_RUN, False, {"problems": ("detector.model is not set",)}, CAR),
+    (K.NOT_DETECTED, False, {**SEEN, "detection": None}, CAR),
+    (K.NOT_DETECTED, False, {**SEEN, "by": "/camera_2d", "robot": True}, CAR),
+    (K.BELOW_THRESHOLD, False, SEEN, CAR),
+    (K.BELOW_THRESHOLD, False, SEEN, DETECTION),
+    (
+        K.SUPPRESSED,
+        False,
+        {**SEEN, "rival": Scored("truck", 0.6), "iou": 0.7, "rival_owner": "the van at 12.0 m"},
+        CAR,
+    ),
+    (K.NOT_FUSED, False, {"cameras": ("zed", "left"), "problems": ("no transform",)}, CAR),
+    (K.LOW_OVERLAP, False, PAIR, CAR),
+    (K.TOO_FEW_POINTS, False, {**PAIR, "pair": None}, CAR),
+    (K.TOO_FEW_POINTS, False, {**PAIR, "cluster": -1}, DETECTION),
+    (K.TOO_FAR, False, {**PAIR, "centroid": True}, CAR),
+    (K.TAKEN, False, {**PAIR, "taker": Scored("person", 0.57), "taker_owner": ""}, CAR),
+    (K.TAKEN, False, {**PAIR, "taker": None}, CAR),
+    (K.MISFIT, False, PAIR, CAR),
+    (K.OTHER_CLUSTER, False, {**PAIR, "mask": ", 9 of 12 points in the frustum lie in the mask"}, CAR),
+    (K.CONTRADICTED, True, {**OBJECT, "opinion": "contradicted by zed: no detection there"}, CAR),
+    (
+        K.NOT_AMONG,
+        False,
+        {
+            "by": "net.onnx",
+            "fused": None,
+            "cluster": -1,
+            "points": 3,
+            "detector_known": True,
+            "detection": None,
+        },
+        CAR,
+    ),
+    (
+        K.NOT_AMONG,
+        False,
+        {
+            "by": "net.onnx",
+            "fused": Scored("car", 0.7),
+            "camera": "zed",
+            "cluster": 7,
+            "points": 300,
+            "partner": Scored("truck", 0.4),
+        },
+        CAR,
+    ),
+    (
+        K.LOST_IN_FUSION,
+        False,
+        {
+            **PAIR,
+            "clustering": "/clusters",
+            "detector": "/camera_2d",
+            "objects": "/fused",
+            "ours": Reason(K.MATCHED),
+        },
+        CAR,
+    ),
+]
+NOT_OURS = ("my:", "/")  # names of stages whose parameters are not ours
+
+
+def sentence(
+    kind: ReasonKind, reported: bool, values: dict[str, Any], subject: Subject, config: Config
+) -> str:
+    ours = not str(values.get("by", "")).startswith(NOT_OURS)
+    limit = limit_of(kind, config) if ours and kind in PARAMETERS else None
+    if kind is K.SHARED_BOX:
+        limit = Limit("fusion.method", "centroid")
+    if kind is K.REPORTED and subject is DETECTION:
+        limit = limit_of(K.BELOW_THRESHOLD, config)
+    return make_verdict(subject, Reason(kind, limit, values), reported).text
+
+
+def test_each_kind_has_its_sentence() -> None:
+    config = load(settings=["clustering.max_cluster_points=50000"])
+    made = [f"{case[0].value}: {sentence(*case, config)}" for case in CASES]
+    assert made == REFERENCE.read_text(encoding="utf-8").splitlines()
+    assert {case[0] for case in CASES} == SENTENCES.keys()
