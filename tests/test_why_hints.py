@@ -12,7 +12,7 @@ from bevviz.config import load
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.hints import SURE, Hint, HintSearch
+from bevviz.why.hints import Hint, HintSearch, TriedChange
 from tests.support.planted_faults import at, run
 
 CLASSES = ("car", "person", "cyclist")
@@ -71,23 +71,19 @@ def test_a_change_of_limits_is_named_for_a_certain_detection() -> None:
     after = again("default", answer)
     named = after.evidence.named
     assert after.verdict.kind is ReasonKind.REPORTED and named is not None
-    assert max(c.overlap for c in after.evidence.candidates if c.row == named.detection) >= SURE
+    assert named.own and named.right
 
 
-def test_without_a_remedy_the_tried_range_is_stated() -> None:
+def test_without_a_remedy_each_tried_change_is_named() -> None:
     vain = [a for a in near("reference") if not a.hints and a.verdict.kind is not ReasonKind.REPORTED]
-    searches = [questioner("reference").search(a) for a in vain]
-    assert any(search.furthest for search in searches)
-    for answer, search in zip(vain, searches, strict=True):
-        assert search.tried > 1, "a change that the reason suggests is tried"
-        assert f"; none of the {search.tried} changes that were tried helps" in answer.verdict.text
-        if search.then is not None:
-            state = "reported, but" if search.reported else "lost as"
-            end = f": with {', '.join(search.furthest)} it is {state} '{search.then.value}'."
-            assert answer.verdict.text.endswith(end)
-            tried = replace(answer, hints=(_as_hint(search.furthest),))
-            there = again("reference", tried).verdict
-            assert (there.kind, there.reported) == (search.then, search.reported)
+    assert any(len(answer.tried) > 1 for answer in vain)
+    for answer in vain[:3]:
+        assert answer.tried, "a change that the reason suggests is tried"
+        assert all(change.text in answer.verdict.text for change in answer.tried)
+        assert " and ".join(answer.tried[0].settings) in answer.verdict.text
+        last = answer.tried[-1]
+        there = again("reference", replace(answer, hints=(_as_hint(last.settings),))).verdict
+        assert there.kind.value in last.text and there.reported == last.text.startswith("it is reported")
 
 
 def _as_hint(settings: tuple[str, ...]) -> Hint:
@@ -96,29 +92,30 @@ def _as_hint(settings: tuple[str, ...]) -> Hint:
 
 
 @pytest.mark.parametrize(
-    ("search", "said"),
+    ("tried", "said"),
     [
-        (HintSearch((), 1), "; the change that was tried does not help."),
-        (HintSearch((), 7), "; none of the 7 changes that were tried helps."),
         (
-            HintSearch((), 7, ("clustering.eps=0.3", "fusion.min_iou=0"), ReasonKind.TAKEN),
-            "; none of the 7 changes that were tried helps:"
-            " with clustering.eps=0.3, fusion.min_iou=0 it is lost as 'taken'.",
+            (TriedChange(("fusion.method=frustum",), "it is reported, but 'split'"),),
+            "; the one tried change does not help: with fusion.method=frustum it is reported, but 'split'.",
         ),
         (
-            HintSearch((), 1, ("fusion.method=frustum",), ReasonKind.SPLIT, True),
-            "; the change that was tried does not help:"
-            " with fusion.method=frustum it is reported, but 'split'.",
+            (
+                TriedChange(("clustering.eps=0.3",), "it stays 'merged'"),
+                TriedChange(("clustering.eps=0.4",), "it stays 'merged'"),
+                TriedChange(("clustering.eps=0.3", "fusion.min_iou=0"), "it is lost as 'taken'"),
+            ),
+            "; no tried change helps: with clustering.eps=0.3 or clustering.eps=0.4 it stays 'merged', "
+            "with clustering.eps=0.3 and fusion.min_iou=0 it is lost as 'taken'.",
         ),
-        (HintSearch((), 0), "."),
+        ((), "."),
     ],
 )
-def test_the_sentence_names_the_change(
-    search: HintSearch, said: str, monkeypatch: pytest.MonkeyPatch
+def test_the_sentence_names_the_changes(
+    tried: tuple[TriedChange, ...], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = questioner("reference")
     answer = asked.missed()[0]
-    monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: search)
+    monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: HintSearch((), tried))
     assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
 
 
@@ -131,7 +128,7 @@ def test_only_valid_values_are_tried(eps: float) -> None:
     odd = replace(answer, evidence=replace(answer.evidence, apart=float("nan")))
     split = replace(odd, verdict=replace(odd.verdict, reason=Reason(ReasonKind.SPLIT)))
     search = asked.search(split)
-    assert search.tried > 0
+    assert search.tried or search.hints
     assert all("nan" not in setting for hint in search.hints for setting in hint.settings)
 
 

@@ -8,8 +8,9 @@ from typing import Any
 from bevviz.config import Config, load
 from bevviz.model.reasons import PARAMETERS, Limit, Reason, ReasonKind, Scored, limit_of
 from bevviz.model.results import Pair
-from bevviz.why.sentences import SENTENCES, make_verdict
+from bevviz.why.sentences import FALSE_SENTENCES, SENTENCES, make_verdict
 from bevviz.why.subject import Subject
+from bevviz.why.verdict import FALSE as FALSE_KINDS
 
 REFERENCE = Path(__file__).parent / "references/why_sentences.txt"
 CAR = Subject("truth", "the car at 10.1 m", "Car", frozenset({"car"}), 3)
@@ -24,6 +25,7 @@ OBJECT: dict[str, Any] = {
     "camera": "zed",
     "own": True,
     "also": (8, 9),
+    "away": 2.96,
     "box_owner": "the van at 12.0 m",
     "split_off": (),
 }
@@ -36,7 +38,29 @@ PAIR: dict[str, Any] = {
     "centroid": False,
     "mask": "",
 }
-SEEN: dict[str, Any] = {"detection": Scored("car", 0.0125), "by": "", "robot": False}
+SEEN: dict[str, Any] = {"detection": Scored("car", 0.0125), "by": "", "robot": False, "shared": None}
+SHARED: dict[str, Any] = {
+    "shared": Scored("car", 0.38),
+    "overlap": 0.44,
+    "shared_owner": "the car at 18.0 m",
+}
+MERGED: dict[str, Any] = {
+    "cluster": 7,
+    "others": ("the van at 12.0 m",),
+    "rest": 0,
+    "gap": 0.31,
+    "by": "",
+    "joined_by": None,
+    "eps": 0.5,
+}
+ASIDE: dict[str, Any] = {
+    "cluster": 7,
+    "count": 5,
+    "clusters": 1,
+    "points": 5,
+    "taker": None,
+    "taker_owner": "",
+}
 GROUND = {"points": 540, "ground_points": 540, "removed": 429, "voxels": 430, "lowest": -0.1, "highest": 0.4}
 NOISE = {"obstacles": 9, "noise": 6, "neighbours": 4, "eps": 0.5, "by": "", "robot": False}
 K = ReasonKind
@@ -51,13 +75,12 @@ CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
     (K.BORROWED, True, {**OBJECT, "box_owner": ""}, CAR),
     (K.SPLIT, True, {"clusters": (1, 2, 3, 4, 5), "apart": 0.61, "by": ""}, CAR),
     (K.SPLIT, False, {"clusters": (1, 2), "apart": NAN, "by": "/clusters"}, CAR),
-    (
-        K.MERGED,
-        False,
-        {"cluster": 7, "others": ("the van at 12.0 m",), "rest": 0, "gap": 0.31, "by": ""},
-        CAR,
-    ),
-    (K.MERGED, True, {"cluster": 7, "others": (), "rest": 31, "gap": NAN, "by": ""}, CAR),
+    (K.MERGED, False, MERGED, CAR),
+    (K.MERGED, False, {**MERGED, "gap": 1.36}, CAR),
+    (K.MERGED, False, {**MERGED, "gap": 1.36, "joined_by": Scored("car", 0.46)}, CAR),
+    (K.MERGED, False, {**MERGED, "by": "/clusters"}, CAR),
+    (K.MERGED, True, {**MERGED, "others": (), "rest": 31, "gap": NAN}, CAR),
+    (K.MISPLACED, False, OBJECT, CAR),
     (K.MISNAMED, False, {**OBJECT, "own": False, "object": Scored("truck", 0.6)}, CAR),
     (K.FAILED, False, {"failures": (("ground", "no plane fits"),)}, CAR),
     (K.FAILED, False, {"failures": ()}, CAR),
@@ -71,10 +94,13 @@ CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
     (K.NOISE, False, NOISE, CAR),
     (K.NO_CLUSTER, False, {**NOISE, "by": "my:cells"}, CAR),
     (K.NO_CLUSTER, False, {**NOISE, **PAIR, "by": "/clusters", "robot": True}, CAR),
-    (K.TOO_SMALL, False, {"cluster": 7, "count": 5}, CAR),
-    (K.TOO_LARGE, False, {"cluster": 7, "count": 90_000}, CAR),
+    (K.TOO_SMALL, False, ASIDE, CAR),
+    (K.TOO_SMALL, False, {**ASIDE, "clusters": 2, "points": 11}, CAR),
+    (K.TOO_SMALL, False, {**ASIDE, "taker": Scored("car", 0.81), "taker_owner": "the van at 12.0 m"}, CAR),
+    (K.TOO_LARGE, False, {**ASIDE, "count": 90_000}, CAR),
     (K.NOT_RUN, False, {"problems": ("detector.model is not set",)}, CAR),
     (K.NOT_DETECTED, False, {**SEEN, "detection": None}, CAR),
+    (K.NOT_DETECTED, False, {**SEEN, "detection": None, **SHARED}, CAR),
     (K.NOT_DETECTED, False, {**SEEN, "by": "/camera_2d", "robot": True}, CAR),
     (K.BELOW_THRESHOLD, False, SEEN, CAR),
     (K.BELOW_THRESHOLD, False, SEEN, DETECTION),
@@ -133,6 +159,28 @@ CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
         CAR,
     ),
 ]
+FALSE: dict[str, Any] = {
+    "object": Scored("car", 0.31),
+    "cluster": 7,
+    "truth": "the car at 38.6 m",
+    "away": 3.04,
+    "other": Scored("car", 0.9),
+    "off": -18.0,
+    "size": (12.3, 3.4),
+    "camera": "zed",
+}
+FALSE_CASES = [
+    (K.DUPLICATE, FALSE),
+    (K.DUPLICATE, {**FALSE, "truth": ""}),
+    (K.SPLIT, FALSE),
+    (K.MISNAMED, FALSE),
+    (K.MISPLACED, FALSE),
+    (K.WRONG_DEPTH, FALSE),
+    (K.WRONG_DEPTH, {**FALSE, "truth": "", "off": 4.2}),
+    (K.WALL, FALSE),
+    (K.DETECTOR_ERROR, FALSE),
+]
+OBJECT_SUBJECT = Subject("object", "the car 0.31 at 20.4 m", "car", frozenset({"car"}), 2)
 NOT_OURS = ("my:", "/")  # names of stages whose parameters are not ours
 
 
@@ -151,5 +199,10 @@ def sentence(
 def test_each_kind_has_its_sentence() -> None:
     config = load(settings=["clustering.max_cluster_points=50000"])
     made = [f"{case[0].value}: {sentence(*case, config)}" for case in CASES]
+    for kind, values in FALSE_CASES:
+        made.append(
+            f"false, {kind.value}: {make_verdict(OBJECT_SUBJECT, Reason(kind, None, values), True).text}"
+        )
     assert made == REFERENCE.read_text(encoding="utf-8").splitlines()
     assert {case[0] for case in CASES} == SENTENCES.keys()
+    assert {case[0] for case in FALSE_CASES} == FALSE_SENTENCES.keys() == FALSE_KINDS

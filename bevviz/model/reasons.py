@@ -26,6 +26,11 @@ class ReasonKind(StrEnum):
     SPLIT = "split"
     MERGED = "merged"
     MISNAMED = "misnamed"
+    MISPLACED = "misplaced"  # its object is farther off than evaluate allows
+    DUPLICATE = "duplicate"  # false: a second object of something that another object is already
+    WRONG_DEPTH = "wrong depth"  # false: the detection is right, and the points are of something else
+    WALL = "wall in the frustum"  # false: its points are a part of something larger
+    DETECTOR_ERROR = "detector's own error"  # false: nothing is where the detector sees it
     FAILED = "failed"
     OUT_OF_VIEW = "out of view"
     HIDDEN = "hidden"

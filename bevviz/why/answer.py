@@ -15,14 +15,17 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
-from bevviz.why.hints import Hint, HintFinder, HintSearch
-from bevviz.why.resolve import select_subjects, subjects_at_place
+from bevviz.why.hints import Hint, HintFinder, HintSearch, TriedChange
+from bevviz.why.resolve import object_subject, select_subjects, subjects_at_place
 from bevviz.why.selection import Selection
 from bevviz.why.sentences import make_verdict
 from bevviz.why.steps import Step, steps_of
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import HOPELESS, Verdict, find_reason
+from bevviz.why.verdict import FALSE, HOPELESS, Verdict, find_reason
+
+NAMED = 3  # tried changes of the same result that a sentence names
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,7 @@ class Answer:
         distance: horizontal metres, NaN where unknown.
         points: number of raw points on the subject.
         evidence: the points, clusters and detections of the subject.
+        tried: changes that were run and did not help.
     """
 
     subject: Subject
@@ -48,6 +52,7 @@ class Answer:
     distance: float
     points: int
     evidence: Evidence = field(repr=False)
+    tried: tuple[TriedChange, ...] = ()
 
     @property
     def near(self) -> bool:
@@ -61,6 +66,11 @@ class Answer:
         low = kind in (ReasonKind.BELOW_THRESHOLD, ReasonKind.SUPPRESSED)
         low |= kind is ReasonKind.NOT_AMONG and best is not None and not best.kept
         return self.subject.kind == "detection" and low
+
+    @property
+    def false(self) -> bool:
+        """Whether the subject is an object that no ground truth explains, or that looks doubtful."""
+        return self.subject.kind == "object" and self.verdict.kind in FALSE
 
     @property
     def folded(self) -> bool:
@@ -106,8 +116,10 @@ class Answer:
             "reason": verdict.kind.value,
             "verdict": verdict.text,
             "folded": self.folded,
+            "false": self.false,
             "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
             "hints": [_hint_dict(hint) for hint in self.hints],
+            "tried": [{"settings": list(change.settings), "text": change.text} for change in self.tried],
         }
 
 
@@ -209,6 +221,11 @@ class FrameExplainer:
         ]
         return sorted(answers, key=_sort_distance)
 
+    def false_objects(self) -> list[Answer]:
+        """Explain the objects that no ground truth explains; without ground truth, the doubtful ones."""
+        rows = false_reasons(self.traces)
+        return [self._answer(object_subject(self.traces, row)) for row in rows]
+
     def search(self, answer: Answer) -> HintSearch:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
@@ -221,13 +238,13 @@ class FrameExplainer:
         if not hints:
             if verdict.kind is ReasonKind.REPORTED or answer.folded or not search.tried:
                 return answer
-            text = f"{verdict.text.removesuffix('.')}; {_no_help_text(search)}."
-            return replace(answer, verdict=replace(verdict, text=text))
+            text = f"{verdict.text.removesuffix('.')}; {_no_help_text(search.tried)}."
+            return replace(answer, verdict=replace(verdict, text=text), tried=search.tried)
         hint = hints[0]
         also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
         settings = ", ".join(hint.settings)
         text = f"{verdict.text.removesuffix('.')}; change {settings}: {hint.text}{also}."
-        return replace(answer, verdict=replace(verdict, text=text), hints=hints)
+        return replace(answer, verdict=replace(verdict, text=text), hints=hints, tried=search.tried)
 
     def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""
@@ -256,14 +273,20 @@ def why(
     return FrameExplainer(result, loader, classes).explain(selection, hints, everything=everything)
 
 
-def _no_help_text(search: HintSearch) -> str:
-    """Say that no change helps, and how far the best one brings the subject."""
-    count = "the change" if search.tried == 1 else f"none of the {search.tried} changes"
-    helps = "that was tried does not help" if search.tried == 1 else "that were tried helps"
-    if search.then is None:
-        return f"{count} {helps}"
-    outcome = "reported, but" if search.reported else "lost as"
-    return f"{count} {helps}: with {', '.join(search.furthest)} it is {outcome} '{search.then.value}'"
+def _no_help_text(tried: Sequence[TriedChange]) -> str:
+    """Say which changes were tried and the result of each."""
+    by_result: dict[str, list[str]] = {}
+    for change in tried:
+        by_result.setdefault(change.text, []).append(" and ".join(change.settings))
+    results = ", ".join(f"with {_some(settings)} {text}" for text, settings in by_result.items())
+    head = "no tried change helps" if tried[1:] else "the one tried change does not help"
+    return f"{head}: {results}"
+
+
+def _some(settings: Sequence[str]) -> str:
+    """Name the first settings and the number of the others."""
+    more = f" or {len(settings) - NAMED} more" if len(settings) > NAMED else ""
+    return " or ".join(settings[:NAMED]) + more
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:

@@ -43,7 +43,8 @@ def _listed(others: Sequence[Answer]) -> Iterator[str]:
 
 def summary_line(answers: Sequence[Answer]) -> str:
     """Return one line about a frame. It needs the answers about all objects, reported ones included."""
-    things = [answer for answer in answers if not answer.weak]
+    false = sum(answer.false for answer in answers)
+    things = [answer for answer in answers if not answer.weak and not answer.false]
     reported = [answer for answer in things if answer.verdict.reported]
     flawed = [answer for answer in reported if answer.verdict.kind is not ReasonKind.REPORTED]
     hopeless = [answer for answer in things if answer.verdict.kind in HOPELESS]
@@ -51,13 +52,16 @@ def summary_line(answers: Sequence[Answer]) -> str:
         answer for answer in things if not answer.verdict.reported and answer.verdict.kind not in HOPELESS
     ]
     near = [answer for answer in missed if answer.near]
+    known = any(answer.subject.kind == "truth" for answer in answers)
     parts = [f"{len(reported)} reported" + (f" ({len(flawed)} with a flaw)" if flawed else "")]
     parts.append(f"{len(near)} missed within {RANGE:g} m with {MIN_HITS} points or more")
     if len(missed) > len(near):
         parts.append(f"{len(missed) - len(near)} missed farther off or with fewer points")
     if hopeless:
         parts.append(f"{len(hopeless)} hidden, out of view or without points")
-    weak = len(answers) - len(things)
+    if false:
+        parts.append(f"{false} {'false' if known else 'doubtful'}")
+    weak = sum(answer.weak for answer in answers)
     if weak:
         parts.append(count(weak, "weak detection"))
     if any(answer.verdict.kind is ReasonKind.NOT_RUN for answer in missed):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.subject import LINK, Subject, points_in_box, projected_box, single_box
 
+SURE = 0.5  # overlap from which a detection surely belongs to its object
 COVERED = 0.8  # share of a cluster's image box that a detection of it covers
 
 
@@ -26,7 +28,11 @@ def find_candidates(
         if detections is None or (subject.camera and camera.camera.name != subject.camera):
             continue
         rows, overlap = _rows_of_subject(subject, traces, camera, parts)
-        candidates += [_candidate(camera, int(row), float(overlap[row])) for row in rows]
+        fits = traces.fits(camera)
+        for row in rows.tolist():
+            candidate, owner = _candidate(camera, row, float(overlap[row])), int(fits.owner[row])
+            own = subject.kind != "truth" or fits.belongs(row, subject.row)
+            candidates.append(replace(candidate, own=own, owner=owner))
     return tuple(candidates)
 
 
@@ -42,10 +48,8 @@ def _rows_of_subject(
         overlap = geometry.iou(subject.xyxy[None], detections.xyxy)[0]
         return np.flatnonzero((np.array(detections.names) == subject.label) & (overlap > 0.99)), overlap
     if subject.kind == "truth":
-        box = projected_box(subject.box, camera.camera) if subject.box is not None else None
-        around = np.full((1, 4), np.nan, np.float32) if box is None else box[None]
-        overlap = geometry.iou(around, detections.xyxy)[0]
-        return np.flatnonzero(traces.owners(camera) == subject.row), overlap
+        overlap = traces.fits(camera).overlap[:, subject.row]
+        return np.flatnonzero(overlap >= LINK), overlap
     kept = [part.cluster for part in parts if part.kept]
     if not kept:
         nothing = np.zeros(len(detections), np.float32)
@@ -88,10 +92,10 @@ def _may_belong(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool
 def sort_candidates(
     candidates: Sequence[Candidate], subject: Subject, main: int, threshold: float
 ) -> tuple[Candidate, ...]:
-    """Sort detections: right class, kept, matched with the subject's cluster, high score times overlap."""
+    """Sort detections: own, right class, kept, matched with its cluster, surely its own, high score."""
     known = subject.kind in ("truth", "detection")
 
-    def rank(candidate: Candidate) -> tuple[bool, bool, bool, bool, bool, bool, float]:
+    def rank(candidate: Candidate) -> tuple[bool | float, ...]:
         """Return the sort key of a detection."""
         matched = candidate.decision == Decision.MATCHED and candidate.cluster == main
         suppressed = candidate.state == DetectionState.SUPPRESSED
@@ -99,12 +103,14 @@ def sort_candidates(
         elsewhere = not known and candidate.decision == Decision.MATCHED and not matched
         sure = candidate.overlap * candidate.score
         return (
+            not candidate.own,
             not subject.accepts(candidate.name),
             elsewhere,
             not candidate.kept,
             weak,
             suppressed,
             not matched,
+            known and candidate.overlap < SURE,
             -sure,
         )
 
@@ -150,9 +156,14 @@ def find_reported_object(
         rows = list(_objects_at_place(subject, traces))
     accepts = subject.accepts if traces.origin("objects").ours else subject.accepts_of_others
     rows.sort(key=lambda row: not accepts(objects.names[row]))
-    for row in rows:
-        return _reported_object(subject, row, result, candidates)
-    return None
+    if subject.kind != "truth":
+        return _reported_object(subject, rows[0], traces, candidates, right=True) if rows else None
+    assert traces.matches is not None
+    partner = traces.matches.partner
+    counted = np.flatnonzero(partner == subject.row).tolist()
+    rows.sort(key=lambda row: bool(partner[row] >= 0))  # Those that count for another label come last.
+    rows = [*counted, *rows]
+    return _reported_object(subject, rows[0], traces, candidates, right=bool(counted)) if rows else None
 
 
 def find_fused(subject: Subject, evidence: Evidence, traces: FrameIndex) -> int:
@@ -187,10 +198,10 @@ def opinion_on(result: FrameResult, row: int) -> str:
 
 
 def _reported_object(
-    subject: Subject, row: int, result: FrameResult, candidates: Sequence[Candidate]
+    subject: Subject, row: int, traces: FrameIndex, candidates: Sequence[Candidate], *, right: bool
 ) -> ReportedObject:
     """Return the object with the detection that named it."""
-    objects = result.objects
+    result, objects = traces.result, traces.result.objects
     assert objects is not None
     camera, detection, cluster = objects.camera[row], int(objects.detection[row]), int(objects.cluster[row])
     also: list[int] = []
@@ -206,8 +217,14 @@ def _reported_object(
     is_own = any(
         (candidate.camera, candidate.row) == (camera, detection) and (known or candidate.overlap >= LINK)
         for candidate in candidates
+        if candidate.own
     )
-    return ReportedObject(row, objects.names[row], cluster, camera, detection, is_own, tuple(also))
+    counts_for = -1 if traces.matches is None else int(traces.matches.partner[row])
+    away = float("nan")
+    if subject.box is not None:
+        away = float(np.linalg.norm(objects.boxes.center[row, :2] - subject.box.center[0, :2]))
+    name, others = objects.names[row], tuple(also)
+    return ReportedObject(row, name, cluster, camera, detection, is_own, others, right, away, counts_for)
 
 
 def _objects_of_clusters(

@@ -32,12 +32,14 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     fate[points] = traces.fate[points]
     rows, heights = np.zeros(0, np.int64), np.zeros(0, np.float32)
     obstacle, labels = np.zeros(0, np.int64), np.zeros(0, np.int32)
+    noise = np.zeros(0, np.int64)
     if voxels is not None and ground is not None:
         rows = np.unique(voxels.inverse[points]).astype(np.int64)
         heights = ground.height[rows[traces.obstacle[rows] < 0]]
         obstacle = traces.obstacle[rows][traces.obstacle[rows] >= 0]
         if result.clusters is not None:
             labels = result.clusters.labels[obstacle]
+            noise = obstacle[(labels < 0) & (traces.first_labels[obstacle] < 0)]
     parts = _parts(labels, result)
     candidates = find_candidates(subject, traces, parts)
     main = _main_cluster(subject, parts, candidates, len(labels))
@@ -45,7 +47,6 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     if named is not None and named.cluster >= 0:
         main = named.cluster
     candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
-    noise = obstacle[labels < 0]
     mates = find_mates(subject, traces, main, obstacle)
     shared = separation(subject, traces, main, obstacle, mates)
     hiding = traces.cluster[front_rows]
@@ -57,7 +58,7 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         distance=_distance(subject, traces, points, main),
         voxels=len(rows),
         ground=heights,
-        noise=len(noise) if result.clusters is not None else 0,
+        noise=len(noise),
         neighbours=_most_neighbours(result.obstacles, noise, config.eps)
         if traces.origin("clustering").ours
         else 0,
@@ -72,6 +73,7 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         others=tuple((name, count) for _, name, count in mates),
         gap=shared[0],
         finer=shared[1],
+        joined_by=shared[2],
         apart=_largest_gap(result, parts),
         in_view=bool(candidates) or _in_view(subject, traces),
     )

@@ -14,6 +14,7 @@ from bevviz.model.results import (
     FrameResult,
     Fusion,
 )
+from bevviz.why.subject import Subject
 
 MOST = 0.5  # least share of the main cause, and of a cluster that belongs mostly to one object
 
@@ -42,9 +43,11 @@ class Candidate:
     name: str
     score: float
     state: DetectionState
-    overlap: float  # IoU with the projected subject; 1 for the subject itself
+    overlap: float  # how well it fits the subject, 0 to 1; 1 for the subject itself
     decision: Decision
     cluster: int  # the matched cluster, or the best one that was refused, else -1
+    own: bool = True  # whether it is a detection of the subject, and not of another object that it fits, too
+    owner: int = -1  # row of the ground truth object that it is the box of, -1: none
 
     @property
     def label(self) -> Scored:
@@ -69,6 +72,9 @@ class ReportedObject:
         detection: row of that detection, -1: none.
         own: whether that detection belongs to the subject.
         also: other clusters that the same detection named.
+        right: whether it counts for the subject; for ground truth, by the rule of ``evaluate``.
+        away: metres on the ground between its box and that of the subject; NaN where unknown.
+        counts_for: row of the ground truth object that ``evaluate`` counts it for, -1: none.
     """
 
     row: int
@@ -78,6 +84,9 @@ class ReportedObject:
     detection: int
     own: bool
     also: tuple[int, ...]
+    right: bool
+    away: float
+    counts_for: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +99,7 @@ class Evidence:
         distance: horizontal metres from the origin of the points; NaN where unknown.
         voxels: number of voxels of the subject.
         ground: heights in metres above the local ground of its voxels that are ground.
-        noise: number of its voxels that are in no cluster.
+        noise: number of its voxels that the clustering itself put in no cluster.
         neighbours: most neighbours within clustering.eps that one of its noise voxels has, itself included;
             0: no noise.
         parts: its clusters, the one with most points first.
@@ -104,6 +113,7 @@ class Evidence:
         others: names of these mates, with their points.
         gap: metres between its points and the nearest mate, or the rest of its cluster; NaN: no mate.
         finer: largest eps that separates them when the points are clustered again; 0: none does.
+        joined_by: detection for which the fusion joined them; None: the clustering itself did.
         apart: metres between its two largest clusters, NaN without two.
         in_view: whether a camera has it in its image.
     """
@@ -126,6 +136,7 @@ class Evidence:
     others: tuple[tuple[str, int], ...]
     gap: float
     finer: float
+    joined_by: Scored | None
     apart: float
     in_view: bool
 
@@ -140,9 +151,23 @@ class Evidence:
         return self.voxels - len(self.ground)
 
     @property
+    def own_candidates(self) -> tuple[Candidate, ...]:
+        """Its detections without those of other objects that fit it, too."""
+        return tuple(candidate for candidate in self.candidates if candidate.own)
+
+    @property
     def best(self) -> Candidate | None:
-        """Its most significant detection."""
-        return self.candidates[0] if self.candidates else None
+        """Its most significant detection, which is not that of another object."""
+        return self.candidates[0] if self.candidates and self.candidates[0].own else None
+
+    def shared(self, subject: Subject) -> Candidate | None:
+        """Return the best detection of its class that fits it, but is the box of another object."""
+        others = (
+            candidate
+            for candidate in self.candidates
+            if not candidate.own and candidate.owner >= 0 and subject.accepts(candidate.name)
+        )
+        return max(others, key=lambda candidate: (candidate.kept, candidate.overlap), default=None)
 
     def part(self, cluster: int) -> ClusterPart | None:
         """Return its part in a cluster, None if it has no points there."""
@@ -154,10 +179,17 @@ class Evidence:
         return next((part for part in self.parts if not part.kept), None)
 
     @property
+    def aside_points(self) -> int:
+        """Number of its voxels in clusters outside the size limits."""
+        return sum(part.points for part in self.parts if not part.kept)
+
+    @property
     def purity(self) -> float:
         """Share of its main cluster that belongs to it; 1 without a cluster."""
         part = self.part(self.main)
-        return 1.0 if part is None else part.points / max(part.count, 1)
+        if part is None:
+            return 1.0 if self.main < 0 else 0.0
+        return part.points / max(part.count, 1)
 
 
 def camera_and_fusion(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 
+from bevviz.evaluate import Matches, Truth, judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
-from bevviz.model.reasons import StageOwner, owner_of
-from bevviz.model.results import CameraResult, Decision, Detections, FrameResult
+from bevviz.model.reasons import Reason, StageOwner, owner_of
+from bevviz.model.results import CameraResult, Decision, FrameResult
+from bevviz.stages.clustering import dbscan
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.stages.visibility import share_in_image
-from bevviz.why.subject import FOOT, LINK, MARGIN, Subject, points_in_box, projected_box, single_box
+from bevviz.why.fits import Fits, find_fits
+from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_box, single_box
 
-SAME_CLASS = 1.3  # factor on the overlap of a detection with an object of its class
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
 DEPTH = 1.5  # metres of depth that the visible part of an object takes
@@ -61,14 +63,16 @@ class FrameIndex:
         self.classes = tuple(dict.fromkeys([*classes, *seen]))
         self._places: dict[tuple[object, ...], I64] = {}
         self._uv: dict[str, F32] = {}
-        self._owners: dict[str, tuple[Detections, I64]] = {}  # camera -> detections, their owners
+        self._fits: dict[str, Fits] = {}  # by camera
+        self._truth_boxes: dict[str, tuple[F32, F32]] = {}  # by camera
         self._labels: dict[int, I32] = {}
+        self.false: Mapping[int, Reason] | None = None  # causes of false objects, when they are known
 
     def for_result(self, result: FrameResult) -> FrameIndex:
         """Return the index of another result of the same frame. Arrays of the frame alone are shared."""
         other = FrameIndex(result, self.classes)
-        other._places, other._uv, other._owners = self._places, self._uv, dict(self._owners)
-        other.truth, other.shown = self.truth, self.shown
+        other._places, other._uv, other._truth_boxes = self._places, self._uv, self._truth_boxes
+        other.truth, other.shown, other.labels_in_evaluate = self.truth, self.shown, self.labels_in_evaluate
         other.directions, other._by_x = self.directions, self._by_x
         return other
 
@@ -109,6 +113,18 @@ class FrameIndex:
         of_voxel = np.full(len(ground.mask), -1, np.int32)
         of_voxel[~ground.mask] = clusters.labels
         return of_voxel[voxels.inverse]
+
+    @cached_property
+    def first_labels(self) -> I32:
+        """(M,) label that the clustering itself gave each obstacle, before detections divided clusters."""
+        result = self.result
+        if result.clusters is None or result.obstacles is None:
+            return np.zeros(0, np.int32)
+        is_divided = result.splits is not None and len(result.splits) > 0
+        if not is_divided or not self.origin("clustering").ours:
+            return result.clusters.labels
+        config = result.config.clustering
+        return dbscan(result.obstacles, config.eps, config.min_points)
 
     @cached_property
     def fate(self) -> U8:
@@ -215,6 +231,18 @@ class FrameIndex:
         return truth_subjects(self.result.frame, self.classes)
 
     @cached_property
+    def labels_in_evaluate(self) -> Truth | None:
+        """The ground truth in the form that ``evaluate`` judges objects by."""
+        frame = self.result.frame
+        return None if frame.truth is None else truth_of(frame, frame.truth)
+
+    @cached_property
+    def matches(self) -> Matches | None:
+        """The judgement of ``evaluate`` about the objects of the frame."""
+        objects, truth = self.result.objects, self.labels_in_evaluate
+        return None if objects is None or truth is None else judge(objects, truth)
+
+    @cached_property
     def of_truth(self) -> Bool:
         """(K,) whether at least half of a cluster's points are on objects of the ground truth."""
         known = np.zeros(len(self.result.frame.points), np.bool_)
@@ -237,16 +265,12 @@ class FrameIndex:
     def labels(self, row: int) -> I32:
         """Return the cluster of each obstacle voxel of an object of the ground truth, -1: noise."""
         if row not in self._labels:
-            self._labels[row] = self.labels_of(self.place(self.truth[row]))
+            voxels, clusters, points = self.result.voxels, self.result.clusters, self.place(self.truth[row])
+            if voxels is None or clusters is None:
+                return np.zeros(0, np.int32)
+            obstacle = self.obstacle[np.unique(voxels.inverse[points])]
+            self._labels[row] = clusters.labels[obstacle[obstacle >= 0]]
         return self._labels[row]
-
-    def labels_of(self, points: I64) -> I32:
-        """Return the cluster of each obstacle voxel that holds these raw points, -1: noise."""
-        voxels, clusters = self.result.voxels, self.result.clusters
-        if voxels is None or clusters is None or self.result.ground is None:
-            return np.zeros(0, np.int32)
-        obstacle = self.obstacle[np.unique(voxels.inverse[points])]
-        return clusters.labels[obstacle[obstacle >= 0]]
 
     def voxels_in_cluster(self, cluster: int, row: int) -> int:
         """Return the voxels of a ground truth object in a cluster, 0 if they are a small part of it."""
@@ -268,47 +292,38 @@ class FrameIndex:
             if near.all() and self.voxels_in_cluster(cluster, other.row):
                 yield other.row
 
-    def owners(self, camera: CameraResult) -> I64:
-        """Return the (D,) row of the ground truth object of each detection, -1: none.
-
-        A detection belongs to the object with the largest overlap. Some detectors box the visible part of an
-        object, others guess all of it. So the overlap combines two IoU: with the projected box of the object,
-        and with the image box around its own points, which other objects do not cover. The larger IoU weighs
-        three times as much.
-        """
+    def fits(self, camera: CameraResult) -> Fits:
+        """Return how well each detection of a camera fits each object of the ground truth."""
         name, detections = camera.camera.name, camera.detections
         assert detections is not None
-        known, owners = self._owners.get(name, (None, None))
-        if owners is None or known is None or not _same_boxes(known, detections):
-            owners = self._find_owners(camera, detections)
-            self._owners[name] = detections, owners
-        return owners
+        if name not in self._fits:
+            names = {name: [subject.accepts(name) for subject in self.truth] for name in {*detections.names}}
+            accepted = np.array([names[name] for name in detections.names], np.bool_)
+            self._fits[name] = find_fits(detections, *self._image_boxes(camera), accepted)
+        return self._fits[name]
 
-    def _find_owners(self, camera: CameraResult, detections: Detections) -> I64:
-        """Find the ground truth object of each detection."""
-        owner = np.full(len(detections), -1, np.int64)
-        column = [c.camera.name for c in self.result.cameras].index(camera.camera.name)
-        rows = [row for row in range(len(self.truth)) if self.shown[row, column] > 0]
-        whole = np.full((len(rows), 4), np.nan, np.float32)
-        seen = whole.copy()
-        for i, row in enumerate(rows):
-            box = self.truth[row].box
-            around = projected_box(box, camera.camera) if box is not None else None
-            if around is not None:
-                whole[i] = around
+    def owners(self, camera: CameraResult) -> I64:
+        """Return the (D,) row of the ground truth object of each detection, -1: none."""
+        return self.fits(camera).owner
+
+    def _image_boxes(self, camera: CameraResult) -> tuple[F32, F32]:
+        """Return (K, 4) projected boxes of the ground truth, and the image boxes around their points."""
+        name = camera.camera.name
+        if name not in self._truth_boxes:
+            column = [c.camera.name for c in self.result.cameras].index(name)
+            whole = np.full((len(self.truth), 4), np.nan, np.float32)
+            seen = whole.copy()
+            for row in np.flatnonzero(self.shown[:, column] > 0).tolist():
+                box = self.truth[row].box
+                around = projected_box(box, camera.camera) if box is not None else None
+                if around is None:
+                    continue
+                whole[row] = around
                 inside = self._in_image(self.uv(camera)[self.place(self.truth[row])], around)
                 if len(inside) >= FEW:
-                    seen[i] = *inside.min(0), *inside.max(0)
-        if not rows or not len(detections):
-            return owner
-        both = geometry.iou(detections.xyxy, whole), geometry.iou(detections.xyxy, seen)
-        overlap = 0.75 * np.maximum(*both) + 0.25 * np.minimum(*both)
-        overlap[:, np.isnan(seen[:, 0])] = both[0][:, np.isnan(seen[:, 0])] / 2
-        same = np.array([[self.truth[row].accepts(name) for row in rows] for name in detections.names])
-        best = (overlap * np.where(same, SAME_CLASS, 1.0)).argmax(axis=1)
-        sure = overlap[np.arange(len(best)), best] >= LINK
-        owner[sure] = np.array(rows)[best[sure]]
-        return owner
+                    seen[row] = *inside.min(0), *inside.max(0)
+            self._truth_boxes[name] = whole, seen
+        return self._truth_boxes[name]
 
     @staticmethod
     def _in_image(uv: F32, box: F32) -> F32:
@@ -350,11 +365,6 @@ def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, 
         )
         for row, label in enumerate(stated.labels)
     )
-
-
-def _same_boxes(a: Detections, b: Detections) -> bool:
-    """Return whether two lists of detections differ in their states only."""
-    return a is b or (a.names == b.names and np.array_equal(a.xyxy, b.xyxy))
 
 
 def joined_boxes(boxes: Sequence[Boxes3D]) -> Boxes3D:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -11,48 +10,29 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bevviz.config import Config, plugin_of
+from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.frame import Camera
 from bevviz.model.reasons import Reason, ReasonKind
-from bevviz.model.results import Detections, DetectionState, FrameResult
+from bevviz.model.results import Detections, DetectionState
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.pipeline.stage_log import Memo
+from bevviz.why.belonging import SURE
+from bevviz.why.changes import Change, changes_for
 from bevviz.why.collect import collect_evidence
-from bevviz.why.evidence import Candidate, Evidence
+from bevviz.why.evidence import Evidence
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import FLAWED, find_reason
+from bevviz.why.verdict import FALSE, FLAWED, find_reason
 
 TRIES = 10  # configurations to run for one subject
-SURE = 0.5  # IoU from which a detection surely belongs to its object
 FURTHER = 10  # more configurations, combined with the best changes so far
 RESULTS = 20  # results of other configurations in the cache, for other subjects of the frame
 
-Change = Mapping[str, Any]  # dotted key -> value
-
-# Parameters that bevviz applies to the output of user functions, too.
-_SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
-_SECTION = {  # kind of reason -> section whose parameters may help
-    ReasonKind.GROUND: "ground",
-    ReasonKind.NOISE: "clustering",
-    ReasonKind.NO_CLUSTER: "clustering",
-    ReasonKind.MERGED: "clustering",
-    ReasonKind.SPLIT: "clustering",
-    ReasonKind.NOT_DETECTED: "detector",
-    ReasonKind.BELOW_THRESHOLD: "detector",
-    ReasonKind.NOT_AMONG: "objects",
-    ReasonKind.MISNAMED: "objects",
-}
-_OTHER_OWNER = {  # another subject has the detection or the cluster
-    ReasonKind.SHARED_BOX,
-    ReasonKind.BORROWED,
-    ReasonKind.TAKEN,
-    ReasonKind.OTHER_CLUSTER,
-    ReasonKind.MISNAMED,
-}
 _ORDER = {kind: place for place, kind in enumerate(ReasonKind)}  # in the order of the stages
 
 
@@ -93,22 +73,24 @@ class Hint:
 
 
 @dataclass(frozen=True, slots=True)
+class TriedChange:
+    """A change that was run and did not help: its settings, and the result for the subject."""
+
+    settings: tuple[str, ...]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class HintSearch:
     """Result of the search for hints on one subject.
 
     Attributes:
         hints: the best change that changes the verdict; empty: no tried change does.
-        tried: number of configurations that were run.
-        furthest: settings that bring the subject to a later stage, if no hint helps; empty: none does.
-        then: kind of the reason of the subject with these settings.
-        reported: whether the subject is reported with these settings.
+        tried: the changes that were run and did not help.
     """
 
     hints: tuple[Hint, ...]
-    tried: int
-    furthest: tuple[str, ...] = ()
-    then: ReasonKind | None = None
-    reported: bool = False
+    tried: tuple[TriedChange, ...]
 
 
 class HintFinder:
@@ -134,11 +116,11 @@ class HintFinder:
         hints: list[Hint] = []
         start = _ReachedStage(reported, reason.kind)
         reached: dict[_ReachedStage, _Step] = {}  # by the mildest change
-        tried = 0
+        tried: list[TriedChange] = []
 
         def ways() -> Iterator[Change]:
             """Yield the changes to try."""
-            yield from islice(_changes_for(evidence, reason, self._traces), TRIES)
+            yield from islice(changes_for(evidence, reason, self._traces), TRIES)
             if not hints:
                 yield from islice(_combined_changes(reached), FURTHER)
 
@@ -146,7 +128,11 @@ class HintFinder:
             after = self._run(change)
             if after is None:
                 continue
-            tried += 1
+            if reason.kind in FALSE and subject.kind == "object":
+                self._try_on_false(subject, change, after, hints, tried)
+                if hints and not hints[-1].effects.harm:
+                    break
+                continue
             then = collect_evidence(subject, after)
             new, now_reported = find_reason(subject, then, after)
             old_kind, new_kind = (reason.kind, reported), (new.kind, now_reported)
@@ -158,12 +144,31 @@ class HintFinder:
                 hints.append(Hint(_settings(change), text, harm))
                 if not hints[-1].effects.harm:
                     break
-            elif not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
+                continue
+            result = _result_text(subject, reason, new, now_reported, then)
+            tried.append(TriedChange(_settings(change), result))
+            if not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
                 reached.setdefault(stage, _Step(change, new, then, after))
-        if hints or not reached:
-            return HintSearch(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tried)
-        last = max(reached)
-        return HintSearch((), tried, _settings(reached[last].change), last.kind, last.reported)
+        return HintSearch(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tuple(tried))
+
+    def _try_on_false(
+        self, subject: Subject, change: Change, after: FrameIndex, hints: list[Hint], tried: list[TriedChange]
+    ) -> None:
+        """Add the result of a change on a false object to the hints or to the tried changes."""
+        objects = after.result.objects
+        if objects is None or subject.box is None:
+            return
+        away = np.linalg.norm(objects.boxes.center[:, :2] - subject.box.center[0, :2], axis=1)
+        away[[name != subject.label for name in objects.names]] = np.inf
+        text = "it is not reported any more"
+        if away.min(initial=np.inf) <= MAX_DISTANCE:
+            text = "it is right then" if self._traces.truth else "nothing about it is doubtful then"
+            if int(away.argmin()) in false_reasons(after):
+                tried.append(TriedChange(_settings(change), "it stays false"))
+                return
+        hints.append(
+            Hint(_settings(change), text, effects(self._result.objects, objects, self._traces.truth))
+        )
 
     def _run(self, change: Change) -> FrameIndex | None:
         """Run the frame with a change, once. None: the configuration cannot be run."""
@@ -237,16 +242,31 @@ def _new_outcome(
 
 
 def _is_sure(subject: Subject, change: Change, evidence: Evidence) -> bool:
-    """Return whether a detection that passes only with other limits surely belongs to the subject."""
-    if subject.kind != "truth" or evidence.named is None or evidence.named.detection < 0:
+    """Return whether a detection that passes only with other limits surely belongs to the subject.
+
+    A kept detection does if the verdict calls it the subject's own. A weak one has to fit well, too.
+    """
+    named = evidence.named
+    if subject.kind != "truth" or named is None or named.detection < 0:
         return True
     if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
         return True
-    camera, row = evidence.named.camera, evidence.named.detection
-    return any(
-        (candidate.camera, candidate.row) == (camera, row) and candidate.overlap >= SURE
-        for candidate in evidence.candidates
-    )
+    detection = (named.camera, named.detection)
+    fits = [c.overlap for c in evidence.own_candidates if (c.camera, c.row) == detection]
+    if any(key.startswith("detector.") for key in change):
+        return max(fits, default=0.0) >= SURE
+    return named.right and bool(fits)
+
+
+def _result_text(subject: Subject, before: Reason, after: Reason, reported: bool, evidence: Evidence) -> str:
+    """Say what a change does to a subject that it does not help."""
+    named = evidence.named
+    if reported and after.kind is ReasonKind.REPORTED and subject.kind == "truth" and named is not None:
+        return "it is reported by a detection that may not be its own"
+    if reported:
+        return f"it is reported, but '{after.kind.value}'"
+    stays = "stays" if after.kind is before.kind else "is lost as"
+    return f"it {stays} '{after.kind.value}'"
 
 
 def _settings(change: Change) -> tuple[str, ...]:
@@ -263,147 +283,8 @@ def _combined_changes(
         stage = max(left)
         done.add(stage)
         step = reached[stage]
-        for more in _changes_for(step.evidence, step.reason, step.traces):
+        for more in changes_for(step.evidence, step.reason, step.traces):
             yield {**step.change, **more}
-
-
-# --- changes to try ----------------------------------------------------------------------------
-
-
-def _changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Iterator[Change]:
-    """Yield changes that may help: parameters of our stages, or of the user's function."""
-    result = traces.result
-    section = _SECTION.get(reason.kind, "")
-    if section and not traces.origin(section).ours:
-        yield from _function_changes(result, section)
-    if not traces.origin("objects").ours:
-        return
-    config = result.config
-    for change in _our_changes(evidence, reason, config):
-        if all(_has_effect(key, traces) for key in change):
-            yield change
-
-
-def _has_effect(key: str, traces: FrameIndex) -> bool:
-    """Return whether a parameter has an effect. Ours have none on a stage that is not ours."""
-    section, _, name = key.partition(".")
-    if section not in ("ground", "clustering", "detector"):
-        return True
-    owner = traces.origin(section)
-    return owner.ours or (bool(owner.function) and name in _SHARED_PARAMETERS)
-
-
-def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
-    """Yield halves and doubles of the numeric parameters of a user's function, within their bounds."""
-    try:
-        plugin = plugin_of(result.config, section)
-    except UserError:
-        return
-    if plugin is None or plugin.params is None:
-        return
-    params = dict(getattr(result.config, section).params)
-    for factor in (0.5, 2.0):
-        for name, value in params.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not value:
-                continue
-            other = type(value)(round(value * factor)) if isinstance(value, int) else round(value * factor, 6)
-            try:
-                plugin.params.model_validate({**params, name: other})
-            except ValidationError:
-                continue
-            if other != value:
-                yield {f"{section}.params.{name}": other}
-
-
-def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
-    """Yield changes of our parameters that may help against the reason."""
-    kind, clustering, best = reason.kind, config.clustering, evidence.best
-    if kind is ReasonKind.GROUND:
-        yield from _ground_changes(config)
-    elif kind is ReasonKind.NOISE:
-        for points in _smaller_min_points(evidence.neighbours, clustering.min_points):
-            yield {"clustering.min_points": points}
-            if points < clustering.min_cluster_points:
-                yield {"clustering.min_points": points, "clustering.min_cluster_points": points}
-        for factor in (1.5, 2.0):
-            yield {"clustering.eps": round(clustering.eps * factor, 3)}
-        yield from _ground_changes(config)
-    elif kind is ReasonKind.TOO_SMALL:
-        yield {"clustering.min_cluster_points": max(reason["count"], 1)}
-        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
-    elif kind is ReasonKind.TOO_LARGE:
-        yield {"clustering.max_cluster_points": reason["count"]}
-    elif kind is ReasonKind.MERGED:
-        if config.fusion.method == "frustum" and not config.fusion.split:
-            yield {"fusion.split": True}
-        if evidence.finer:
-            yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
-        elif not evidence.others:
-            yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 0.6, 0.4))
-    elif kind is ReasonKind.SPLIT:
-        # The distance is unknown if one of the parts is not a cluster.
-        yield {"clustering.eps": round(max(np.nan_to_num(evidence.apart), clustering.eps) * 1.1, 3)}
-        yield {"clustering.min_points": max(1, clustering.min_points // 2)}
-        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
-    elif best is not None:
-        yield from _detection_changes(kind, best, config)
-
-
-def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Iterator[Change]:
-    """Yield changes that may help a subject that has a detection."""
-    if kind is ReasonKind.BELOW_THRESHOLD:
-        # A threshold that lets noise pass is no advice.
-        if best.score >= 0.05:
-            passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
-            yield passes
-            if config.fusion.method == "frustum" and config.fusion.split:
-                # The rating of a match is proportional to the score.
-                weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
-                yield from ({**passes, "fusion.min_rating": round(weak * factor, 4)} for factor in (1.0, 0.5))
-    elif kind is ReasonKind.SUPPRESSED:
-        yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
-    elif kind is ReasonKind.LOW_OVERLAP:
-        yield from (
-            {"fusion.min_iou": round(config.fusion.min_iou * factor, 3)} for factor in (0.5, 0.2, 0.0)
-        )
-        yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
-    elif kind is ReasonKind.MISFIT:
-        yield from (
-            {"fusion.min_rating": round(config.fusion.min_rating * factor, 4)} for factor in (0.5, 0.2)
-        )
-        yield {"fusion.split": False}
-    elif kind is ReasonKind.TOO_FEW_POINTS:
-        yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
-    elif kind in _OTHER_OWNER:
-        if config.fusion.method == "centroid":
-            yield {"fusion.method": "frustum"}
-    elif kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
-        # The subject has no cluster of its own: the fusion compared the nearest other one.
-        yield from _ground_changes(config)
-        yield {"fusion.method": "frustum"}
-    elif kind is ReasonKind.TOO_FAR:
-        yield {"fusion.max_depth": 200.0}
-
-
-def _ground_changes(config: Config) -> Iterator[Change]:
-    """Yield thinner ground layers, and for a plane also a ground that follows the road."""
-    ground, points = config.ground, max(1, config.clustering.min_points // 3)
-    for threshold in (0.3, 0.2, 0.1):
-        if threshold < ground.distance_threshold:
-            yield {"ground.distance_threshold": threshold}
-    if ground.method == "plane":
-        yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
-        yield {
-            "ground.method": "polar",
-            "ground.distance_threshold": 0.2,
-            "clustering.min_points": points,
-        }
-
-
-def _smaller_min_points(neighbours: int, limit: int) -> list[int]:
-    """Return values of min_points to try: the number that the best point reaches, and less."""
-    tries = [neighbours, round(neighbours * 0.75), neighbours // 2]
-    return [n for n in dict.fromkeys(tries) if 2 <= n < limit]
 
 
 def _setting_text(value: Any) -> str:

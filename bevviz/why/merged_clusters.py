@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, I64, Bool
+from bevviz.model.frame import F32, I32, I64, Bool
+from bevviz.model.reasons import Scored, scored
 from bevviz.stages.clustering import dbscan
 from bevviz.support.kernel import kernel
 from bevviz.why.evidence import MOST
@@ -64,19 +65,20 @@ def _same_view(a: Subject, b: Subject) -> bool:
 
 def separation(
     subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
-) -> tuple[float, float]:
-    """Return the gap in metres between the subject and its mates, and the eps that separates them.
+) -> tuple[float, float, Scored | None]:
+    """Return the gap in metres between the subject and its mates, the eps that parts them, and the joiner.
 
-    The gap is NaN if the cluster holds only the subject. The eps is 0 if none separates them.
+    The gap is NaN if the cluster holds only the subject. The eps is 0 if none separates them. The joiner is
+    the detection for which the fusion joined clusters that the clustering had kept apart.
     """
     result = traces.result
     clusters, obstacles = result.clusters, result.obstacles
     if main < 0 or clusters is None or obstacles is None or subject.kind not in ("truth", "detection"):
-        return float("nan"), 0.0
+        return float("nan"), 0.0, None
     members = np.flatnonzero(clusters.labels == main)
     mine = np.isin(members, obstacle_rows)
     if not mates and (subject.kind == "detection" or mine.mean() >= MOST):
-        return float("nan"), 0.0
+        return float("nan"), 0.0, None
     points = obstacles[members]
     nearest, gap = ~mine, float("inf")
     voxels = result.voxels
@@ -94,11 +96,32 @@ def separation(
                 gap, nearest = between, theirs
     mine &= ~nearest
     if not mine.any() or not nearest.any():
-        return float("nan"), 0.0
+        return float("nan"), 0.0, None
     if not mates:
         gap = least_distance(points[mine], points[nearest])
-    finer = _separating_eps(points, mine, nearest, traces) if traces.origin("clustering").ours else 0.0
-    return gap, finer
+    first = traces.first_labels[members]
+    joined_by = None
+    if _most_frequent(first[mine]) != _most_frequent(first[nearest]):
+        joined_by = _joining_detection(traces, main)
+    ours = traces.origin("clustering").ours and joined_by is None
+    return gap, _separating_eps(points, mine, nearest, traces) if ours else 0.0, joined_by
+
+
+def _most_frequent(labels: I32) -> int:
+    """Return the label that occurs most often."""
+    values, counts = np.unique(labels, return_counts=True)
+    return int(values[counts.argmax()])
+
+
+def _joining_detection(traces: FrameIndex, cluster: int) -> Scored | None:
+    """Return the detection for which the fusion made a cluster."""
+    splits = traces.result.splits
+    rows = [] if splits is None else np.flatnonzero(splits.cluster == cluster).tolist()
+    if splits is None or not rows:
+        return None
+    camera = traces.camera(splits.camera[rows[0]])
+    assert camera is not None and camera.detections is not None
+    return scored(camera.detections, int(splits.detection[rows[0]]))
 
 
 def _detection_of_row(traces: FrameIndex, camera: str, row: int) -> Subject:

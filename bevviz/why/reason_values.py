@@ -43,6 +43,7 @@ class ReasonValues:
             ReasonKind.SHARED_BOX: self._object,
             ReasonKind.BORROWED: self._object,
             ReasonKind.MISNAMED: self._object,
+            ReasonKind.MISPLACED: self._object,
             ReasonKind.CONTRADICTED: self._object,
             ReasonKind.SPLIT: self._split,
             ReasonKind.MERGED: self._merged,
@@ -106,6 +107,7 @@ class ReasonValues:
             "camera": named.camera,
             "own": named.own,
             "also": named.also,
+            "away": named.away,
             "box_owner": self._box_owner(named.camera, named.detection),
         }
 
@@ -121,13 +123,17 @@ class ReasonValues:
 
     def _merged(self) -> dict[str, Any]:
         evidence = self.evidence
-        part = evidence.part(evidence.main)
+        part, clusters = evidence.part(evidence.main), self.result.clusters
+        assert clusters is not None
+        whole = int(clusters.count[evidence.main])
         return {
             "cluster": evidence.main,
             "others": tuple(name for name, _ in evidence.others),
-            "rest": 0 if part is None else part.count - part.points,
+            "rest": whole if part is None else whole - part.points,
             "gap": evidence.gap,
             "by": self._owner("clustering").name,
+            "joined_by": evidence.joined_by,
+            "eps": self.config.clustering.eps,
         }
 
     # --- LiDAR ---------------------------------------------------------------------------------
@@ -188,7 +194,27 @@ class ReasonValues:
     def _aside(self) -> dict[str, Any]:
         aside = self.evidence.aside
         assert aside is not None
-        return {"cluster": aside.cluster, "count": aside.count}
+        parts = [part for part in self.evidence.parts if not part.kept]
+        taker, owner = self._divider(aside.cluster)
+        return {
+            "cluster": aside.cluster,
+            "count": aside.count,
+            "clusters": len(parts),
+            "points": self.evidence.aside_points,
+            "taker": taker,
+            "taker_owner": owner,
+        }
+
+    def _divider(self, cluster: int) -> tuple[Scored | None, str]:
+        """Return the detection that took the larger part of a cluster, and the object it is the box of."""
+        splits = self.result.splits
+        rows = [] if splits is None else np.flatnonzero(splits.rest == cluster).tolist()
+        if splits is None or not rows:
+            return None, ""
+        row = max(rows, key=lambda row: int(splits.points[row]))
+        camera, detection = self.traces.camera(splits.camera[row]), int(splits.detection[row])
+        assert camera is not None and camera.detections is not None
+        return scored(camera.detections, detection), self._box_owner(camera.camera.name, detection)
 
     # --- detector ------------------------------------------------------------------------------
 
@@ -197,9 +223,18 @@ class ReasonValues:
 
     def _detection(self) -> dict[str, Any]:
         """Return the best detection of the subject."""
-        best, owner = self.evidence.best, self._owner("detector")
-        detection = None if best is None else best.label
-        return {"detection": detection, "by": owner.name, "robot": bool(owner.topic)}
+        best, shared = self.evidence.best, self.evidence.shared(self.subject)
+        owner = self._owner("detector")
+        values = {
+            "detection": None if best is None else best.label,
+            "by": owner.name,
+            "robot": bool(owner.topic),
+            "shared": None if shared is None else shared.label,
+        }
+        if shared is None:
+            return values
+        owner_name = self.traces.truth[shared.owner].name
+        return {**values, "overlap": shared.overlap, "shared_owner": owner_name}
 
     def _suppressed(self) -> dict[str, Any]:
         best = self.evidence.best

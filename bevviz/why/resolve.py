@@ -14,6 +14,7 @@ from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
 from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
 from bevviz.why.belonging import OVERLAP
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, FrameIndex, detection_subject, joined_boxes
 from bevviz.why.selection import Selection
 from bevviz.why.subject import IN_VIEW, LINK, Subject, projected_box, single_box
@@ -55,6 +56,7 @@ def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
         camera_of(traces, selection.camera)
     subjects = [*_truth_in_view(traces, selection.camera), *_strange_detections(traces, selection.camera)]
     subjects += _contradicted_objects(traces, selection.camera)
+    subjects += _false_objects(traces, selection.camera)
     if not selection.label:
         return subjects
     truth = result.frame.truth
@@ -237,8 +239,26 @@ def _strange_detections(traces: FrameIndex, camera: str) -> Iterator[Subject]:
         if detections is None or camera not in ("", camera_result.camera.name):
             continue
         strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(camera_result) < 0)
+        strange[_detections_of_false_objects(traces, camera_result)] = False
         for row in np.flatnonzero(strange).tolist():
             yield detection_subject(camera_result, row)
+
+
+def _detections_of_false_objects(traces: FrameIndex, camera: CameraResult) -> list[int]:
+    """Return the detections that named false objects, which are subjects themselves."""
+    objects, name = traces.result.objects, camera.camera.name
+    if objects is None:
+        return []
+    return [int(objects.detection[row]) for row in false_reasons(traces) if objects.camera[row] == name]
+
+
+def _false_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
+    """Yield the objects that no ground truth explains, or that look doubtful."""
+    objects = traces.result.objects
+    for row in false_reasons(traces):
+        assert objects is not None
+        if camera in ("", objects.camera[row]):
+            yield object_subject(traces, row)
 
 
 def _contradicted_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:

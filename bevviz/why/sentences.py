@@ -6,16 +6,19 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.why.subject import Subject, count
 from bevviz.why.verdict import Verdict
 
+WITHIN = f"evaluate allows {MAX_DISTANCE:g} m"
 _ONLY = ("nothing", "only ground", "mostly ground")  # at a place without an object
 
 
 def make_verdict(subject: Subject, reason: Reason, reported: bool) -> Verdict:
     """Return the verdict with its reason in one sentence."""
-    because = SENTENCES[reason.kind](reason, subject)
+    is_false = subject.kind == "object" and reason.kind in FALSE_SENTENCES
+    because = (FALSE_SENTENCES if is_false else SENTENCES)[reason.kind](reason, subject)
     head = subject.name[0].upper() + subject.name[1:]
     if reason.kind is ReasonKind.REPORTED:
         text = f"{head} was reported: {because}."
@@ -85,6 +88,10 @@ def _misnamed(reason: Reason, _: Subject) -> str:
     return text
 
 
+def _misplaced(reason: Reason, _: Subject) -> str:
+    return f"its object is too far off: {_object(reason)}, {reason['away']:.1f} m from it ({WITHIN})"
+
+
 def _split(reason: Reason, _: Subject) -> str:
     parts = " and ".join(map(str, reason["clusters"][:4])) + (" and more" if reason["clusters"][4:] else "")
     by = f" by {reason['by']}" if reason["by"] else ""
@@ -97,6 +104,11 @@ def _merged(reason: Reason, _: Subject) -> str:
     text = f"cluster {reason['cluster']} holds {names}, too"
     if not np.isfinite(reason["gap"]):
         return text
+    gap = f"{reason['gap']:.2f} m"
+    if reason["joined_by"] is not None:
+        return f"{text}: the fusion joined clusters {gap} apart for {reason['joined_by']}"
+    if reason.limit is not None and reason["gap"] > reason["eps"]:
+        return f"{text}: other points of the cluster bridge the gap of {gap} between them, {reason.limit}"
     because = reason.limit if reason.limit is not None else f"{reason['by']} made one of them"
     return f"{text}: the gap between them is {reason['gap']:.2f} m and {because}"
 
@@ -144,9 +156,11 @@ def _ground(reason: Reason, subject: Subject) -> str:
 
 def _noise(reason: Reason, _: Subject) -> str:
     are = "is" if reason["noise"] == 1 else "are"
-    points = count(reason["noise"], "obstacle point")
+    points = f"its {count(reason['noise'], 'obstacle point')}"
+    if reason["noise"] < reason["obstacles"]:
+        points = f"{reason['noise']} of its {count(reason['obstacles'], 'obstacle point')}"
     most = f"none has more than {reason['neighbours']} neighbours within {reason['eps']:g} m"
-    return f"its {points} {are} noise: {most} ({reason.limit})"
+    return f"{points} {are} noise: {most} ({reason.limit})"
 
 
 def _no_cluster(reason: Reason, _: Subject) -> str:
@@ -161,7 +175,14 @@ def _no_cluster(reason: Reason, _: Subject) -> str:
 
 
 def _set_aside(reason: Reason, _: Subject) -> str:
-    return f"its cluster {reason['cluster']} has {count(reason['count'], 'point')} ({reason.limit})"
+    points = count(reason["count"], "point")
+    text = f"its cluster {reason['cluster']} has {points} ({reason.limit})"
+    if reason["clusters"] > 1:
+        text += f", and {reason['points']} of its points are in {reason['clusters']} such clusters"
+    if reason["taker"] is None:
+        return text
+    whose = f", the box of {reason['taker_owner']}" if reason["taker_owner"] else ""
+    return f"{text}: the fusion gave the rest of it to {reason['taker']}{whose}"
 
 
 # --- detector ----------------------------------------------------------------------------------
@@ -179,6 +200,11 @@ def _not_detected(reason: Reason, subject: Subject) -> str:
         return f"the robot's detector lost it: {by} has no detection {class_}there{wrong}"
     if reason.limit is None:
         return f"{by} gave no detection {class_}there{wrong}"
+    if reason["shared"] is not None:
+        fit = f"{reason['shared']} fits it ({reason['overlap']:.2f})"
+        return (
+            f"the detector has no box for it alone: {fit}, but is the box of {reason['shared_owner']}{wrong}"
+        )
     least = reason.limit.number
     return f"the detector has no candidate {class_}there, not even with a score of {least}{wrong}"
 
@@ -289,6 +315,54 @@ def _lost_in_fusion(reason: Reason, _: Subject) -> str:
     return f"the robot's fusion lost it: {inputs}, but no object of {reason['objects']}; ours {decision}"
 
 
+# --- false objects -----------------------------------------------------------------------------
+
+
+def _duplicate(reason: Reason, _: Subject) -> str:
+    what = f"{reason['truth']} is {reason['other']} already" if reason["truth"] else ""
+    return f"it is a duplicate: {what or 'its box overlaps that of ' + str(reason['other'])}"
+
+
+def _part(reason: Reason, _: Subject) -> str:
+    return f"its points are a part of {reason['truth']}, which {reason['other']} is already"
+
+
+def _named_wrongly(reason: Reason, _: Subject) -> str:
+    return f"its points are those of {reason['truth']}"
+
+
+def _off(reason: Reason, _: Subject) -> str:
+    return f"its points are those of {reason['truth']}, {reason['away']:.1f} m from it ({WITHIN})"
+
+
+def _wrong_depth(reason: Reason, _: Subject) -> str:
+    whose = reason["truth"] or "the points in the middle of its 2D box"
+    off = f"its cluster {reason['cluster']} is {_side(reason)}"
+    return f"its 2D box is that of {whose}, and {off} it" if reason["truth"] else f"{off} {whose}"
+
+
+def _side(reason: Reason) -> str:
+    """Say how far an object is before or behind the thing of its 2D box."""
+    return f"{abs(reason['off']):.1f} m {'behind' if reason['off'] > 0 else 'before'}"
+
+
+def _wall(reason: Reason, _: Subject) -> str:
+    length, height = reason["size"]
+    larger = f"something {length:.1f} m long and {height:.1f} m high"
+    text = f"its points (cluster {reason['cluster']}) are a part of {larger} in the frustum"
+    return f"{text}, {_side(reason)} {reason['truth']}" if reason["truth"] else text
+
+
+FALSE_SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words after "but"
+    ReasonKind.DUPLICATE: _duplicate,
+    ReasonKind.SPLIT: _part,
+    ReasonKind.MISNAMED: _named_wrongly,
+    ReasonKind.MISPLACED: _off,
+    ReasonKind.WRONG_DEPTH: _wrong_depth,
+    ReasonKind.WALL: _wall,
+    ReasonKind.DETECTOR_ERROR: lambda *_: "it is the detector's own error: nothing is labelled there",
+}
+
 SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words after "because"
     ReasonKind.REPORTED: _reported,
     ReasonKind.SHARED_BOX: _shared_box,
@@ -296,6 +370,7 @@ SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words a
     ReasonKind.SPLIT: _split,
     ReasonKind.MERGED: _merged,
     ReasonKind.MISNAMED: _misnamed,
+    ReasonKind.MISPLACED: _misplaced,
     ReasonKind.FAILED: _failed,
     ReasonKind.OUT_OF_VIEW: lambda *_: "no camera has it in view, and only a camera names objects",
     ReasonKind.HIDDEN: _hidden,

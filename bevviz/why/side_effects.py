@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.compare.differences import Change, SideResult, compare_objects
-from bevviz.evaluate import MAX_DISTANCE, pair_in_order
+from bevviz.evaluate import Truth, match
+from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
 from bevviz.why.frame_index import joined_boxes
@@ -159,18 +160,16 @@ def _name(name: str, boxes: Boxes3D, row: int) -> str:
 
 
 def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]:
-    """Return the ground truth row of each object, -1: none.
-
-    The pairs are one to one, the best score first, as in ``evaluate``.
-    """
+    """Return the ground truth row of each object by the rule of ``evaluate``, -1: none."""
     if objects is None:
         return []
-    rows = [-1] * len(objects)
-    truth = joined_boxes([subject.box for subject in subjects if subject.box is not None])
-    order = np.argsort(-objects.score, kind="stable")
-    away = np.linalg.norm(objects.boxes.center[order][:, None, :2] - truth.center[None, :, :2], axis=2)
-    right = np.array([[subject.accepts(objects.names[j]) for subject in subjects] for j in order], bool)
-    partner, _ = pair_in_order(np.where(right.reshape(away.shape), away, np.inf), MAX_DISTANCE)
-    for j, row in zip(order.tolist(), partner.tolist(), strict=True):
-        rows[j] = row
-    return rows
+    boxes = joined_boxes([subject.box for subject in subjects if subject.box is not None])
+    accepted = tuple(_accepted_names(subject.label) for subject in subjects)
+    labels = tuple(subject.label for subject in subjects)
+    partner, _ = match(objects, Truth(boxes, labels, accepted, np.ones(len(labels), np.bool_)))
+    return [int(row) for row in partner]
+
+
+def _accepted_names(label: str) -> frozenset[str]:
+    """Return the names of objects that ``evaluate`` accepts for a label."""
+    return ACCEPTED_NAMES.get(label, frozenset((label.lower(),)))

@@ -200,6 +200,8 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) ->
             numbers["suppressed_by"] = int(detections.suppressed_by[candidate.row])
         reason = detection_reason(detections, candidate.row, config)
         state = "kept" if candidate.kept else not_kept_text(reason)
+        if not candidate.own and candidate.owner >= 0:
+            state += f", the box of {traces.truth[candidate.owner].name}"
         yield Step("detector", f"{candidate.label}{by}, overlap {candidate.overlap:.2f}: {state}", numbers)
         if candidate.kept and fusion is not None:
             yield from _pair_steps(candidate, evidence, traces)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import (
@@ -16,12 +17,22 @@ from bevviz.model.results import (
 )
 from bevviz.why.belonging import find_fused
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
 from bevviz.why.subject import Subject
 
 WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 
+FALSE = {  # causes of false objects
+    ReasonKind.DUPLICATE,
+    ReasonKind.SPLIT,
+    ReasonKind.MISNAMED,
+    ReasonKind.MISPLACED,
+    ReasonKind.WRONG_DEPTH,
+    ReasonKind.WALL,
+    ReasonKind.DETECTOR_ERROR,
+}
 FLAWED = {ReasonKind.SHARED_BOX, ReasonKind.MERGED, ReasonKind.SPLIT}
 HOPELESS = {ReasonKind.OUT_OF_VIEW, ReasonKind.HIDDEN, ReasonKind.NO_POINTS}
 
@@ -59,6 +70,8 @@ def find_reason(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tup
         reason: that stage or fault, with its values.
         reported: whether it still is an object of a right class.
     """
+    if subject.kind == "object" and (false := false_reasons(traces).get(subject.row)) is not None:
+        return false, True
     kind, reported = _Decider(subject, evidence, traces).decide()
     return ReasonValues(subject, evidence, traces).reason(kind), reported
 
@@ -83,11 +96,13 @@ class _Decider:
             return self._by_cameras()
         ours = self.traces.origin("objects").ours
         accepts = subject.accepts if ours else subject.accepts_of_others
-        if named is not None and accepts(named.name):
+        if named is not None and named.right and (accepts(named.name) or subject.kind == "truth"):
             return self._flaw(named), True
+        if named is not None and accepts(named.name) and subject.kind == "truth":
+            return self._misplaced(named), False
+        kept = [candidate for candidate in evidence.own_candidates if candidate.kept]
         if named is not None and (
-            not any(candidate.kept and subject.accepts(candidate.name) for candidate in evidence.candidates)
-            or self._is_in_reported_box(named)
+            not any(subject.accepts(candidate.name) for candidate in kept) or self._is_in_reported_box(named)
         ):
             return ReasonKind.MISNAMED, False
         if self.result.objects is None:
@@ -123,6 +138,16 @@ class _Decider:
         is_split = several and part is not None and part.points < WHOLE * whole
         return ReasonKind.SPLIT if is_split else ReasonKind.REPORTED
 
+    def _misplaced(self, named: ReportedObject) -> ReasonKind:
+        """Return why ``evaluate`` does not count the object: it is too far off, or has another name."""
+        if named.counts_for >= 0:
+            is_merged = self.evidence.mates or self.evidence.purity < MOST
+            return ReasonKind.MERGED if is_merged else ReasonKind.BORROWED
+        if named.away <= MAX_DISTANCE:
+            return ReasonKind.MISNAMED
+        flaw = self._flaw(named)
+        return flaw if flaw in (ReasonKind.MERGED, ReasonKind.SPLIT) else ReasonKind.MISPLACED
+
     # --- our stages ----------------------------------------------------------------------------
 
     def _loss(self) -> ReasonKind:
@@ -156,7 +181,7 @@ class _Decider:
         """Return the stage that took most points of a subject without a kept cluster."""
         evidence = self.evidence
         aside = evidence.aside
-        if aside is not None and aside.points >= max(evidence.noise, len(evidence.ground)):
+        if aside is not None and evidence.aside_points >= max(evidence.noise, len(evidence.ground)):
             return ReasonKind.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else ReasonKind.TOO_LARGE
         return ReasonKind.GROUND if len(evidence.ground) >= evidence.noise else self._noise()
 
@@ -180,6 +205,8 @@ class _Decider:
         if fusion is None:
             return ReasonKind.NOT_FUSED
         kind = pair_reason(fusion, self.result.config, best.row, evidence.main).kind
+        if kind is ReasonKind.MATCHED:  # the object counts for another one in the cluster
+            return ReasonKind.MERGED if self.subject.kind == "truth" else ReasonKind.REPORTED
         main = evidence.part(evidence.main)
         if self.subject.kind != "truth" or main is None:
             return kind
@@ -246,7 +273,7 @@ class _Decider:
         if "clustering" in robot and self.result.clusters is not None and not cluster:
             removed = "ground" in robot and len(evidence.ground) >= evidence.noise
             return ReasonKind.GROUND if removed else ReasonKind.NO_CLUSTER
-        kept = [candidate for candidate in evidence.candidates if candidate.kept]
+        kept = [candidate for candidate in evidence.own_candidates if candidate.kept]
         detected = any(subject.accepts(candidate.name) for candidate in kept)
         if "detector" in robot and detector_ran(self.result, subject.camera) and not detected:
             visible = subject.is_place or evidence.in_view

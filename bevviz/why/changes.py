@@ -1,0 +1,197 @@
+"""Parameter changes that may help against a reason. ``hints`` tests them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from bevviz.config import Config, plugin_of
+from bevviz.errors import UserError
+from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.model.results import FrameResult
+from bevviz.why.evidence import Candidate, Evidence
+from bevviz.why.frame_index import FrameIndex
+
+Change = Mapping[str, Any]  # dotted key -> value
+
+# Parameters that bevviz applies to the output of user functions, too.
+_SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
+_SECTION = {  # kind of reason -> section whose parameters may help
+    ReasonKind.GROUND: "ground",
+    ReasonKind.NOISE: "clustering",
+    ReasonKind.NO_CLUSTER: "clustering",
+    ReasonKind.MERGED: "clustering",
+    ReasonKind.SPLIT: "clustering",
+    ReasonKind.NOT_DETECTED: "detector",
+    ReasonKind.BELOW_THRESHOLD: "detector",
+    ReasonKind.NOT_AMONG: "objects",
+    ReasonKind.MISNAMED: "objects",
+}
+_OTHER_OWNER = {  # another subject has the detection or the cluster
+    ReasonKind.SHARED_BOX,
+    ReasonKind.BORROWED,
+    ReasonKind.TAKEN,
+    ReasonKind.OTHER_CLUSTER,
+    ReasonKind.MISNAMED,
+}
+
+
+def changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Iterator[Change]:
+    """Yield changes that may help: parameters of our stages, or of the user's function."""
+    result = traces.result
+    section = _SECTION.get(reason.kind, "")
+    if section and not traces.origin(section).ours:
+        yield from _function_changes(result, section)
+    if not traces.origin("objects").ours:
+        return
+    config = result.config
+    for change in _our_changes(evidence, reason, config):
+        if all(_has_effect(key, traces) for key in change):
+            yield change
+
+
+def _has_effect(key: str, traces: FrameIndex) -> bool:
+    """Return whether a parameter has an effect. Ours have none on a stage that is not ours."""
+    section, _, name = key.partition(".")
+    if section not in ("ground", "clustering", "detector"):
+        return True
+    owner = traces.origin(section)
+    return owner.ours or (bool(owner.function) and name in _SHARED_PARAMETERS)
+
+
+def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
+    """Yield halves and doubles of the numeric parameters of a user's function, within their bounds."""
+    try:
+        plugin = plugin_of(result.config, section)
+    except UserError:
+        return
+    if plugin is None or plugin.params is None:
+        return
+    params = dict(getattr(result.config, section).params)
+    for factor in (0.5, 2.0):
+        for name, value in params.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value:
+                continue
+            other = type(value)(round(value * factor)) if isinstance(value, int) else round(value * factor, 6)
+            try:
+                plugin.params.model_validate({**params, name: other})
+            except ValidationError:
+                continue
+            if other != value:
+                yield {f"{section}.params.{name}": other}
+
+
+def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+    """Yield changes of our parameters that may help against the reason."""
+    kind, clustering, best = reason.kind, config.clustering, evidence.best
+    if kind is ReasonKind.GROUND:
+        yield from _ground_changes(config)
+    elif kind is ReasonKind.NOISE:
+        for points in _smaller_min_points(evidence.neighbours, clustering.min_points):
+            yield {"clustering.min_points": points}
+            if points < clustering.min_cluster_points:
+                yield {"clustering.min_points": points, "clustering.min_cluster_points": points}
+        for factor in (1.5, 2.0):
+            yield {"clustering.eps": round(clustering.eps * factor, 3)}
+        yield from _ground_changes(config)
+    elif kind is ReasonKind.TOO_SMALL:
+        yield {"clustering.min_cluster_points": max(reason["count"], 1)}
+        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
+    elif kind is ReasonKind.TOO_LARGE:
+        yield {"clustering.max_cluster_points": reason["count"]}
+    elif kind in (ReasonKind.DUPLICATE, ReasonKind.DETECTOR_ERROR, ReasonKind.WALL, ReasonKind.WRONG_DEPTH):
+        yield from _stricter_changes(kind, reason["object"].score, config)
+    elif kind is ReasonKind.MISPLACED:
+        yield {"fusion.split": not config.fusion.split}
+        yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 1.5))
+    elif kind is ReasonKind.MERGED:
+        if reason["joined_by"] is not None:
+            yield {"fusion.min_rating": round(2 * config.fusion.min_rating, 4)}
+            yield {"fusion.split": False}
+        if config.fusion.method == "frustum" and not config.fusion.split:
+            yield {"fusion.split": True}
+        if evidence.finer:
+            yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
+        elif not evidence.others:
+            yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 0.6, 0.4))
+    elif kind is ReasonKind.SPLIT:
+        # The distance is unknown if one of the parts is not a cluster.
+        yield {"clustering.eps": round(max(np.nan_to_num(evidence.apart), clustering.eps) * 1.1, 3)}
+        yield {"clustering.min_points": max(1, clustering.min_points // 2)}
+        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
+    elif best is not None:
+        yield from _detection_changes(kind, best, config)
+
+
+def _stricter_changes(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
+    """Yield stricter limits, which may remove a false object."""
+    fusion = config.fusion
+    if kind is ReasonKind.DUPLICATE:
+        limits = (factor * config.detector.iou_threshold for factor in (0.8, 0.6))
+        yield from ({"detector.iou_threshold": round(value, 3)} for value in limits)
+    if kind in (ReasonKind.WALL, ReasonKind.WRONG_DEPTH) and fusion.method == "frustum":
+        yield from ({"fusion.min_rating": round(fusion.min_rating * factor, 4)} for factor in (2, 4))
+        yield from ({"fusion.min_iou": round(fusion.min_iou * factor, 3)} for factor in (2, 3))
+    if score < 0.6:  # A higher threshold would lose too many right objects.
+        yield {"detector.conf_threshold": math.floor(100 * score + 1) / 100}
+
+
+def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Iterator[Change]:
+    """Yield changes that may help a subject that has a detection."""
+    if kind is ReasonKind.BELOW_THRESHOLD:
+        # A threshold that lets noise pass is no advice.
+        if best.score >= 0.05:
+            passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
+            yield passes
+            if config.fusion.method == "frustum" and config.fusion.split:
+                # The rating of a match is proportional to the score.
+                weak = config.fusion.min_rating * best.score / config.detector.conf_threshold
+                yield from ({**passes, "fusion.min_rating": round(weak * factor, 4)} for factor in (1.0, 0.5))
+    elif kind is ReasonKind.SUPPRESSED:
+        yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
+    elif kind is ReasonKind.LOW_OVERLAP:
+        yield from (
+            {"fusion.min_iou": round(config.fusion.min_iou * factor, 3)} for factor in (0.5, 0.2, 0.0)
+        )
+        yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
+    elif kind is ReasonKind.MISFIT:
+        yield from (
+            {"fusion.min_rating": round(config.fusion.min_rating * factor, 4)} for factor in (0.5, 0.2)
+        )
+        yield {"fusion.split": False}
+    elif kind is ReasonKind.TOO_FEW_POINTS:
+        yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))
+    elif kind in _OTHER_OWNER:
+        if config.fusion.method == "centroid":
+            yield {"fusion.method": "frustum"}
+    elif kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
+        # The subject has no cluster of its own: the fusion compared the nearest other one.
+        yield from _ground_changes(config)
+        yield {"fusion.method": "frustum"}
+    elif kind is ReasonKind.TOO_FAR:
+        yield {"fusion.max_depth": 200.0}
+
+
+def _ground_changes(config: Config) -> Iterator[Change]:
+    """Yield thinner ground layers, and for a plane also a ground that follows the road."""
+    ground, points = config.ground, max(1, config.clustering.min_points // 3)
+    for threshold in (0.3, 0.2, 0.1):
+        if threshold < ground.distance_threshold:
+            yield {"ground.distance_threshold": threshold}
+    if ground.method == "plane":
+        yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
+        yield {
+            "ground.method": "polar",
+            "ground.distance_threshold": 0.2,
+            "clustering.min_points": points,
+        }
+
+
+def _smaller_min_points(neighbours: int, limit: int) -> list[int]:
+    """Return values of min_points to try: the number that the best point reaches, and less."""
+    tries = [neighbours, round(neighbours * 0.75), neighbours // 2]
+    return [n for n in dict.fromkeys(tries) if 2 <= n < limit]

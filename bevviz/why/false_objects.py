@@ -1,0 +1,176 @@
+"""The cause of a false object: one that no ground truth explains or, without ground truth, a doubtful one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from bevviz.evaluate import MAX_DISTANCE
+from bevviz.model import geometry
+from bevviz.model.class_names import ACCEPTED_NAMES
+from bevviz.model.reasons import Reason, ReasonKind, scored
+from bevviz.model.results import Decision, Objects
+from bevviz.why.evidence import MOST, camera_and_fusion
+from bevviz.why.frame_index import FrameIndex, detection_subject
+from bevviz.why.subject import points_in_box, single_box
+
+LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
+BARELY = 2.0  # factor on a limit of the fusion within which it accepts an object only just
+DOUBLE = 0.1  # IoU from above from which two objects are one
+DEPTH = 3.0  # metres that the points of an object may be off those in the middle of its 2D box
+_JUDGED = frozenset().union(*ACCEPTED_NAMES.values())  # names that some label of a data set accepts
+
+
+def false_reasons(traces: FrameIndex) -> Mapping[int, Reason]:
+    """Return object row -> cause, for the objects that ``evaluate`` calls false.
+
+    Without ground truth these are the doubtful objects. Only objects of our fusion are judged.
+    """
+    if traces.false is None:
+        traces.false = dict(_false_reasons(traces))
+    return traces.false
+
+
+def _false_reasons(traces: FrameIndex) -> Iterator[tuple[int, Reason]]:
+    """Yield the false objects with their causes."""
+    objects, truth, matches = traces.result.objects, traces.labels_in_evaluate, traces.matches
+    if objects is None or not traces.origin("objects").ours:
+        return
+    if truth is None or matches is None:
+        for row in range(len(objects)):
+            if (doubt := _doubt(traces, objects, row)) is not None:
+                yield row, doubt
+        return
+    judged = _JUDGED.union(*truth.accepted)
+    for row in np.flatnonzero(matches.false).tolist():
+        if objects.names[row].lower() in judged:
+            yield row, _cause(traces, objects, row)
+
+
+def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
+    """Return the cause of an object that no ground truth explains."""
+    assert traces.matches is not None
+    name, partner = objects.names[row], traces.matches.partner
+    owner = _owner(traces, objects, row)
+    values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
+    holder = _holder_of_points(traces, int(objects.cluster[row]))
+    for number in dict.fromkeys((holder, owner)):
+        if number < 0:
+            continue
+        subject = traces.truth[number]
+        assert subject.box is not None
+        away = float(np.linalg.norm(objects.boxes.center[row, :2] - subject.box.center[0, :2]))
+        values |= {"truth": subject.name, "away": away}
+        other = np.flatnonzero(partner == number)
+        if len(other) and (number == holder or away <= MAX_DISTANCE):
+            values["other"] = scored(objects, int(other[0]))
+            near = away <= MAX_DISTANCE or number == owner
+            return Reason(ReasonKind.DUPLICATE if near else ReasonKind.SPLIT, None, values)
+        if number == holder and not subject.accepts(name):
+            return Reason(ReasonKind.MISNAMED, None, values)
+        if number == holder:
+            return Reason(ReasonKind.MISPLACED, None, values)
+    values |= {"truth": traces.truth[owner].name if owner >= 0 else "", "off": 0.0}
+    if owner >= 0:
+        truth_box = traces.truth[owner].box
+        assert truth_box is not None
+        values["off"] = float(np.hypot(*objects.boxes.center[row, :2]) - np.hypot(*truth_box.center[0, :2]))
+    if (size := _larger_whole(traces, objects, row)) is not None:
+        return Reason(ReasonKind.WALL, None, {**values, "size": size})
+    if owner >= 0:
+        return Reason(ReasonKind.WRONG_DEPTH, None, values)
+    return Reason(
+        ReasonKind.DETECTOR_ERROR, None, {"object": values["object"], "camera": objects.camera[row]}
+    )
+
+
+def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
+    """Return what makes an object doubtful, None if nothing does."""
+    values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
+    better = np.flatnonzero(objects.score > objects.score[row])
+    better = better[[objects.names[other] == objects.names[row] for other in better]]
+    overlap = geometry.bev_iou(single_box(objects.boxes, row), objects.boxes)[0]
+    doubles = better[overlap[better] >= DOUBLE]
+    if len(doubles):
+        other = scored(objects, int(doubles[overlap[doubles].argmax()]))
+        return Reason(ReasonKind.DUPLICATE, None, {**values, "truth": "", "other": other})
+    size = _larger_whole(traces, objects, row)
+    if size is not None and _is_barely_accepted(traces, objects, row):
+        return Reason(ReasonKind.WALL, None, {**values, "truth": "", "size": size})
+    off = _off_its_box(traces, objects, row)
+    if abs(off) > DEPTH:
+        return Reason(ReasonKind.WRONG_DEPTH, None, {**values, "truth": "", "off": off})
+    return None
+
+
+def _owner(traces: FrameIndex, objects: Objects, row: int) -> int:
+    """Return the row of the ground truth object whose box the object's detection is, -1: none."""
+    camera = traces.camera(objects.camera[row])
+    return -1 if camera is None else int(traces.owners(camera)[objects.detection[row]])
+
+
+def _holder_of_points(traces: FrameIndex, cluster: int) -> int:
+    """Return the row of the ground truth object that holds most points of a cluster, -1: none."""
+    points = traces.result.frame.points[traces.cluster == cluster]
+    shares = [
+        points_in_box(subject.box, points).mean() if subject.box is not None and len(points) else 0.0
+        for subject in traces.truth
+    ]
+    return int(np.argmax(shares)) if shares and max(shares) >= MOST else -1
+
+
+def _larger_whole(traces: FrameIndex, objects: Objects, row: int) -> tuple[float, float] | None:
+    """Return length and height of what an object's points are a part of, None if it is not larger.
+
+    The clustering itself is asked, since a detection may have cut the points out of its cluster.
+    """
+    clusters, obstacles = traces.result.clusters, traces.result.obstacles
+    if clusters is None or obstacles is None or objects.cluster[row] < 0:
+        return None
+    first = traces.first_labels[clusters.labels == objects.cluster[row]]
+    first = first[first >= 0]
+    if not len(first):
+        return None
+    whole = obstacles[traces.first_labels == np.bincount(first).argmax()]
+    extent = np.ptp(whole, axis=0)
+    length, height = float(np.hypot(*extent[:2])), float(extent[2])
+    size = objects.boxes.size[row]
+    is_larger = length > LARGER * float(np.hypot(*size[:2])) or height > LARGER * max(float(size[2]), 1.0)
+    return (length, height) if is_larger else None
+
+
+def _is_barely_accepted(traces: FrameIndex, objects: Objects, row: int) -> bool:
+    """Return whether a limit of the fusion only just accepted the points of an object.
+
+    Right objects are cut out of larger clusters, too, but suit their detections better.
+    """
+    camera, detection = objects.camera[row], int(objects.detection[row])
+    fusion = camera_and_fusion(traces.result, camera)[1] if camera else None
+    config = traces.result.config.fusion
+    if fusion is None:
+        return False
+    if fusion.claims is not None:
+        return bool(fusion.claims.fit[detection] * objects.score[row] < BARELY * config.min_rating)
+    pair = fusion.pair(detection, int(objects.cluster[row]))
+    return pair is not None and pair.iou < BARELY * config.min_iou
+
+
+def _off_its_box(traces: FrameIndex, objects: Objects, row: int) -> float:
+    """Return the metres by which an object is behind the points in the middle of its 2D box."""
+    camera_name, detection = objects.camera[row], int(objects.detection[row])
+    if not camera_name or detection < 0:
+        return 0.0
+    camera, fusion = camera_and_fusion(traces.result, camera_name)
+    view = camera.camera
+    if view.camera_from_points is None or fusion is None:
+        return 0.0
+    if fusion.detection_decision[detection] != Decision.MATCHED:
+        return 0.0
+    pair = fusion.pair(detection, int(objects.cluster[row]))
+    points = traces.place(detection_subject(camera, detection))
+    if pair is None or not len(points):
+        return 0.0
+    depth = geometry.apply(view.camera_from_points, traces.result.frame.points[points])[:, 2]
+    return pair.depth - float(np.median(depth))
