@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +170,18 @@ def test_each_false_object_has_a_cause(asked: dict[str, Asked]) -> None:
     assert {ReasonKind.DETECTOR_ERROR, ReasonKind.MISPLACED, ReasonKind.WRONG_DEPTH} <= kinds | {
         ReasonKind.WALL
     }
+
+
+def test_without_ground_truth_doubtful_objects_are_false_ones(asked: dict[str, Asked]) -> None:
+    doubtful, right = 0, 0
+    for name, frame in asked.items():
+        if name.endswith("network"):
+            partner, result = partner_of(frame), frame.result
+            blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)))
+            rows = [answer.subject.row for answer in blind.false_objects()]
+            doubtful += len(rows)
+            right += sum(partner[row] >= 0 for row in rows)
+    assert doubtful >= 4 and right <= 1
 
 
 def test_a_change_with_the_objects_own_detection_is_a_hint(asked: dict[str, Asked]) -> None:

@@ -19,7 +19,7 @@ from bevviz.why.subject import points_in_box, single_box
 LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
 BARELY = 2.0  # factor on a limit of the fusion within which it accepts an object only just
 DOUBLE = 0.1  # IoU from above from which two objects are one
-DEPTH = 3.0  # metres that the points of an object may be off those in the middle of its 2D box
+DEPTH = 3.0  # metres that an object may be nearer than the points in the middle of its 2D box
 _JUDGED = frozenset().union(*ACCEPTED_NAMES.values())  # names that some label of a data set accepts
 
 
@@ -100,7 +100,7 @@ def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
     if size is not None and _is_barely_accepted(traces, objects, row):
         return Reason(ReasonKind.WALL, None, {**values, "truth": "", "size": size})
     off = _off_its_box(traces, objects, row)
-    if abs(off) > DEPTH:
+    if off < -DEPTH:  # A right object may be behind the points that hide its middle.
         return Reason(ReasonKind.WRONG_DEPTH, None, {**values, "truth": "", "off": off})
     return None
 
