@@ -199,6 +199,23 @@ def test_missed_objects_are_listed_and_opened(browser: Browser, address: str) ->
         assert state(again) == held
 
 
+def test_the_page_shows_what_was_tried_in_vain(browser: Browser, address: str) -> None:
+    """Below the answer and in the row of the list, where no hint helps."""
+    with opened(browser, address) as page:
+        until(lambda: listed(page))
+        for row in page.locator("#found li", has=page.locator(".missed")).all():
+            assert not row.locator("small").count()
+            row.locator("button").click()
+            until(lambda: "busy" not in (page.locator("#answer").get_attribute("class") or ""))
+            until(lambda: not page.inner_text("#hints").startswith("Trying"))
+            if not page.locator("#hints button").count():
+                break
+        sentence = page.inner_text("#hints")
+        assert sentence.startswith("No ") and sentence.endswith(".")
+        until(lambda: page.locator("#found [aria-current=true] small").count())
+        assert page.inner_text("#found [aria-current=true] small") == sentence
+
+
 def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str) -> None:
     """A control changes the picture's counts; undo takes it back; what is wrong is said in a line."""
     with opened(browser, address) as page:
@@ -311,14 +328,18 @@ def talk(address: str) -> Iterator[Talk]:
         yield talk
 
 
-def helped(talk: Talk) -> tuple[int, str, dict[str, Any]]:
-    """Time and pick of a missed object, and a hint that helps it."""
+def hints_of_missed(talk: Talk) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Yield time and pick of each missed object, and the message with its hints."""
     for entry in talk.of("missed"):
         _, stamp, _, pick, *_ = entry["sights"][0]
-        talk.say(type="ask", time=int(stamp), set=[], pick=pick)
-        hints = talk.until("hints")["hints"]
-        if hints:
-            return int(stamp), pick, hints[0]
+        yield int(stamp), pick, talk.asked("hints", type="ask", time=int(stamp), set=[], pick=pick)
+
+
+def helped(talk: Talk) -> tuple[int, str, dict[str, Any]]:
+    """Time and pick of a missed object, and a hint that helps it."""
+    for stamp, pick, message in hints_of_missed(talk):
+        if message["hints"]:
+            return stamp, pick, message["hints"][0]
     pytest.fail("no change helps any missed object")
 
 
@@ -356,6 +377,14 @@ def test_a_hint_has_the_promised_effect(talk: Talk) -> None:
     assert tried["effects"] == {key: hint[key] for key in tried["effects"]}
     assert hint["fixed"]
     assert tried["f1"][1] > tried["f1"][0]
+
+
+def test_without_a_hint_a_sentence_names_the_tried_changes(talk: Talk) -> None:
+    sentences = []
+    for _, _, message in hints_of_missed(talk):
+        assert bool(message["hints"]) == (not message["tried"])
+        sentences += [message["tried"]] if message["tried"] else []
+    assert any(re.fullmatch(r"No tried change helps: with \w+\.\w+=.*'\.", text) for text in sentences)
 
 
 def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:

@@ -77,6 +77,21 @@ class Answer:
         """Whether no setting could help: it is hidden, out of view, without points, or a weak detection."""
         return self.verdict.kind in HOPELESS or self.weak
 
+    def tried_text(self, named: int = NAMED) -> str:
+        """Return a clause with the results of the tried changes; empty: one helps, or none was tried.
+
+        Args:
+            named: number of changes that are named for each result.
+        """
+        if self.hints or not self.tried:
+            return ""
+        by_result: dict[str, list[str]] = {}
+        for change in self.tried:
+            by_result.setdefault(change.text, []).append(" and ".join(change.settings))
+        results = ", ".join(f"with {_some(settings, named)} {text}" for text, settings in by_result.items())
+        head = "no tried change helps" if self.tried[1:] else "the one tried change does not help"
+        return f"{head}: {results}"
+
     @property
     def selection(self) -> Selection | None:
         """The selection of the subject; None: it is a place or a track."""
@@ -238,8 +253,9 @@ class FrameExplainer:
         if not hints:
             if verdict.kind is ReasonKind.REPORTED or answer.folded or not search.tried:
                 return answer
-            text = f"{verdict.text.removesuffix('.')}; {_no_help_text(search.tried)}."
-            return replace(answer, verdict=replace(verdict, text=text), tried=search.tried)
+            answer = replace(answer, tried=search.tried)
+            text = f"{verdict.text.removesuffix('.')}; {answer.tried_text()}."
+            return replace(answer, verdict=replace(verdict, text=text))
         hint = hints[0]
         also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
         settings = ", ".join(hint.settings)
@@ -273,20 +289,10 @@ def why(
     return FrameExplainer(result, loader, classes).explain(selection, hints, everything=everything)
 
 
-def _no_help_text(tried: Sequence[TriedChange]) -> str:
-    """Say which changes were tried and the result of each."""
-    by_result: dict[str, list[str]] = {}
-    for change in tried:
-        by_result.setdefault(change.text, []).append(" and ".join(change.settings))
-    results = ", ".join(f"with {_some(settings)} {text}" for text, settings in by_result.items())
-    head = "no tried change helps" if tried[1:] else "the one tried change does not help"
-    return f"{head}: {results}"
-
-
-def _some(settings: Sequence[str]) -> str:
+def _some(settings: Sequence[str], named: int) -> str:
     """Name the first settings and the number of the others."""
-    more = f" or {len(settings) - NAMED} more" if len(settings) > NAMED else ""
-    return " or ".join(settings[:NAMED]) + more
+    more = f" or {len(settings) - named} more" if len(settings) > named else ""
+    return " or ".join(settings[:named]) + more
 
 
 def _rank(answer: Answer) -> tuple[bool, bool, bool, bool, bool, float]:

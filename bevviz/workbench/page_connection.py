@@ -161,7 +161,7 @@ class PageConnection:
 
     async def _ask(self, number: int, message: Message) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer message came."""
-        from bevviz.workbench.page_messages import other_answers
+        from bevviz.workbench.page_messages import hints_dict, other_answers
 
         workbench, frame = self._workbench, await self._frame(message)
         settings = self._source.asked_settings(_settings(message), again="pick" in message)
@@ -185,7 +185,7 @@ class PageConnection:
         await self._at_desk(number, lambda: self._source.mark(result, answer))
         hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, selection), idle=True)
         if hints is not None:
-            await self._send({"type": "hints", **head, "hints": hints.as_dict()["hints"]})
+            await self._send({"type": "hints", **head, **hints_dict(hints)})
 
     def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""

@@ -1,4 +1,4 @@
-"""JSON of the messages to the page: other answers, notes and parameter controls."""
+"""JSON of the messages to the page: other answers, hints, notes and parameter controls."""
 
 from __future__ import annotations
 
@@ -32,6 +32,14 @@ def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
                 "reported": answer.verdict.reported,
                 "reason": answer.verdict.kind.value,
             }
+
+
+def hints_dict(answer: Answer) -> dict[str, Any]:
+    """Return the hints of an answer with hints, and one sentence where no change helps."""
+    text = answer.tried_text(named=1)
+    if not text and not answer.hints and not answer.verdict.reported:
+        text = "no change that helps is known"
+    return {"hints": answer.as_dict()["hints"], "tried": f"{text[:1].upper()}{text[1:]}." if text else ""}
 
 
 def note_dict(note: Note) -> dict[str, Any]:

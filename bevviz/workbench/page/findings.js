@@ -52,6 +52,15 @@ export function notes(message) {
   draw();
 }
 
+// Show in the row of an object that no tried change helps it. A sight keeps the sentence after its own text.
+export function explain(frame, pick, tried, sentence) {
+  for (const { sights } of entries.values()) {
+    const one = sights.find((sight) => sight[0] === frame && sight[3] === pick && sight[4] === tried);
+    if (one) one[6] = sentence;
+  }
+  draw();
+}
+
 // --- drawing ------------------------------------------------------------------------------------
 
 const away = (one) => one[2] ?? 99;
@@ -106,7 +115,8 @@ function drawn(entry) {
   const where = one[2] === null ? "" : ` at ${one[2]} m`;
   const text = `${entry.name}${where}${one[5] ? `: ${one[5]}` : ""}`;
   const button = element("button", "", "", element("span", "time", seconds(one[1])),
-    element("span", entry.what.replace(" ", "-"), entry.what), element("span", "", text),
+    element("span", entry.what.replace(" ", "-"), entry.what),
+    element("span", "", text, ...(one[6] ? [element("small", "", one[6])] : [])),
     element("span", "faint", frames(entry)));
   button.setAttribute("aria-current", entry.key === current);
   button.onclick = () => choose(entry, entry.key === current ? sight + 1 : entry.best);

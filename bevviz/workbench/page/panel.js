@@ -12,12 +12,14 @@ let opened = []; // controls of the configuration that the drive was opened with
 // --- questions and answers ----------------------------------------------------------------------
 
 let asking = 0;
+let askedTried = false; // the newest question is about the tried side
 function ask(what) {
   if (state.time === null) return;
   asked.at = "entity" in what ? asked.released : performance.now();
   asked.sent = performance.now();
   $("answer").classList.add("busy");
-  asking = send({ type: "ask", time: Number(state.time), set: isTried() ? state.set : [], ...what });
+  askedTried = isTried();
+  asking = send({ type: "ask", time: Number(state.time), set: askedTried ? state.set : [], ...what });
 }
 
 // Row numbers differ between results, only those of the ground truth stay. So ask about the object's position.
@@ -73,6 +75,9 @@ function hints(message) {
     button.onclick = () => change(hint.settings);
     return button;
   }));
+  if (!message.tried) return;
+  $("hints").textContent = message.tried;
+  list.explain(message.frame, state.pick, askedTried, message.tried);
 }
 
 // Describe the effects of other values on a frame. Hints and tried values use the same words.
