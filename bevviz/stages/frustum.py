@@ -30,7 +30,6 @@ from bevviz.stages.mask_lookup import is_covered
 EDGE_PIXELS = 2.0  # pixels, one sigma of the edges of an image box,
 EDGE_SHARE = 0.03  # or this share of the box's width if that is more;
 EDGE_DOUBT = 2.0  # an edge of a box of score s is 1 + EDGE_DOUBT (1 - s) times as uncertain
-NEARNESS = 3.0  # candidates are compared by rating / distance ** (NEARNESS (1 - s)): see ``claim_clusters``
 TALL_SHARE = 0.08  # sigma of a height as a share of it; the object may stand anywhere in the box
 HIDDEN_SIGMAS = 2.0  # sigmas: a lower height costs no more than this, because the object may be partly hidden
 HIDDEN_SIGMAS_CUT = 1.0  # the same for a box that the image border cuts
@@ -66,9 +65,7 @@ def claim_clusters(
     ``overlap`` is the part of the image box that the candidate's outline covers. ``t(height)`` is the
     agreement of the box's height in metres at the candidate's distance with that of the class. It is
     Student's t, lenient with lower heights because the object may be partly hidden. ``share`` is the share of
-    the connected points that are in the box. Of several candidates the nearer one is preferred, and the more
-    so the lower the score is: the box of a weak detection is less exact, so that what stands behind the
-    object may fill it better. The best rated detection of all claims its points. Other
+    the connected points that are in the box. The best rated detection of all claims its points. Other
     detections that wanted these points search again. This is repeated until none is left. Then
     ``box_fit.fit`` fits a box of the class's size to the candidate, and the detection claims the points in
     it. This joins parts that an occluder separated, and drops points that stand too near.
@@ -286,17 +283,9 @@ class _CameraFrustums:
         for size in self._sizes[d][1:].tolist():
             candidate = self._best_of_size(d, size)
             candidate = replace(candidate, fit=DOUBT * candidate.fit)
-            if self._weight(d, candidate) > self._weight(d, best):
+            if candidate.fit > best.fit:
                 best = candidate
         return best
-
-    def _weight(self, d: int, candidate: _Candidate) -> float:
-        """Return the rating of a candidate, lower for farther ones."""
-        return float(candidate.fit / max(candidate.depth, 1.0) ** self._nearness(d))
-
-    def _nearness(self, d: int) -> float:
-        """Return the exponent of the distance in the comparison of a detection's candidates."""
-        return NEARNESS * (1 - float(self._detections.score[d]))
 
     def _best_of_size(self, d: int, size: Sequence[float]) -> _Candidate:
         """Return the best rated candidate for one size of a detection's class."""
@@ -317,7 +306,6 @@ class _CameraFrustums:
             self._lowest(d),
             self._work.fewest,
             config.min_iou,
-            self._nearness(d),
         )
         return _Candidate(rating, rows, depth)
 

@@ -36,7 +36,6 @@ def choose_candidate(
     lowest: float,
     fewest: int,
     least: float,
-    nearness: float,
 ) -> tuple[I64, float, float]:
     """Choose the best candidate in the frustum of an image box.
 
@@ -56,7 +55,6 @@ def choose_candidate(
         lowest: sigmas; a lower height costs no more than this.
         fewest: smallest number of points of a candidate.
         least: smallest part of the image box that a candidate covers.
-        nearness: exponent of the distance by which ratings of candidates are divided to compare them.
 
     Returns:
         The rows of the candidate's points, its rating without the score, and the distance of its front.
@@ -131,7 +129,6 @@ def choose_candidate(
 
     area = (box[2] - box[0]) * (box[3] - box[1])
     best, best_first, best_last, best_far = 0.0, 0, 0, 0.0
-    most = 0.0
     for k in range(bodies):
         first = start[k]
         while first < start[k + 1]:
@@ -157,9 +154,7 @@ def choose_candidate(
                 if not np.isnan(height):
                     z = max((tall * front - height) / sigma, -lowest)
                     rating /= 1 + z * z / STUDENT_FREEDOM
-                weighted = rating / max(front, 1.0) ** nearness
-                if overlap >= least and weighted > most:
-                    most = weighted
+                if overlap >= least and rating > best:
                     best, best_first, best_last, best_far = rating, first, last, front
             if last == start[k + 1]:
                 break
