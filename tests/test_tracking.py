@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import bevviz
 from bevviz.config import TrackingConfig, load
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
@@ -18,7 +20,7 @@ from bevviz.pipeline.session import Session
 from bevviz.stages.tracking import Tracker
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
-from tests.support.track_metrics import Tallies, TrackTally, Truth, add_tracks, truth_of
+from tests.support.track_metrics import IdentityCounter, Tallies, TrackTally, Truth, add_tracks, truth_of
 from tests.support.tracking_scenes import CAR, PERSON, scene
 
 CONFIG = TrackingConfig()
@@ -213,6 +215,69 @@ def test_trails_go_back_as_far_as_asked_for() -> None:
 
 def replace_trail(seconds: float) -> TrackingConfig:
     return CONFIG.model_copy(update={"trail": seconds})
+
+
+TRUCK = (12.0, 2.5, 3.0)
+HALF = (6.0, 2.5, 3.0)
+
+
+def shown_ids(tracks: Tracks) -> list[int]:
+    return [int(i) for i in tracks.id[tracks.confirmed]]
+
+
+@pytest.mark.parametrize("speed", [0.0, 8.0])
+def test_a_truck_that_falls_into_two_clusters_keeps_one_id(speed: float) -> None:
+    """A truck seen in turn as a whole, as two halves, and as the rear half alone."""
+    tracker = Tracker()
+    for i in range(50):
+        x = 20 + speed * i / 10
+        turn = "whole" if i % 10 < 3 else "halves" if i % 10 < 8 else "rear"
+        parts = {"whole": [x], "halves": [x - 3, x + 3], "rear": [x - 3]}[turn]
+        size = TRUCK if turn == "whole" else HALF
+        tracks = step(tracker, i, [(part, 4, 0) for part in parts], size, ("truck",) * len(parts))
+        assert shown_ids(tracks) == ([0] if i >= 2 else []), i
+        if i >= 15:
+            row = tracks.id.tolist().index(0)
+            assert tracks.velocity[row, 0] == pytest.approx(speed, abs=1.0), "another part is no motion"
+
+
+def test_the_older_track_continues_where_only_the_younger_one_is_seen() -> None:
+    tracker = Tracker()
+    for i in range(20):
+        parts = [20] if i < 10 else [17, 23] if i < 12 else [23]
+        places = [(part, 4, 0) for part in parts]
+        tracks = step(tracker, i, places, TRUCK if i < 10 else HALF, ("truck",) * len(parts))
+        if i >= 12:
+            assert shown_ids(tracks) == [0]
+            assert tracks.cluster[tracks.id == 0].tolist() == [0], "it is the object that is seen"
+
+
+def test_who_stands_at_a_truck_has_a_track_beside_it() -> None:
+    tracker = Tracker()
+    for i in range(20):
+        tracks = step(tracker, i, [(20, 4, 0), (18, 3, 0)], np.array([TRUCK, PERSON]), ("truck", "person"))
+    assert shown_ids(tracks) == [0, 1]
+    assert tracks.names == ("truck", "person")
+
+
+def test_two_trucks_in_a_queue_have_two_ids() -> None:
+    tracker = Tracker()
+    for i in range(20):
+        tracks = step(tracker, i, [(20, 4, 0), (33, 4, 0)], TRUCK, ("truck", "truck"))
+    assert shown_ids(tracks) == [0, 1]
+
+
+def test_trucks_in_a_real_queue_keep_their_ids(shared: Path) -> None:
+    """A lorry and an articulated truck beside the robot, in clusters that change from frame to frame."""
+    model = shared / "models" / "yolox_nano.onnx"
+    counter = IdentityCounter()
+    with bevviz.open(shared / "kitti_drive", model=model) as opened:
+        for result in opened:
+            assert result.tracks is not None
+            counter.add(result.tracks)
+    assert counter.shown >= 100
+    assert counter.switches <= 4, "without the overlap of the boxes: 10"
+    assert counter.doubles <= 4, "without merging: 7"
 
 
 Drive = list[list[tuple[float, float, float]]]

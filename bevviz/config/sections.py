@@ -258,12 +258,24 @@ class TrackingConfig(Section):
     method: Literal["kalman", "none"] = Field(
         "kalman", description="kalman: objects keep an id, with speed and trail; none: each frame for itself"
     )
-    gate: Metres = Field(1.5, gt=0, le=20, description="farthest on the ground from the expected place")
+    gate: Metres = Field(
+        1.5,
+        gt=0,
+        le=20,
+        description="farthest on the ground from the expected place; tracks of 3 m or more also follow boxes "
+        "that they overlap",
+    )
     position_noise: Metres = Field(0.2, gt=0, le=5, description="one sigma of the centre of a box")
     acceleration: float = Field(
         2.0, gt=0, le=50, description="one sigma of an object's acceleration, in m/s^2"
     )
-    min_hits: int = Field(3, ge=1, le=100, description="frames with a name until a track is shown")
+    min_hits: int = Field(
+        3,
+        ge=1,
+        le=100,
+        description="frames with a name until a track is shown, or frames in the box of an older one until "
+        "it is hidden",
+    )
     max_coast: Seconds = Field(1.0, ge=0, le=60, description="a track that is unseen for longer ends")
     class_memory: Seconds = Field(1.0, gt=0, le=60, description="time that the vote of a class decays in")
     reset_after: Seconds = Field(3.0, gt=0, le=3600, description="a longer gap in the stamps ends all tracks")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,13 +12,13 @@ from bevviz.config import TrackingConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Frame
 from bevviz.model.results import Clusters, Objects, Tracks
-from bevviz.stages.fusion import assign
-from bevviz.support.kernel import kernel
+from bevviz.stages.track_matching import SAME_PLACE, costs, extents, match, overlaps
 
 INITIAL_SPEED = 5.0  # m/s, one sigma of the speed of a new track
 SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading
-SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate
 LEAST_VOTE = 1.0  # a track whose decayed scores sum up to less loses its name
+SAME_OBJECT = 0.5  # share of a track's box that lies in an older one's from which on both are one object
+LONG = 3.0  # m; a track of this length or more is a vehicle, of which often only a part is seen
 HEADING_SPEED = 1.0  # m/s above which the direction of motion distinguishes front from back
 
 
@@ -37,6 +36,8 @@ class _TrackStates:
     sightings: I32
     born: I64  # stamp
     seen: I64  # stamp
+    doubled: I32  # frames that the track shared the box of an older one
+    split: Bool  # whether the box holds another cluster as well, which may be a part of the object
     votes: F64  # (T, classes)
     trail: F32  # (T, L, 3) NaN before the birth
 
@@ -65,6 +66,8 @@ class _TrackStates:
             sightings=np.zeros(n, np.int32),
             born=np.full(n, stamp, np.int64),
             seen=np.full(n, stamp, np.int64),
+            doubled=np.zeros(n, np.int32),
+            split=np.zeros(n, np.bool_),
             votes=np.zeros((n, classes)),
             trail=np.full((n, length, 3), np.nan, np.float32),
         )
@@ -161,7 +164,8 @@ class Tracker:
 
         self._remember(frame.stamp, config)
         named = self._vote(cluster, in_view, objects, dt, config)
-        return self._tracks(frame.stamp, place, cluster, named, innovation, config)
+        cluster, named, innovation, shown = self._merge(cluster, named, innovation, config)
+        return self._tracks(frame.stamp, place, cluster, named, innovation, shown)
 
     def _predict(self, dt: float, config: TrackingConfig) -> None:
         """Predict with constant velocity. Noise is an acceleration that is constant between two frames."""
@@ -176,33 +180,40 @@ class Tracker:
         The assignment minimises squared distances on the ground, relative to the gate. The gate is
         ``tracking.gate``, or three sigma of the position if that is wider. Different sizes cost as well. A
         track that never was whole is compared with the visible box. The visible part of an object that was
-        whole before may be smaller and its centre may lie nearer to the sensor, at no cost.
+        whole before may be smaller and its centre may lie nearer to the sensor, at no cost. A box that
+        overlaps a long track may be its box beyond the gate, too, since the centre of a vehicle's visible
+        part may be far from the vehicle's. Tracks that share the box of an older one choose last.
         """
         state = self._state
         column = np.full(len(state), -1, np.int32)
+        state.split[:] = False
         if len(state) == 0 or len(boxes) == 0:
             return column
-        gate = np.maximum(config.gate**2, 9 * (state.covariance[:, 0, 0] + config.position_noise**2))
+        expected = self._boxes()
+        large = np.flatnonzero(expected.size[:, :2].max(axis=1) >= LONG)
+        overlap = np.zeros((2, len(state), len(boxes)))
+        overlap[0, large], inside = overlaps(expected.chosen(large), seen)
+        overlap[1, large], _ = overlaps(expected.chosen(large), boxes)
+        gate = self._gate(config)
         sight = state.mean[:, 0, :2] - pose[:2, 3]
         sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
-        cost, near_track, near_box = _costs(
+        cost = costs(
             state.mean[:, 0],
             gate,
-            _extent(state.size),
+            extents(state.size),
             sight,
             state.whole,
             np.stack([seen.center, boxes.center]),
-            np.stack([_extent(seen.size), _extent(boxes.size)]),
+            np.stack([extents(seen.size), extents(boxes.size)]),
             whole,
+            overlap,
         )
-        # Most tracks have one box near, and that box has no other track. Only the others need an assignment.
-        nearest = cost.argmin(1)
-        alone = (near_track == 1) & (near_box[nearest] == 1)
-        column[alone] = nearest[alone]
-        near_box[nearest[alone]] = 0
-        rows, columns = np.flatnonzero((near_track > 0) & ~alone), np.flatnonzero(near_box)
-        chosen = assign(cost[np.ix_(rows, columns)], unmatched=2.0)
-        column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
+        doubled = state.doubled >= config.min_hits
+        column[~doubled] = match(cost[~doubled])
+        free = np.setdiff1d(np.arange(len(boxes)), column)
+        column[doubled] = np.append(free, -1)[match(cost[np.ix_(doubled, free)])]
+        parts = (inside >= SAME_OBJECT) & (np.arange(len(boxes)) != column[large, None])
+        state.split[large] = (parts & (seen.size[:, :2].max(axis=1) >= config.gate)).any(axis=1)
         return column
 
     def _complete(self, rows: NDArray[Any], boxes: Boxes3D, whole: Bool, seen: Boxes3D, pose: F64) -> Boxes3D:
@@ -234,23 +245,91 @@ class Tracker:
         return Boxes3D(center, size, boxes.yaw)
 
     def _correct(self, rows: NDArray[Any], boxes: Boxes3D, config: TrackingConfig) -> F32:
-        """Update with the measured boxes. Return the (T,) distances on the ground from the predictions."""
-        state = self._state
-        covariance = state.covariance[rows]
-        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
-        innovation = boxes.center - state.mean[rows, 0]
-        state.mean[rows] += gain[:, :, None] * innovation[:, None]
-        state.covariance[rows] = covariance - gain[:, :, None] * covariance[:, :1]
+        """Update with the measured boxes. Return the distances on the ground from the predictions.
 
+        If a long object seems longer or shorter than before, its steadiest end counts as its motion. An
+        offset beyond the gate moves the track without changing its speed.
+        """
+        state = self._state
         turn, quarters = _turn(boxes.yaw, state.yaw[rows])
         size = boxes.size.astype(np.float64)
         size[:, :2] = np.where((quarters % 2 == 1)[:, None], size[:, 1::-1], size[:, :2])
+        axes = _axes(state.yaw[rows])
+        offset = boxes.center - state.mean[rows, 0]
+        along = (axes @ offset[:, :2, None])[:, :, 0]
+        grown = (size - state.size[rows])[:, :2]
+        side = _steadiest_side(along, grown, 2 * config.position_noise)
+        side[state.size[rows, :2].max(axis=1) < LONG] = 0
+        innovation = offset.copy()
+        innovation[:, :2] += ((side * grown / 2)[:, None] @ axes)[:, 0]
+
+        covariance = state.covariance[rows]
+        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + config.position_noise**2)
+        gain[(innovation[:, :2] ** 2).sum(axis=1) > self._gate(config)[rows], 1] = 0
+        state.mean[rows] += gain[:, :, None] * innovation[:, None]
+        state.covariance[rows] = covariance - gain[:, :, None] * covariance[:, :1]
+        smaller = state.split[rows, None] & (size < state.size[rows])  # the rest is in another cluster
+        gains = np.where(smaller, 0, SHAPE_GAIN)
+        state.mean[rows, 0, :2] -= ((side * gains[:, :2] * grown / 2)[:, None] @ axes)[:, 0]
+
         state.yaw[rows] += SHAPE_GAIN * turn
-        state.size[rows] += SHAPE_GAIN * (size - state.size[rows])
+        state.size[rows] += gains * (size - state.size[rows])
         velocity = state.mean[rows, 1]
         backwards = np.cos(state.yaw[rows] - np.arctan2(velocity[:, 1], velocity[:, 0])) < 0
         state.yaw[rows] += np.pi * (backwards & (np.hypot(*velocity[:, :2].T) > HEADING_SPEED))
         return np.asarray(np.hypot(innovation[:, 0], innovation[:, 1]), np.float32)
+
+    def _merge(
+        self, cluster: NDArray[Any], named: I32, innovation: F32, config: TrackingConfig
+    ) -> tuple[NDArray[Any], I32, F32, Bool]:
+        """Make one of tracks that share the box of a vehicle: the oldest one that is confirmed survives.
+
+        A younger track that is seen beside the older one goes on, so that its cluster has a track, but
+        is not shown. If the older one is not seen, it continues as the younger one. People and others who
+        are shorter than a vehicle and have another name stay.
+
+        Returns:
+            The clusters, objects and innovations of the remaining tracks, and which of them are shown.
+        """
+        state = self._state
+        shown = (state.sightings >= config.min_hits) & (state.votes.sum(1) >= LEAST_VOTE)
+        length = state.size[:, :2].max(axis=1)
+        hosts = np.flatnonzero(shown & (length >= LONG))
+        boxes = self._boxes()
+        iou, share = overlaps(boxes.chosen(hosts), boxes)
+        best = state.votes.argmax(1) if len(self._classes) else np.zeros(len(state), np.int64)
+        alike = (best[hosts, None] == best) | (state.sightings == 0) | (length >= LONG)
+        doubles = (share >= SAME_OBJECT) & alike & (hosts[:, None] < np.arange(len(state)))
+        ended = np.zeros(len(state), np.bool_)
+        for young in range(len(state)):
+            older = np.flatnonzero(doubles[:, young] & shown[hosts] & ~ended[hosts])
+            doubled = state.doubled[young] + (1 if len(older) else -1)
+            state.doubled[young] = min(max(doubled, 0), 2 * config.min_hits)
+            if len(older) == 0 or doubled < config.min_hits:
+                continue
+            shown[young] = False
+            near = older[iou[older, young].argmax()]
+            old = hosts[near]
+            if cluster[old] < 0 <= cluster[young] and iou[near, young] >= SAME_PLACE:
+                for values in (state.mean, state.covariance, state.size, state.whole, state.yaw, state.seen):
+                    values[old] = values[young]
+                for results in (cluster, named, innovation, state.trail[:, -1]):
+                    results[old] = results[young]
+                ended[young] = True
+            elif cluster[young] < 0:
+                ended[young] = True
+        self._state = state.chosen(~ended)
+        return cluster[~ended], named[~ended], innovation[~ended], shown[~ended]
+
+    def _gate(self, config: TrackingConfig) -> F64:
+        """Return the (T,) squared distances on the ground within which an object may have moved."""
+        return np.maximum(config.gate**2, 9 * (self._state.covariance[:, 0, 0] + config.position_noise**2))
+
+    def _boxes(self) -> Boxes3D:
+        """Return the boxes of the tracks."""
+        state = self._state
+        yaw = np.arctan2(np.sin(state.yaw), np.cos(state.yaw))
+        return Boxes3D(*(a.astype(np.float32) for a in (state.mean[:, 0], state.size, yaw)))
 
     def _remember(self, stamp: int, config: TrackingConfig) -> None:
         """Append the positions to the trails, and drop those older than ``config.trail``."""
@@ -297,17 +376,16 @@ class Tracker:
         cluster: NDArray[Any],
         named: I32,
         innovation: F32,
-        config: TrackingConfig,
+        shown: Bool,
     ) -> Tracks:
         """Return the tracks of the current state."""
         state = self._state
         best = state.votes.argmax(1) if len(self._classes) else np.zeros(len(state), np.int64)
-        yaw = np.arctan2(np.sin(state.yaw), np.cos(state.yaw))
         return Tracks(
             frame_id=place[0],
             absolute=place[1],
             id=state.id.copy(),
-            boxes=Boxes3D(*(a.astype(np.float32) for a in (state.mean[:, 0], state.size, yaw))),
+            boxes=self._boxes(),
             velocity=state.mean[:, 1].astype(np.float32),
             age=((stamp - state.born) * 1e-9).astype(np.float32),
             coasting=((stamp - state.seen) * 1e-9).astype(np.float32),
@@ -316,53 +394,32 @@ class Tracker:
             names=tuple(
                 self._classes[c] if n else "" for c, n in zip(best.tolist(), state.sightings, strict=True)
             ),
-            confirmed=(state.sightings >= config.min_hits) & (state.votes.sum(1) >= LEAST_VOTE),
+            confirmed=shown,
             cluster=cluster.astype(np.int32),
             object=named,
             trail=state.trail,
         )
 
 
-def _extent(size: F32 | F64) -> F64:
-    """Return the (N, 2) logarithms of the shorter and the longer side on the ground."""
-    return np.asarray(np.log(np.maximum(np.sort(size[:, :2]), 0.1)), np.float64)
+def _axes(yaw: F64) -> F64:
+    """Return the (N, 2, 2) directions of the length and of the width on the ground."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
 
 
-@kernel
-def _costs(
-    place: F64, gate: F64, extent: F64, sight: F64, known: Bool, center: F32, measured: F64, whole: Bool
-) -> tuple[F64, I32, I32]:
-    """Return the cost of each track and box, and the numbers of candidates.
+def _steadiest_side(along: F64, grown: F64, noise: float) -> F64:
+    """Return the (N, 2) sides, -1 or 1, that moved less than the centre did, 0 for the centre.
 
-    ``center`` and ``measured`` are (2, K, ...): as seen, and as completed if the box is ``whole``.
+    A box that is longer or shorter than before has another end, which is not motion: another part of the
+    object is seen.
 
-    Returns:
-        (T, K) costs, inf beyond the squared gate.
-        (T,) boxes near each track.
-        (K,) tracks near each box.
+    Args:
+        along: (N, 2) offsets of the centres.
+        grown: (N, 2) differences of the sizes.
+        noise: differences of the sizes up to here are noise.
     """
-    cost = np.full((len(place), len(whole)), np.inf)
-    near_track, near_box = np.zeros(len(place), np.int32), np.zeros(len(whole), np.int32)
-    for t in range(len(place)):
-        for k in range(len(whole)):
-            as_whole = 1 if known[t] and whole[k] else 0
-            dx, dy = place[t, 0] - center[as_whole, k, 0], place[t, 1] - center[as_whole, k, 1]
-            narrower, shorter = (
-                extent[t, 0] - measured[as_whole, k, 0],
-                extent[t, 1] - measured[as_whole, k, 1],
-            )
-            if known[t] and not whole[k]:
-                hidden = max(math.exp(extent[t, 1]) - math.exp(measured[0, k, 1]), 0.0) / 2
-                nearer = min(max(dx * sight[t, 0] + dy * sight[t, 1], 0.0), hidden)
-                dx, dy = dx - nearer * sight[t, 0], dy - nearer * sight[t, 1]
-                shorter, narrower = min(shorter, 0.0), min(narrower, 0.0)
-            distance = (dx * dx + dy * dy) / gate[t]
-            if distance <= 1:
-                size = abs(narrower) + abs(shorter)
-                cost[t, k] = distance + SIZE_WEIGHT * size / 2
-                near_track[t] += 1
-                near_box[k] += 1
-    return cost, near_track, near_box
+    moved = np.abs(np.stack([along - grown / 2, along, along + grown / 2]))
+    return np.where(np.abs(grown) > noise, moved.argmin(axis=0) - 1.0, 0.0)
 
 
 def _turn(measured: F32, expected: F64) -> tuple[F64, I64]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I32, Bool
+from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
 from bevviz.model.results import Tracks
 from bevviz.stages.fusion import assign
 from bevviz.synthetic import Snapshot, SyntheticSource
@@ -117,3 +117,22 @@ def add_tracks(tallies: Tallies, seed: int, tracks: Tracks, truth: Truth) -> Non
         rows = [t for t in np.flatnonzero(shown).tolist() if tracks.names[t] == name]
         of_class = [r for r, label in enumerate(truth.labels) if label == name]
         tallies[name].add(seed, tracks, rows, truth, of_class)
+
+
+class IdentityCounter:
+    """Counts, without truth, boxes that change their id and boxes shared by two tracks."""
+
+    def __init__(self) -> None:
+        self.shown = self.switches = self.doubles = 0
+        self._last = (Boxes3D.empty(), np.zeros(0, np.int64))
+
+    def add(self, tracks: Tracks) -> None:
+        """Add the next frame."""
+        rows = np.flatnonzero(tracks.confirmed & (tracks.cluster >= 0))
+        boxes, ids = tracks.boxes.chosen(rows), tracks.id[rows]
+        overlap = geometry.bev_iou(self._last[0], boxes)
+        self.shown += len(rows)
+        self.switches += int(((overlap > 0.3) & (self._last[1][:, None] != ids)).sum())
+        self._last = boxes, ids
+        every = tracks.boxes.chosen(np.flatnonzero(tracks.confirmed))
+        self.doubles += int(np.triu(geometry.bev_iou(every, every) > 0.3, 1).sum())
