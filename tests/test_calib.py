@@ -12,7 +12,6 @@ import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
-from bevviz.calib.edges import cloud_edges
 from bevviz.calib.offsets import SCALES, TIME, error_pose
 from bevviz.calib.result import correction_yaml
 from bevviz.calib.score import Scorer
@@ -23,6 +22,7 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
+from bevviz.stages.edges import cloud_edges
 from bevviz.synthetic import SyntheticSource, write_bag
 from bevviz.synthetic.drive import PERIOD, START
 from tests.support import bags, documented_json

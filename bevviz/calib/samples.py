@@ -6,17 +6,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
-from bevviz.calib.edges import Edges, cloud_edges, image_edges
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, U8, Bool, Camera, Frame, Intrinsics
+from bevviz.stages.edges import Edges, cloud_edges, edges_in_view, image_edges, shrink, undistort
 
 CELLS = (8, 4)  # parts of the image along u and v; the edges of one part have the same errors
 PIXELS = 500_000  # larger images are scaled down to this size
 REACH = np.radians(3.5)  # radians outside the image; edges up to there may still move into it
-NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself is nearer; farther edges are wider than a pixel
 STEPS = np.arange(-15, 16) * 10_000_000  # nanoseconds from the image's stamp at which the pose is looked up
 
 Pose = Callable[[Frame, int], F64 | None]  # fixed_from_points at a stamp; None: unknown
@@ -31,7 +29,7 @@ class Shot:
     K: F64  # (3, 3) of the undistorted and scaled image that ``maps`` is made from
     maps: U8  # (4, H, W) see ``image_edges``
     xyz: F32  # (E, 3) edges of the cloud, in Frame.points_frame
-    change: U8  # (E,) expected change of the image at each edge: a row of ``score.CHANGES``
+    change: U8  # (E,) expected change of the image at each edge: a row of ``edges.CHANGES``
     cell: I32  # (E,) part of the image that each edge projects to, as stated
     mounting: F64  # (4, 4) camera_from_points as stated, for a robot that stands still
     motion: F64 | None  # (T, 4, 4) points at the image's stamp + STEPS from points at the cloud's stamp
@@ -121,28 +119,15 @@ def _shot(frame: Frame, camera: Camera, edges: Edges, pose: Pose) -> Shot:
     mounting = camera.camera_from_points
     if camera.motion_compensated and motion is not None:
         mounting = mounting @ geometry.inverse(motion[len(STEPS) // 2])
-    picture, K = _flatten(camera.image.bgr, camera.intrinsics)
+    flat_image = undistort(camera.image.bgr, camera.intrinsics)
+    picture, K = shrink(flat_image, camera.intrinsics.K, PIXELS)
     height, width = picture.shape[:2]
+    view = Intrinsics(width, height, K)
+    xyz, uv, change = edges_in_view(edges, camera.camera_from_points, view, REACH)
     size = np.array([width, height], np.float32)
-    flat = Intrinsics(width, height, K)
-    uv, depth = geometry.project(geometry.apply(camera.camera_from_points, edges.xyz), flat)
-    margin = np.tan(REACH) * np.array([K[0, 0], K[1, 1]], np.float32)
-    with np.errstate(invalid="ignore"):
-        inside = ((uv > -margin) & (uv < size + margin)).all(axis=1)
-    inside &= (depth > NEAREST) & (depth < FARTHEST)
-    xyz, towards, bright, uv = edges.xyz[inside], edges.towards[inside], edges.bright[inside], uv[inside]
-    displaced = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
-    away = geometry.project(geometry.apply(camera.camera_from_points, displaced), flat)[0] - uv
     column, row = np.clip(uv / size * CELLS, 0, np.array(CELLS) - 1).astype(np.int32).T
     cell = row * CELLS[0] + column
-    return Shot(frame, camera, K, image_edges(picture), xyz, _change(away, bright), cell, mounting, motion)
-
-
-def _change(away: F32, bright: Bool) -> U8:
-    """Return the row of ``score.CHANGES`` for edges with (E, 2) directions in the image."""
-    along_v = np.abs(away[:, 1]) > np.abs(away[:, 0])
-    negative = np.where(along_v, away[:, 1], away[:, 0]) < 0
-    return np.where(bright, 2 + 2 * along_v + negative, along_v).astype(np.uint8)
+    return Shot(frame, camera, K, image_edges(picture), xyz, change, cell, mounting, motion)
 
 
 def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
@@ -151,21 +136,3 @@ def _motion(frame: Frame, stamp: int, pose: Pose) -> F64 | None:
     poses = [pose(frame, stamp + int(step)) for step in STEPS] if here is not None else []
     known = [geometry.inverse(then) @ here for then in poses if then is not None and here is not None]
     return np.stack(known) if len(known) == len(STEPS) else None
-
-
-def _flatten(bgr: U8, intrinsics: Intrinsics) -> tuple[U8, F64]:
-    """Return the image without distortion, scaled down to PIXELS, and its camera matrix."""
-    picture, K = bgr, intrinsics.K
-    if geometry.has_distortion(intrinsics):
-        if intrinsics.distortion_model in geometry.FISHEYE:
-            picture = cv2.fisheye.undistortImage(picture, K, intrinsics.D[:4], Knew=K)
-        else:
-            picture = cv2.undistort(picture, K, intrinsics.D)
-    height, width = picture.shape[:2]
-    scale = np.sqrt(PIXELS / (height * width))
-    if scale >= 1:
-        return picture, K
-    size = round(width * scale), round(height * scale)
-    sx, sy = size[0] / width, size[1] / height
-    shrink = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), shrink @ K

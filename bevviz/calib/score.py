@@ -13,34 +13,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from bevviz.calib.offsets import AXES, TIME, error_pose
 from bevviz.calib.samples import CELLS, Shot
 from bevviz.model.frame import F32, F64, I32, I64, Bool
+from bevviz.stages.edges import SHARE, densities
 from bevviz.support.kernel import kernel
 
-SHARE = 0.2  # share of the edges of a cloud that are visible in an image
-AGAINST = 0.25  # weight of a change of the opposite sign: some surfaces (leaves) reflect more and look darker
 PIXEL = 1.5  # pixels^2, variance of the edges themselves
 MOMENT = 0.01  # seconds over which the motion of the robot is differenced
 PARTS = CELLS[0] * CELLS[1]
-
-# Changes of the image that an edge of the cloud may show, as weights of the four rows of ``image_edges``:
-# a change along u, a change along v; brighter to the right, to the left, downwards, upwards.
-CHANGES = np.array(
-    [
-        [1, 1, 0, 0],
-        [0, 0, 1, 1],
-        [1, AGAINST, 0, 0],
-        [AGAINST, 1, 0, 0],
-        [0, 0, 1, AGAINST],
-        [0, 0, AGAINST, 1],
-    ],
-    np.float32,
-)
-ALONG_V = np.array([0, 1, 0, 0, 1, 1], np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +57,7 @@ class Scorer:
         self.sigma = sigma
         self.variance = sigma * sigma + PIXEL
         self.edges = sum(len(shot.xyz) for shot in shots)
-        self._densities = [densities(shot, sigma) for shot in shots]
+        self._densities = [densities(shot.change, shot.maps, sigma) for shot in shots]
 
     def __call__(self, offsets: F64, slopes: bool = True, information: bool = False) -> Sums:
         """Return the sums at (7,) offsets in radians, metres and seconds. Sums not asked for are zero."""
@@ -105,25 +88,6 @@ class Scorer:
                 fitting,
             )
         return Sums(score, count, gradient, fitting)
-
-
-def densities(shot: Shot, sigma: float) -> tuple[F32, I64, Bool]:
-    """Return the densities that the edges of a shot are drawn from.
-
-    Returns:
-        density: (D, H, W) of mean 1, one for each of ``CHANGES`` that the shot has.
-        row: (E,) the density of each edge.
-        along_v: (D,) whether the density changes along v.
-    """
-    changes, row = np.unique(shot.change, return_inverse=True)
-    blurred = [cv2.GaussianBlur(rows.astype(np.float32), (0, 0), sigma) for rows in shot.maps]
-    density = np.ones((len(changes), *shot.maps.shape[1:]), np.float32)
-    for made, change in zip(density, changes, strict=True):
-        total = sum(float(CHANGES[change, k]) * blurred[k] for k in np.flatnonzero(CHANGES[change]))
-        mean = float(np.mean(total))
-        if mean > 0:
-            np.divide(total, mean, out=made)
-    return density, row.astype(np.int64), ALONG_V[changes]
 
 
 @kernel

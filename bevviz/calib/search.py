@@ -16,10 +16,10 @@ import numpy as np
 
 from bevviz.calib.offsets import AXES, PRIOR, error_pose
 from bevviz.calib.samples import REACH, Shot
-from bevviz.calib.score import SHARE, Scorer, Sums, densities
+from bevviz.calib.score import Scorer, Sums
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Bool
-from bevviz.support.kernel import kernel
+from bevviz.stages.edges import SHARE, add_scores, densities, log_densities
 
 STEP = np.radians(0.32)  # radians, step of the grid about x and y
 ROLL = np.radians(0.7)  # radians about z, where an error moves the middle of the image little
@@ -174,7 +174,9 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
         shift = np.array([along_x, along_y, 0.0])
         sums = np.zeros(len(rotations))
         for xyz, row, logs, K in parts:
-            _sample(xyz, row, logs, (K @ rotations).astype(np.float32), (K @ shift).astype(np.float32), sums)
+            add_scores(
+                xyz, row, logs, (K @ rotations).astype(np.float32), (K @ shift).astype(np.float32), sums
+            )
         score = sums.reshape(turns.shape[:3])
         for place in np.argwhere(_highest(score) & (score > 0)):
             at = tuple(place)
@@ -185,30 +187,13 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
 
 def _shrunk(shot: Shot, blur: float, shrink: int) -> tuple[F32, I64, F32, F64]:
     """Return the edges in the stated camera, the density of each, the log densities, and their K."""
-    density, row, _ = densities(shot, blur)
+    density, row, _ = densities(shot.change, shot.maps, blur)
     height, width = (-(-size // shrink) for size in density.shape[1:])
     small = [cv2.resize(d, (width, height), interpolation=cv2.INTER_AREA) for d in density]
     sx, sy = width / density.shape[2], height / density.shape[1]
     scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
     xyz = geometry.apply(shot.camera_from_points(0.0), shot.xyz)
-    return xyz, row, np.log(1 - SHARE + SHARE * np.stack(small)), scale @ shot.K
-
-
-@kernel
-def _sample(xyz: F32, density_row: I64, logs: F32, turns: F32, shift: F32, score: F64) -> None:
-    """Add the score of one shot at each of the (T, 3, 3) pixels_from_camera."""
-    height, width = logs.shape[1:]
-    half = np.float32(0.5)
-    for j in range(len(turns)):
-        m, total = turns[j], 0.0
-        for i in range(len(xyz)):
-            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            depth = np.float32(1) / (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + shift[2])
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + shift[0]) * depth + half
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + shift[1]) * depth + half
-            if 0 <= u < width and 0 <= v < height:
-                total += logs[density_row[i], int(v), int(u)]
-        score[j] += total
+    return xyz, row, log_densities(np.stack(small)), scale @ shot.K
 
 
 def _highest(score: F64) -> Bool:

@@ -20,8 +20,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bevviz.model.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud, Intrinsics
+from bevviz.support.kernel import kernel
 
+NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself is nearer; farther edges are wider than a pixel
 ROW = np.radians(0.4)  # radians, height of a row of beams in a cloud without rings
 JUMP = 0.12  # least share by which the inverse range falls at an edge
 STEP = 0.4  # metres, least jump of the range
@@ -30,7 +33,24 @@ CONTRAST = 0.15  # least step of reflectance, as a share of the brightest point 
 USUAL = 8.0  # pixels, blur that gives the usual change of the image around a pixel
 NOISE = 4.0  # grey values by which an image changes without an edge
 LEVELS = 60  # steps of image_edges for one multiple of the usual change
+SHARE = 0.2  # share of the edges of a cloud that are visible in an image
+AGAINST = 0.25  # weight of a change of the opposite sign: some surfaces (leaves) reflect more and look darker
 TURN = 10.0  # radians, more than the azimuths of a ring span, so that ring and azimuth make one sort key
+
+# Changes of the image that an edge of the cloud may show, as weights of the four rows of ``image_edges``:
+# a change along u, a change along v; brighter to the right, to the left, downwards, upwards.
+CHANGES = np.array(
+    [
+        [1, 1, 0, 0],
+        [0, 0, 1, 1],
+        [1, AGAINST, 0, 0],
+        [AGAINST, 1, 0, 0],
+        [0, 0, 1, AGAINST],
+        [0, 0, AGAINST, 1],
+    ],
+    np.float32,
+)
+ALONG_V = np.array([0, 1, 0, 0, 1, 1], np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +76,14 @@ class _Rings:
     above: I64
 
 
-def cloud_edges(cloud: Cloud) -> Edges:
-    """Return the edges of one scan: jumps of range and steps of reflectance between neighbouring beams."""
-    rings = _arrange(cloud)
+def cloud_edges(cloud: Cloud, part: Bool | None = None) -> Edges:
+    """Return the edges of one scan: jumps of range and steps of reflectance between neighbouring beams.
+
+    Args:
+        cloud: the scan.
+        part: (N,) points among which edges are searched. None: all.
+    """
+    rings = _arrange(cloud, part)
     if rings is None:
         return Edges(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.bool_))
     sides = (
@@ -75,12 +100,14 @@ def cloud_edges(cloud: Cloud) -> Edges:
     return Edges(xyz, towards, np.arange(len(xyz)) >= jumps)
 
 
-def _arrange(cloud: Cloud) -> _Rings | None:
+def _arrange(cloud: Cloud, part: Bool | None) -> _Rings | None:
     """Sort the points by ring and azimuth and find their neighbours. Return None if they are too few."""
-    xyz = cloud.xyz.astype(np.float64)
+    ring = _ring(cloud)
+    row = np.arange(len(cloud.xyz)) if part is None else np.flatnonzero(part)
+    xyz = cloud.xyz[row].astype(np.float64)
     distance = np.linalg.norm(xyz, axis=1)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    ring = _ring(cloud, azimuth, distance)
+    ring = ring[row]
     order = np.lexsort((azimuth, ring))
     order = order[distance[order] > 0.5]  # Nearer points are the robot itself, or beams without an echo.
     if len(order) < 100:
@@ -90,30 +117,31 @@ def _arrange(cloud: Cloud) -> _Rings | None:
     turn = np.diff(azimuth)
     step = float(np.median(turn[together])) if together.any() else 0.0
     joined = together & (turn < 2.5 * step)
-    row = np.arange(len(order))
-    right = np.where(np.append(joined, False), row + 1, -1)
-    left = np.where(np.insert(joined, 0, False), row - 1, -1)
+    place = np.arange(len(order))
+    right = np.where(np.append(joined, False), place + 1, -1)
+    left = np.where(np.insert(joined, 0, False), place - 1, -1)
     key = ring * TURN + azimuth
     below, above = (_nearest(key, key + shift, 0.75 * step) for shift in (-TURN, TURN))
     reflectance = None
     if (intensity := cloud.fields.get("intensity")) is not None:
-        brightest = float(np.percentile(intensity, 99))
+        brightest = float(np.percentile(intensity[row], 99))
         if brightest > 0:
-            reflectance = intensity[order].astype(np.float64) / brightest
+            reflectance = intensity[row[order]].astype(np.float64) / brightest
     return _Rings(xyz, distance, xyz / distance[:, None], reflectance, left, right, below, above)
 
 
-def _ring(cloud: Cloud, azimuth: F64, distance: F64) -> I64:
+def _ring(cloud: Cloud) -> I64:
     """Return the (N,) ring of each point: from its field, from the storage order, or from its elevation."""
     for name in RING_FIELDS:
         if name in cloud.fields:
             ring: I64 = cloud.fields[name].astype(np.int64)
             return ring
-    turns = np.abs(np.diff(azimuth)) > np.pi
+    turns = np.abs(np.diff(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]))) > np.pi
     if 4 <= turns.sum() <= 300:  # a plausible number of beams: the cloud is stored ring by ring
         return np.cumsum(np.insert(turns, 0, False), dtype=np.int64)
+    xyz = cloud.xyz.astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
-        elevation = np.nan_to_num(np.arcsin(cloud.xyz[:, 2] / distance))
+        elevation = np.nan_to_num(np.arcsin(xyz[:, 2] / np.linalg.norm(xyz, axis=1)))
     row: I64 = np.floor(elevation / ROW).astype(np.int64)
     return row
 
@@ -174,14 +202,14 @@ def _clear_step(near: tuple[F64, F64], far: tuple[F64, F64]) -> Bool:
     return clear
 
 
-def image_edges(bgr: U8) -> U8:
-    """Return (4, H, W) how much the image brightens to the right, to the left, downwards and upwards.
+def image_edges(image: U8) -> U8:
+    """Return (4, H, W) how much an image brightens to the right, to the left, downwards and upwards.
 
     The unit is 1 / LEVELS of the usual change around the pixel. So a bright wall does not outweigh a grey
     one, and a hedge scores no better than a road.
     """
-    gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).astype(np.float32)
-    gray = cv2.GaussianBlur(gray, (0, 0), 0.8)
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    gray = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 0.8)
     edges = np.empty((4, *gray.shape), np.uint8)
     for k, (dx, dy) in enumerate(((1, 0), (0, 1))):
         change = cv2.Sobel(gray, cv2.CV_32F, dx, dy)
@@ -189,3 +217,105 @@ def image_edges(bgr: U8) -> U8:
         for sign in (0, 1):
             edges[2 * k + sign] = np.clip((1 - 2 * sign) * LEVELS * change / usual, 0, 4 * LEVELS)
     return edges
+
+
+def undistort(image: U8, intrinsics: Intrinsics) -> U8:
+    """Return the image without distortion, with the same camera matrix."""
+    if not geometry.has_distortion(intrinsics):
+        return image
+    if intrinsics.distortion_model in geometry.FISHEYE:
+        return np.asarray(
+            cv2.fisheye.undistortImage(image, intrinsics.K, intrinsics.D[:4], Knew=intrinsics.K)
+        )
+    return np.asarray(cv2.undistort(image, intrinsics.K, intrinsics.D))
+
+
+def shrink(image: U8, K: F64, pixels: int) -> tuple[U8, F64]:
+    """Return the image scaled down to this number of pixels, if it has more, and its camera matrix."""
+    height, width = image.shape[:2]
+    scale = np.sqrt(pixels / (height * width))
+    if scale >= 1:
+        return image, K
+    size = round(width * scale), round(height * scale)
+    sx, sy = size[0] / width, size[1] / height
+    smaller = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8), smaller @ K
+
+
+# --- agreement of both -------------------------------------------------------------------------
+
+
+def edges_in_view(
+    edges: Edges, camera_from_cloud: F64, view: Intrinsics, reach: float
+) -> tuple[F32, F32, U8]:
+    """Return the edges that project into an image without distortion, or beside it by up to ``reach``.
+
+    Args:
+        edges: edges of a cloud.
+        camera_from_cloud: stated pose of the camera.
+        view: size and camera matrix of the image.
+        reach: angle in radians.
+
+    Returns:
+        xyz: (E, 3) edges.
+        uv: (E, 2) their pixels.
+        change: (E,) expected change of the image at each edge: a row of ``CHANGES``.
+    """
+    uv, depth = geometry.project(geometry.apply(camera_from_cloud, edges.xyz), view)
+    margin = np.tan(reach) * np.array([view.K[0, 0], view.K[1, 1]], np.float32)
+    size = np.array([view.width, view.height], np.float32)
+    with np.errstate(invalid="ignore"):
+        inside = ((uv > -margin) & (uv < size + margin)).all(axis=1)
+    inside &= (depth > NEAREST) & (depth < FARTHEST)
+    xyz, towards, uv = edges.xyz[inside], edges.towards[inside], uv[inside]
+    displaced = xyz + towards * np.linalg.norm(xyz, axis=1, keepdims=True)
+    away = geometry.project(geometry.apply(camera_from_cloud, displaced), view)[0] - uv
+    return xyz, uv, _expected_change(away, edges.bright[inside])
+
+
+def _expected_change(away: F32, bright: Bool) -> U8:
+    """Return the row of ``CHANGES`` for edges with (E, 2) directions in the image."""
+    along_v = np.abs(away[:, 1]) > np.abs(away[:, 0])
+    negative = np.where(along_v, away[:, 1], away[:, 0]) < 0
+    return np.where(bright, 2 + 2 * along_v + negative, along_v).astype(np.uint8)
+
+
+def densities(change: U8, maps: U8, sigma: float) -> tuple[F32, I64, Bool]:
+    """Return the densities that the edges of a shot are drawn from.
+
+    Returns:
+        density: (D, H, W) of mean 1, one for each of ``CHANGES`` that the shot has.
+        row: (E,) the density of each edge.
+        along_v: (D,) whether the density changes along v.
+    """
+    changes, row = np.unique(change, return_inverse=True)
+    blurred = [cv2.GaussianBlur(rows.astype(np.float32), (0, 0), sigma) for rows in maps]
+    density = np.ones((len(changes), *maps.shape[1:]), np.float32)
+    for made, expected in zip(density, changes, strict=True):
+        total = sum(float(CHANGES[expected, k]) * blurred[k] for k in np.flatnonzero(CHANGES[expected]))
+        mean = float(np.mean(total))
+        if mean > 0:
+            np.divide(total, mean, out=made)
+    return density, row.astype(np.int64), ALONG_V[changes]
+
+
+def log_densities(density: F32) -> F32:
+    """Return the score of an edge at each pixel of its density."""
+    return np.asarray(np.log(1 - SHARE + SHARE * density), np.float32)
+
+
+@kernel
+def add_scores(xyz: F32, density_row: I64, logs: F32, turns: F32, shift: F32, score: F64) -> None:
+    """Add the score of one shot at each of the (T, 3, 3) pixels_from_camera."""
+    height, width = logs.shape[1:]
+    half = np.float32(0.5)
+    for j in range(len(turns)):
+        m, total = turns[j], 0.0
+        for i in range(len(xyz)):
+            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            depth = np.float32(1) / (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + shift[2])
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + shift[0]) * depth + half
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + shift[1]) * depth + half
+            if 0 <= u < width and 0 <= v < height:
+                total += logs[density_row[i], int(v), int(u)]
+        score[j] += total
