@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 import bevviz
 from bevviz.anomalies import AnomalyDetector
+from bevviz.anomalies.placement import LEAST_PAST, find_error, score_rotations
 from bevviz.anomalies.sensor_faults import ImageWatch
 from bevviz.config import AnomaliesConfig
-from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, U8, Camera, Image
+from bevviz.model.frame import Image
 from bevviz.model.results import Anomaly, FrameResult
+from tests.support.sensor_plants import (
+    Results,
+    blocked_sector,
+    pixels,
+    turned_camera,
+    turned_lidar,
+    turned_transform,
+    with_image,
+    with_scan,
+)
 
 FIRST, LAST = 8, 18  # frames with the fault
 CAMERA, LIDAR = "camera image_2", "LiDAR velodyne"
-
-Results = Sequence[FrameResult]
 
 
 @pytest.fixture(scope="module")
@@ -30,66 +37,6 @@ def drive(shared: Path) -> Results:
     with bevviz.open(shared / "kitti_drive") as opened:
         session = opened.new_session()
         return [session.perceive(frame) for frame in opened.frames]
-
-
-def pixels(result: FrameResult) -> U8:
-    image = result.frame.cameras[0].image
-    assert image is not None
-    return image.bgr
-
-
-def with_camera(result: FrameResult, camera: Camera) -> FrameResult:
-    return replace(result, frame=replace(result.frame, cameras=(camera,)))
-
-
-def with_image(result: FrameResult, bgr: U8) -> FrameResult:
-    camera = result.frame.cameras[0]
-    assert camera.image is not None
-    return with_camera(result, replace(camera, image=replace(camera.image, bgr=bgr)))
-
-
-def with_scan(result: FrameResult, xyz: F32) -> FrameResult:
-    frame = result.frame
-    cloud = replace(frame.clouds[0], xyz=xyz, fields={})
-    return replace(result, frame=replace(frame, points=xyz, fields={}, clouds=(cloud,)))
-
-
-def rotation(axis: int, degrees: float) -> F64:
-    """(4, 4) rotation about x, y or z."""
-    vector = np.zeros(3)
-    vector[axis] = np.radians(degrees)
-    turned = np.eye(4)
-    turned[:3, :3] = cv2.Rodrigues(vector)[0]
-    return turned
-
-
-def turned_camera(result: FrameResult, axis: int, degrees: float) -> FrameResult:
-    intrinsics, bgr = result.frame.cameras[0].intrinsics, pixels(result)
-    assert intrinsics is not None
-    homography = intrinsics.K @ rotation(axis, degrees)[:3, :3] @ np.linalg.inv(intrinsics.K)
-    size = bgr.shape[1], bgr.shape[0]
-    return with_image(result, np.asarray(cv2.warpPerspective(bgr, homography, size), np.uint8))
-
-
-def turned_lidar(result: FrameResult, axis: int, degrees: float) -> FrameResult:
-    turn, voxels = rotation(axis, degrees), result.voxels
-    assert voxels is not None
-    voxels = replace(voxels, points=geometry.apply(turn, voxels.points))
-    return replace(with_scan(result, geometry.apply(turn, result.frame.points)), voxels=voxels)
-
-
-def turned_transform(result: FrameResult, axis: int, degrees: float) -> FrameResult:
-    camera = result.frame.cameras[0]
-    assert camera.camera_from_points is not None
-    return with_camera(
-        result, replace(camera, camera_from_points=rotation(axis, degrees) @ camera.camera_from_points)
-    )
-
-
-def blocked_sector(result: FrameResult) -> FrameResult:
-    xyz = result.frame.points
-    azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
-    return with_scan(result, xyz[(azimuth < -48) | (azimuth > -13)])
 
 
 def faults(results: Results, plant: Callable[[int], FrameResult]) -> dict[str, tuple[int, Anomaly]]:
@@ -167,3 +114,78 @@ def test_image_shared_by_two_frames_is_not_frozen() -> None:
     for stamp in range(10):
         image = Image(stamp // 2, "camera", noise.integers(0, 255, (48, 64, 3), np.uint8))
         assert watch.update(image) == ()
+
+
+# --- calibrations that are wrong from the first frame on ---------------------------------------
+
+
+MISPLACED = f"{CAMERA}: not where its transform says"
+
+
+def drifts(results: Results, degrees: Callable[[int], float], axis: int) -> dict[str, tuple[int, Anomaly]]:
+    """Return the faults of a drive whose stated transform is off by ``degrees`` of each frame."""
+    detector, seen = AnomalyDetector(), dict[str, tuple[int, Anomaly]]()
+    for row, result in enumerate(results):
+        wrong = turned_transform(result, axis, degrees(row))
+        for anomaly in detector.update(wrong, AnomaliesConfig()):
+            if anomaly.kind == "sensor":
+                seen.setdefault(anomaly.subject, (row, anomaly))
+    return seen
+
+
+@pytest.mark.parametrize("degrees", [3.0, -3.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_transform_that_was_always_wrong_is_told(drive: Results, axis: int, degrees: float) -> None:
+    seen = drifts(drive, lambda row: degrees, axis)
+    assert list(seen) == [MISPLACED]
+    row, anomaly = seen[MISPLACED]
+    assert row <= 24
+    assert anomaly.text == f"{MISPLACED} since 0.0 s, by about 3 degrees against {LIDAR}"
+
+
+def restamped(results: Results) -> Results:
+    """Return the results at 10 Hz."""
+    moved = []
+    for row, result in enumerate(results):
+        frame, stamp = result.frame, (row + 1) * 100_000_000
+        camera = frame.cameras[0]
+        assert camera.image is not None
+        camera = replace(camera, image=replace(camera.image, stamp=stamp))
+        clouds = (replace(frame.clouds[0], stamp=stamp),)
+        moved.append(replace(result, frame=replace(frame, stamp=stamp, cameras=(camera,), clouds=clouds)))
+    return moved
+
+
+def test_transform_that_drifts_slowly_is_told(drive: Results) -> None:
+    """It drifts by 0.06 degrees a frame, too little for a jump, while the drive runs forth and back."""
+    there_and_back = [*drive, *drive[-2:0:-1]]
+    seen = drifts(restamped(there_and_back * 2), lambda row: min(0.06 * row, 3.0), 1)
+    assert list(seen) == [MISPLACED]
+
+
+def test_long_clean_drive_has_no_sensor_fault(drive: Results) -> None:
+    assert drifts(restamped([*drive, *drive[-2:0:-1]] * 2), lambda row: 0.0, 0) == {}
+
+
+@pytest.mark.parametrize("name", ["kitti", "kitti_more"])
+def test_right_transform_of_single_frames_is_left_alone(shared: Path, name: str) -> None:
+    checks = []
+    with bevviz.open(shared / name) as opened:
+        for frame in opened.frames:
+            scores = score_rotations(frame.cameras[0], frame.clouds[0], frame.points_from_clouds[0])
+            assert scores is not None
+            checks.append(scores)
+    for count in range(LEAST_PAST, len(checks) + 1):
+        assert find_error(np.array(checks[:count])) is None
+
+
+def test_image_and_cloud_of_different_places_tell_no_error(shared: Path) -> None:
+    with bevviz.open(shared / "kitti") as opened:
+        frames = list(opened.frames)
+    checks = [
+        score_rotations(a.cameras[0], b.clouds[0], b.points_from_clouds[0])
+        for a, b in zip(frames, frames[1:] + frames[:1], strict=True)
+    ]
+    known = [scores for scores in checks if scores is not None]
+    for count in range(LEAST_PAST, len(known) + 1):
+        assert find_error(np.array(known[:count])) is None

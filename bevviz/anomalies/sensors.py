@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from bevviz.anomalies.placement import PlacementWatch
 from bevviz.anomalies.sensor_faults import ImageWatch, ScanWatch, SensorFault
 from bevviz.anomalies.turns import MountingWatch, ScanShape
 from bevviz.model.frame import Cloud, Frame
@@ -25,6 +26,7 @@ class SensorWatch:
         self._images: dict[str, ImageWatch] = {}
         self._scans: dict[str, ScanWatch] = {}
         self._mountings: dict[str, MountingWatch] = {}
+        self._placement = PlacementWatch()
         self._shape: ScanShape | None = None
 
     def update(self, result: FrameResult) -> Iterator[Anomaly]:
@@ -43,7 +45,8 @@ class SensorWatch:
     def _faults(self, result: FrameResult) -> Iterator[SensorFault]:
         """Yield the faults that each rule finds in this frame."""
         frame = result.frame
-        for cloud in _clouds(frame):
+        clouds, distrusted = _clouds(frame), set[str]()
+        for cloud in clouds:
             yield from self._scans.setdefault(cloud.name, ScanWatch(f"LiDAR {cloud.name}")).update(cloud)
         before, self._shape = self._shape, None
         if frame.lidar and any(camera.image is not None for camera in frame.cameras):
@@ -56,8 +59,11 @@ class SensorWatch:
                 watch = self._images.setdefault(camera.name, ImageWatch(f"camera {camera.name}"))
                 faults, gray = watch.update(image), watch.gray
                 yield from faults
+            if faults:
+                distrusted.add(camera.name)
             mounting = self._mountings.setdefault(camera.name, MountingWatch(camera.name, frame.lidar))
             yield from mounting.update(camera, gray, scene, frame.stamp, trusted=not faults)
+        yield from self._placement.update(frame, clouds, distrusted)
 
 
 def _clouds(frame: Frame) -> tuple[Cloud, ...]:

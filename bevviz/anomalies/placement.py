@@ -1,0 +1,169 @@
+"""Faults of a calibration: a camera that is not where its transform says, always or by slow drift.
+
+Where the range jumps between neighbouring beams, the image should have an edge (Levinson and Thrun 2013). The
+edges of single frames are scored at the stated mounting and at small rotations around it. A rotation that
+beats the stated mounting clearly, over several frames, is the error of the transform.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from bevviz.anomalies.sensor_faults import SensorFault
+from bevviz.model import geometry
+from bevviz.model.frame import F32, F64, Bool, Camera, Cloud, Frame, Intrinsics
+from bevviz.stages.edges import (
+    add_scores,
+    cloud_edges,
+    densities,
+    edges_in_view,
+    image_edges,
+    log_densities,
+    shrink,
+    undistort,
+)
+
+EVERY = 10  # frames from one check to the next, each of one camera with one LiDAR
+PAST = 6  # checks that are judged together: 6 s at 10 Hz with one camera
+LEAST_PAST = 3
+PIXELS = 80_000  # larger images are scaled down to this size
+EDGES = 800  # most edges of a cloud that are scored
+LEAST_EDGES = 150  # fewer tell nothing
+BLUR = np.radians(0.35)  # radians
+
+STEP = 0.75  # degrees about x and y of the camera, from one rotation to the next
+ROLL = 1.5  # degrees about z, where a rotation moves the middle of the image little
+STEPS, ROLLS = 6, 3  # to both sides
+LEAST = 1.6  # degrees, least error that is a fault
+CLEAR = 2.0  # spreads of the score by which the best rotation beats the stated mounting
+UNIQUE = 1.25  # spreads by which it beats all rotations that differ by more than LEAST
+MOST = 0.7  # share of the checks in which it beats the stated mounting
+
+
+def _rotations() -> tuple[F64, F64]:
+    """Return the (R, 3) turns in degrees about the camera's axes, and their (R, 3, 3) matrices."""
+    across, roll = np.arange(-STEPS, STEPS + 1) * STEP, np.arange(-ROLLS, ROLLS + 1) * ROLL
+    turns = np.stack(np.meshgrid(across, across, roll, indexing="ij"), -1).reshape(-1, 3)
+    return turns, np.stack([cv2.Rodrigues(np.radians(turn))[0] for turn in turns])
+
+
+TURNS, MATRICES = _rotations()
+AT_STATED: Bool = np.linalg.norm(TURNS, axis=1) < 1.5 * STEP
+
+
+@dataclass(slots=True)
+class _Pair:
+    """Checks of one camera with one LiDAR."""
+
+    scores: deque[F64] = field(default_factory=lambda: deque(maxlen=PAST))  # (R,) of each check
+    stamps: deque[int] = field(default_factory=lambda: deque(maxlen=PAST))
+    fault: SensorFault | None = None
+
+
+class PlacementWatch:
+    """Detector of cameras that are not where their transform says."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._pairs: dict[tuple[str, str], _Pair] = defaultdict(_Pair)
+
+    def update(
+        self, frame: Frame, clouds: Sequence[Cloud], distrusted: Collection[str]
+    ) -> Iterator[SensorFault]:
+        """Yield the faults of the newest frame. One camera is checked in every ``EVERY``-th frame.
+
+        Args:
+            frame: the frame.
+            clouds: its clouds by sensor.
+            distrusted: names of cameras whose image is known to be wrong.
+        """
+        turn, rest = divmod(self._frames, EVERY)
+        self._frames += 1
+        if rest == 0 and clouds and frame.cameras:
+            number, of_camera = divmod(turn, len(frame.cameras))
+            camera, row = frame.cameras[of_camera], number % len(clouds)
+            if camera.name not in distrusted:
+                points_from_cloud = frame.points_from_clouds[row] if frame.clouds else np.eye(4)
+                self._check(frame.stamp, camera, clouds[row], points_from_cloud)
+        for pair in self._pairs.values():
+            if pair.fault is not None:
+                yield pair.fault
+
+    def _check(self, stamp: int, camera: Camera, cloud: Cloud, points_from_cloud: F64) -> None:
+        """Check one camera with one cloud."""
+        scores = score_rotations(camera, cloud, points_from_cloud)
+        if scores is None:
+            return
+        pair = self._pairs[camera.name, cloud.name]
+        pair.scores.append(scores)
+        pair.stamps.append(stamp)
+        best = find_error(np.array(pair.scores))
+        if best is None:
+            pair.fault = None
+            return
+        since = pair.stamps[0] if pair.fault is None else pair.fault.since
+        detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {cloud.name}"
+        pair.fault = SensorFault(f"camera {camera.name}", "not where its transform says", since, detail)
+
+
+def find_error(scores: F64) -> int | None:
+    """Return the row of ``TURNS`` that corrects the stated mounting. None: it is right, or nobody can tell.
+
+    Args:
+        scores: (C, R) score of each rotation in each check.
+    """
+    if len(scores) < LEAST_PAST:
+        return None
+    total = scores.sum(axis=0)
+    best, spread = int(total.argmax()), float(total.std())
+    apart = np.linalg.norm(TURNS - TURNS[best], axis=1)
+    stated = scores[:, AT_STATED].max(axis=1)
+    better = scores[:, apart < STEP + 0.1].max(axis=1) > stated
+    if (
+        np.linalg.norm(TURNS[best]) < LEAST
+        or total[best] - total[AT_STATED].max() < CLEAR * spread
+        or total[best] - total[apart > LEAST].max() < UNIQUE * spread
+        or better.mean() < MOST
+    ):
+        return None
+    return best
+
+
+def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64 | None:
+    """Return the (R,) scores of all rotations in one frame. None: too few edges, or nothing to compare."""
+    if camera.image is None or camera.intrinsics is None or camera.camera_from_points is None:
+        return None
+    small, K = shrink(cv2.cvtColor(camera.image.bgr, cv2.COLOR_BGR2GRAY), camera.intrinsics.K, PIXELS)
+    view = replace(camera.intrinsics, width=small.shape[1], height=small.shape[0], K=K)
+    image = undistort(small, view)
+    view = Intrinsics(view.width, view.height, K)  # without distortion
+    camera_from_cloud = np.asarray(camera.camera_from_points @ points_from_cloud, np.float64)
+    reach = np.radians(STEPS * STEP)
+    part = _in_view(cloud.xyz, camera_from_cloud, view, reach)
+    xyz, _, change = edges_in_view(cloud_edges(cloud, part), camera_from_cloud, view, reach)
+    if len(xyz) < LEAST_EDGES:
+        return None
+    every = -(-len(xyz) // EDGES)
+    xyz, change = xyz[::every], change[::every]
+    density, row, _ = densities(change, image_edges(image), float(K[0, 0]) * BLUR)
+    scores = np.zeros(len(TURNS))
+    from_camera = (K @ MATRICES).astype(np.float32)
+    xyz = geometry.apply(camera_from_cloud, xyz)
+    add_scores(xyz, row, log_densities(density), from_camera, np.zeros(3, np.float32), scores)
+    return scores
+
+
+def _in_view(xyz: F32, camera_from_cloud: F64, view: Intrinsics, reach: float) -> Bool:
+    """Return which points lie in a cone around the image and ``reach``."""
+    corners = np.array([[u, v, 1.0] for u in (0, view.width) for v in (0, view.height)])
+    rays = corners @ np.linalg.inv(view.K).T
+    angle = np.arccos((rays[:, 2] / np.linalg.norm(rays, axis=1)).min()) + reach
+    to_camera = camera_from_cloud.astype(np.float32)
+    depth = xyz @ to_camera[2, :3] + to_camera[2, 3]
+    inside: Bool = depth > np.float32(np.cos(angle)) * np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    return inside
