@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from bevviz.bags.source import BagSource
+from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import WIDTH, describe_bag, render_bag_info
@@ -151,6 +153,44 @@ def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
     assert "warnings\n" in text
     assert "the file ends early (no footer): what is there was rescued" in text
     assert re.search(r"read \d+ messages, \d+ of them from the incomplete last", " ".join(text.split()))
+
+
+def frozen_after(seconds: float, path: Path) -> Path:
+    """Write 12 s of a drive whose camera repeats one image from a moment on."""
+    messages, image = bags.Messages(), np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
+    items = [
+        item._replace(message=messages.image(item.received, image))
+        if item.topic == bags.IMAGE and item.received >= bags.START + seconds * 1e9
+        else item
+        for item in bags.small_items(messages, scans=120)
+    ]
+    return bags.write(path, items, messages)
+
+
+def test_a_frozen_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(frozen_after(2.0, tmp_path / "drive"))
+    assert main(["info", path]) == 0
+    assert "warnings\n  camera camera: frozen image since 2.0 s\n" in capsys.readouterr().out
+    assert main(["info", path, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"] == ["camera camera: frozen image since 2.0 s"]
+
+
+def test_the_whole_drive_is_checked_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(frozen_after(11.0, tmp_path / "drive"))
+    assert main(["info", path]) == 0
+    assert "warnings" not in capsys.readouterr().out
+    assert main(["info", path, "--sensors"]) == 0
+    assert "warnings\n  camera camera: frozen image since 11.0 s\n" in capsys.readouterr().out
+    assert main(["info", "--live", "--sensors"]) != 0
+
+
+def test_unrelated_single_frames_are_not_compared(shared: Path) -> None:
+    assert not any("since" in line for line in describe_bag([shared / "kitti"], Config()).warnings)
+
+
+def test_a_real_drive_has_no_fault(shared: Path) -> None:
+    info = describe_bag([shared / "kitti_drive"], Config(), all_frames=True)
+    assert not any("since" in line for line in info.warnings)
 
 
 def test_a_file_that_is_no_bag_is_reported(tmp_path: Path) -> None:

@@ -15,12 +15,18 @@ def add(commands: Commands) -> None:
     info = commands.add_parser(
         "info",
         help="what is in a bag, and what is missing for a full run",
-        description="Topics, rates, gaps and frames of a bag, the role of each topic, and what is missing.",
+        description="Topics, rates, gaps and frames of a bag, the role of each topic, what is missing, and "
+        "faults of the sensors in the first seconds.",
     )
     info.add_argument(
         "paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder, or a data set's folder"
     )
     add_dataset(info)
+    info.add_argument(
+        "--sensors",
+        action="store_true",
+        help="check the sensors in the whole drive, not in its first 100 frames or 2 s of work alone",
+    )
     info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
     info.add_argument(
         "--for",
@@ -39,6 +45,8 @@ def add(commands: Commands) -> None:
 def _info(options: argparse.Namespace) -> int:
     from bevviz.pipeline.bag_info import contents_tree, describe_bag, render_bag_info
 
+    if options.live and options.sensors:
+        raise UserError("bevviz info: --sensors is for a drive; a running robot's are watched by bevviz live")
     if options.live:
         from bevviz.live import graph_info as info
 
@@ -50,6 +58,6 @@ def _info(options: argparse.Namespace) -> int:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
-    bag_info = describe_bag(options.paths, load_config(options))
+    bag_info = describe_bag(options.paths, load_config(options), all_frames=options.sensors)
     print_result(options, "info", contents_tree(bag_info), lambda: render_bag_info(bag_info))
     return 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +25,7 @@ from bevviz.errors import UserError
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
+from bevviz.pipeline.sensor_check import SensorCheck, first_frames
 from bevviz.recording.provenance import model_path
 from bevviz.support import table
 from bevviz.support.text import printable
@@ -90,8 +90,13 @@ class BagInfo(TopicContents):
         return (self.end - self.start) / SECOND
 
 
-def describe_bag(paths: Sequence[Path], config: Config) -> BagInfo:
-    """Read the index of a bag, and synchronise one scan.
+def describe_bag(paths: Sequence[Path], config: Config, *, all_frames: bool = False) -> BagInfo:
+    """Read the index of a bag, and check its sensors.
+
+    Args:
+        paths: files or folders.
+        config: configuration of the runs to come.
+        all_frames: check the sensors in the whole drive, not in its first frames alone.
 
     Raises:
         UserError: there is no readable bag, or a stated topic is not in it.
@@ -104,9 +109,13 @@ def describe_bag(paths: Sequence[Path], config: Config) -> BagInfo:
             return _describe(recording, roles, config, missing=[str(error)])
     with source:
         roles = source.roles
-        frame = next(reversed(list(islice(source, min(TRIAL_SCAN, source.total)))), None)
+        frame, check = None, SensorCheck(config)
+        for count, read in enumerate(first_frames(source, TRIAL_SCAN, all_frames), 1):
+            frame = read if count <= TRIAL_SCAN else frame
+            if not source.recording.single_frames:
+                check.add(read)
         missing = find_missing(roles, frame, config)
-        return _describe(source.recording, roles, config, missing, frame, source)
+        return _describe(source.recording, roles, config, missing, frame, source, check.warnings)
 
 
 def _describe(
@@ -116,6 +125,7 @@ def _describe(
     missing: Sequence[str],
     frame: Frame | None = None,
     source: BagSource | None = None,
+    faults: Sequence[str] = (),
 ) -> BagInfo:
     """Collect the summary of an open bag."""
     networks, missing_networks = network_providers(config)
@@ -137,7 +147,7 @@ def _describe(
         object_network=networks["objects"],
         configured=tuple(stated_lines(config)),
         missing=tuple(missing),
-        warnings=(*recording.warnings, *(source.doubts if source else ())),
+        warnings=(*recording.warnings, *(source.doubts if source else ()), *faults),
     )
 
 
