@@ -28,7 +28,7 @@ NEAREST = 1.5  # metres; nearer returns may come from the object that blocks the
 BLOCKED = 0.3  # share of the usual returns below which a sector is blocked
 SCANS = 3  # scans in a row that show it
 LEAST_RETURNS = 50  # usual returns of a sector that can be judged
-POINTS = 40_000  # most points of a scan that are counted
+POINTS = 10_000  # most points of a scan that are counted
 LEAST_POINTS = 500  # of a scan that can be called frozen
 
 
@@ -113,8 +113,11 @@ class ImageWatch:
 
 def _small(bgr: U8) -> U8:
     """Return the image in grey, ``WIDTH`` pixels wide."""
-    step = max(bgr.shape[1] // (2 * WIDTH), 1)
-    gray = cv2.cvtColor(np.ascontiguousarray(bgr[::step, ::step]), cv2.COLOR_BGR2GRAY)
+    step = max(round(bgr.shape[1] / (2 * WIDTH)), 1)
+    size = bgr.shape[1] // step, bgr.shape[0] // step
+    if step > 1:
+        bgr = np.asarray(cv2.resize(bgr, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
     size = WIDTH, max(round(WIDTH * bgr.shape[0] / bgr.shape[1]), 1)
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 

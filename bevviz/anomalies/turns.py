@@ -16,21 +16,22 @@ import cv2
 import numpy as np
 
 from bevviz.anomalies.sensor_faults import SensorFault
-from bevviz.model.frame import F64, U8, Camera
+from bevviz.model.frame import F32, F64, U8, Camera
 from bevviz.model.results import FrameResult
 
-BINS = 720  # directions in which the range is compared
+BINS = 360  # directions in which the range is compared
 BANDS = (20, 33, 46, 59, 72, 85, 98)  # percentiles of the elevations that bound the bands of a scan
 FAR = 6.0  # metres; what is nearer moves sideways as the robot drives
-REACH = 16  # bins, largest rotation of a LiDAR from scan to scan
+REACH = 8  # bins, largest rotation of a LiDAR from scan to scan
 UNLIKE = 0.9  # ratio of the least to the usual difference of two scans of different places
 LARGEST = 0.3  # largest difference of two mean logarithms that counts: beyond it they show two objects
 FEWEST = 2  # points of a direction whose mean range is used
 GROUND = 20.0  # metres, farthest ground whose slope is measured
 LEAST_GROUND = 200  # points
 POINTS = 40_000  # most points of a scan that are used
+GROUND_POINTS = 4000  # most points of the ground that are used
 
-CORNERS, LEAST_CORNERS = 200, 40
+CORNERS, LEAST_CORNERS = 150, 40
 AGREE = 0.35  # least share of the corners that move together
 SPREAD = 0.1  # least spread of these corners, as a share of the image width: one object is not enough
 OUTLIER = 1.5  # pixels
@@ -48,7 +49,7 @@ LASTS = 30.0  # seconds for which it is told
 class ScanShape:
     """Shape of a scan, from which its rotation against the next scan is measured."""
 
-    ranges: F64  # (bands, BINS) mean logarithm of the range in each direction; NaN: too few points
+    ranges: F32  # (bands, BINS) mean logarithm of the range in each direction; NaN: too few points
     elevations: F64  # (bands + 1,) tangents of the elevations that bound the bands
     slope: F64  # (2,) rise of the ground along x and along y; NaN: unknown
 
@@ -60,9 +61,10 @@ class ScanShape:
         distance = np.hypot(xyz[:, 0], xyz[:, 1])
         xyz, distance = xyz[distance > FAR], distance[distance > FAR]
         elevation = xyz[:, 2] / distance
-        bounds = np.percentile(elevation, BANDS) if len(xyz) else np.zeros(len(BANDS))
         if before is not None:
             bounds = before.elevations
+        else:
+            bounds = np.percentile(elevation, BANDS) if len(xyz) else np.zeros(len(BANDS))
         inside = (elevation > bounds[0]) & (elevation < bounds[-1])
         band = np.searchsorted(bounds, elevation[inside]) - 1
         azimuth = np.arctan2(xyz[inside, 1], xyz[inside, 0])
@@ -70,7 +72,11 @@ class ScanShape:
         cells = (len(BANDS) - 1) * BINS
         count = np.bincount(cell, minlength=cells)
         total = np.bincount(cell, np.log(distance[inside]), cells)
-        ranges = np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan).reshape(-1, BINS)
+        ranges = (
+            np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
+            .reshape(-1, BINS)
+            .astype(np.float32)
+        )
         return ScanShape(ranges, np.asarray(bounds, np.float64), _ground_slope(result))
 
     def rotation_to(self, other: ScanShape) -> F64 | None:
@@ -79,13 +85,14 @@ class ScanShape:
         None: the two scans do not show the same place, or too few points were measured.
         """
         shifts = np.arange(-REACH, REACH + 1)
-        cost = np.empty(len(shifts))
-        for row, shift in enumerate(shifts.tolist()):
-            difference = np.abs(np.roll(self.ranges, shift, axis=1) - other.ranges)
-            difference = difference[np.isfinite(difference)]
-            if len(difference) < BINS / 8:
-                return None
-            cost[row] = np.minimum(difference, LARGEST).mean()
+        turned = np.pad(self.ranges, ((0, 0), (REACH, REACH)), mode="wrap")
+        turned = np.lib.stride_tricks.sliding_window_view(turned, BINS, axis=1)[:, ::-1]
+        difference = np.abs(turned - other.ranges[:, None])  # (bands, shifts, BINS)
+        known = np.isfinite(difference)
+        count = known.sum(axis=(0, 2))
+        if count.min() < BINS / 8:
+            return None
+        cost = np.where(known, np.minimum(difference, LARGEST), 0).sum(axis=(0, 2)) / count
         best = int(cost.argmin())
         if cost[best] > UNLIKE * np.median(cost) or not 0 < best < 2 * REACH:
             return None
@@ -101,9 +108,9 @@ def _ground_slope(result: FrameResult) -> F64:
     """Return the (2,) slope of the near ground along x and y, NaN if it is not known."""
     if result.ground is None or result.voxels is None:
         return np.full(2, np.nan)
-    ground = result.voxels.points[result.ground.mask]
+    rows = np.flatnonzero(result.ground.mask)
+    ground = result.voxels.points[rows[:: -(-len(rows) // GROUND_POINTS) or 1]]
     ground = ground[np.hypot(ground[:, 0], ground[:, 1]) < GROUND].astype(np.float64)
-    ground = ground[:: -(-len(ground) // POINTS) or 1]
     if len(ground) < LEAST_GROUND:
         return np.full(2, np.nan)
     on_plane = np.ones(len(ground), np.bool_)
@@ -133,7 +140,7 @@ def camera_rotation(before: U8, after: U8, camera: Camera) -> F64 | None:
     corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 6)
     if corners is None or len(corners) < LEAST_CORNERS:
         return None
-    moved, state, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)
+    moved, state, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(13, 13), maxLevel=2)
     tracked = state[:, 0] == 1
     middle = np.array(before.shape[::-1], np.float32) / 2
     start, end = corners[tracked, 0] - middle, moved[tracked, 0] - middle
