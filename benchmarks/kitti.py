@@ -106,7 +106,8 @@ Twelve frames on which methods were chosen, 000000 to 000011:
 
 {tables[0]}
 
-Twelve more frames, 000012 to 000023. Boxes of people and the doubt about edges of weak detections were chosen on both:
+Twelve more frames, 000012 to 000023. Boxes of people and the doubt about edges of weak detections were
+chosen on both:
 
 {tables[1]}
 """
