@@ -17,7 +17,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+import bevviz
 from benchmarks.pages import write_section
+from benchmarks.sensor_faults import SensorTally, results
+from benchmarks.sensor_faults import measure as measure_sensors
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
 from bevviz.model import geometry
@@ -26,15 +29,18 @@ from bevviz.model.results import Anomaly, Detections, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.synthetic import Snapshot, SyntheticSource
+from tests.support.sensor_plants import Results
 
 CHOSEN_ON = (2000, 2001, 2011)  # seeds that rules and limits were looked at on
 SEEDS = (2010, 2012, 2013)  # seeds that figures are of
 
 INTRO = f"""## Anomalies
 
-Faults planted every two seconds in the synthetic drives {SEEDS} of 10 s, by `python -m benchmarks.anomalies`,
-which also lists the false alarms. Limits were chosen on {CHOSEN_ON}.
+Faults planted in the synthetic drives {SEEDS} of 10 s, and faults of sensors in {{real}} as well, by
+`python -m benchmarks.anomalies`, which also lists the false alarms. Limits were chosen on {CHOSEN_ON}
+and on the real drive.
 """
+REAL = "25 frames of a KITTI drive"
 
 FRAMES = 100
 EVERY, FIRST = 20, 30  # frames: when faults are planted
@@ -299,13 +305,23 @@ def _reported(shot: Snapshot, result: FrameResult) -> set[int]:
     return found
 
 
-def table(tally: Tally) -> str:
+def sensor_drives(seeds: Sequence[int], folder: Path) -> Iterator[Results]:
+    """Yield the drives in which faults of sensors are planted: the real one first, if it is in the folder."""
+    if folder.is_dir():
+        with bevviz.open(folder) as drive:
+            yield results(iter(drive.frames), Config())
+    for seed in seeds:
+        source = SyntheticSource(FRAMES, seed)
+        yield results((source.snapshot(index).frame for index in range(FRAMES)), Config())
+
+
+def table(tally: Tally, sensors: SensorTally) -> str:
     lines = [
         "| fault | planted | told within 0.3 s | later | not | delay, median s |",
         "| --- |" + " ---: |" * 5,
     ]
-    for name in FAULTS:
-        delays = np.array(tally.delays[name])
+    for name, told_after in {**{name: tally.delays[name] for name in FAULTS}, **sensors.delays}.items():
+        delays = np.array(told_after)
         if not len(delays):
             lines.append(f"| {name} | 0 | - | - | - | - |")
             continue
@@ -318,7 +334,10 @@ def table(tally: Tally) -> str:
     rate = 10 * len(tally.alarms) / tally.seconds
     lines += [
         "",
-        f"{len(tally.alarms)} false alarms in {tally.seconds:.0f} s undisturbed: {rate:.1f} in 10 s",
+        f"{len(tally.alarms)} false alarms in {tally.seconds:.0f} s undisturbed: {rate:.1f} in 10 s.",
+        f"{len(sensors.alarms)} of a sensor in {sensors.seconds:.1f} s, the real drive among them. "
+        f"{sensors.misnamed} of the {sum(map(len, sensors.delays.values()))} faults of sensors were told by "
+        "another name, too.",
     ]
     return "\n".join(lines)
 
@@ -328,14 +347,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, action="append", help=f"drives (default: {SEEDS})")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--write", type=Path, help="page whose section is replaced, instead of printing it")
+    parser.add_argument(
+        "--real",
+        type=Path,
+        default=Path("../shared/data/kitti_drive"),
+        help="real drive (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
+    sensors = SensorTally()
+    for drive in sensor_drives(options.seed or SEEDS, options.real):
+        measure_sensors(drive, sensors)
     tally = measure(options.seed or SEEDS, load(settings=options.set))
     if options.write:
-        write_section(options.write, f"{INTRO}\n{table(tally)}\n")
+        real = REAL if options.real.is_dir() else "no real drive"
+        write_section(options.write, f"{INTRO.format(real=real)}\n{table(tally, sensors)}\n")
         return
-    print(table(tally))
+    print(table(tally, sensors))
     for seed, index, anomaly in tally.alarms:
         print(f"- drive {seed}, frame {index}: {anomaly.kind}: {anomaly.text}")
+    for anomaly in sensors.alarms:
+        print(f"- {anomaly.text}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,119 @@
+"""Faults of sensors, planted in the synthetic drives and in a real one: how soon each is told by its name."""
+
+from __future__ import annotations
+
+import copy
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bevviz.anomalies.sensors import SensorWatch
+from bevviz.config import Config
+from bevviz.model.frame import Frame
+from bevviz.model.results import Anomaly, FrameResult
+from bevviz.pipeline.session import Session
+from tests.support.sensor_plants import (
+    Results,
+    blocked_sector,
+    pixels,
+    turned_camera,
+    turned_lidar,
+    turned_transform,
+    with_image,
+)
+
+FIRST, EVERY = 8, 8  # frames, when faults are planted in a drive
+NEWEST = 150_000_000  # nanoseconds by which a fault may be dated back
+HORIZON = 6  # frames that a fault is watched for
+LONGEST = 100  # frames that a transform which was always wrong is watched for
+DEGREES = 3.0
+TURNS = [(axis, sign * DEGREES) for axis in range(3) for sign in (1, -1)]
+ALWAYS = "transform wrong by 3 degrees from the first frame on"
+
+Plant = Callable[[Results, int, int], FrameResult]  # of a drive, a frame and the first frame with the fault
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPlant:
+    """A fault, the name that tells it, and the ways to plant it."""
+
+    told_by: str
+    plants: tuple[Plant, ...]
+
+
+def _turns(turn: Callable[[FrameResult, int, float], FrameResult]) -> tuple[Plant, ...]:
+    """Return plants of a rotation about each axis, to both sides."""
+
+    def plant(axis: int, degrees: float) -> Plant:
+        return lambda drive, row, first: turn(drive[row], axis, degrees)
+
+    return tuple(plant(axis, degrees) for axis, degrees in TURNS)
+
+
+SENSOR_FAULTS = {
+    "black image": SensorPlant(
+        "black image", (lambda d, i, _: with_image(d[i], np.zeros_like(pixels(d[i]))),)
+    ),
+    "dark image": SensorPlant("dark image", (lambda d, i, _: with_image(d[i], pixels(d[i]) // 8),)),
+    "frozen image": SensorPlant("frozen image", (lambda d, i, k: with_image(d[i], pixels(d[k]).copy()),)),
+    "image late by one": SensorPlant(
+        "late image", (lambda d, i, _: with_image(d[i], pixels(d[i - 1]).copy()),)
+    ),
+    "blocked sector of 35 degrees": SensorPlant("blocked sector", (lambda d, i, _: blocked_sector(d[i]),)),
+    "transform jumps by 3 degrees": SensorPlant("jumped", _turns(turned_transform)),
+    "camera turned by 3 degrees": SensorPlant("camera turned", _turns(turned_camera)),
+    "LiDAR turned by 3 degrees": SensorPlant("LiDAR turned", _turns(turned_lidar)),
+}
+
+
+@dataclass
+class SensorTally:
+    """Delays of the planted faults, and the false alarms."""
+
+    delays: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # s; inf: not told
+    alarms: list[Anomaly] = field(default_factory=list)
+    seconds: float = 0.0  # undisturbed
+    misnamed: int = 0  # planted faults that were told by another name, too
+
+
+def results(frames: Iterator[Frame], config: Config) -> Results:
+    """Run the stages without a detector."""
+    session = Session(config)
+    return [session.perceive(frame) for frame in frames]
+
+
+def measure(drive: Results, tally: SensorTally) -> None:
+    """Run a drive undisturbed and with each fault."""
+    watch, seen = SensorWatch(), set[tuple[str, int]]()
+    for row, result in enumerate(drive):
+        if row >= FIRST and (row - FIRST) % EVERY == 0 and row + HORIZON <= len(drive):
+            for name, fault in SENSOR_FAULTS.items():
+                for plant in fault.plants:
+                    window = [plant(drive, i, row) for i in range(row, row + HORIZON)]
+                    tally.delays[name].append(_delay(copy.deepcopy(watch), window, fault.told_by, tally))
+        new = [a for a in watch.update(result) if (a.subject, a.since) not in seen]
+        seen |= {(a.subject, a.since) for a in new}
+        tally.alarms += new
+    for axis, degrees in TURNS:
+        wrong = [turned_transform(result, axis, degrees) for result in drive[:LONGEST]]
+        tally.delays[ALWAYS].append(_delay(SensorWatch(), wrong, "not where its transform says", tally))
+    tally.seconds += 0.1 * len(drive)
+
+
+def _delay(watch: SensorWatch, window: Sequence[FrameResult], told_by: str, tally: SensorTally) -> float:
+    """Return the seconds from the first frame to the one that tells the fault."""
+    delay, others = float("inf"), False
+    for row, result in enumerate(window):
+        for anomaly in watch.update(result):
+            if anomaly.since < window[0].frame.stamp - NEWEST:
+                continue  # an alarm from before the fault
+            words = anomaly.subject.partition(": ")
+            name = f"{words[0].split()[0]} {words[2]}"
+            if told_by in name:
+                delay = min(delay, 0.1 * row)
+            else:
+                others = True
+    tally.misnamed += others
+    return delay
