@@ -61,7 +61,7 @@ class Selection:
         return self.kind in PLACES
 
     def __str__(self) -> str:
-        """As it stands in the page's address: ``detection/front/3``, ``point//1.5,2,0``."""
+        """Return the text of the page's address: ``detection/front/3``, ``point//1.5,2,0``."""
         numbers = ",".join(f"{v:.4g}" for v in self.place) if self.is_place else str(self.row)
         return f"{self.kind}/{self.camera}/{numbers}"
 
