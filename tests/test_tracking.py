@@ -241,7 +241,7 @@ def test_a_truck_that_falls_into_two_clusters_keeps_one_id(speed: float) -> None
             assert tracks.velocity[row, 0] == pytest.approx(speed, abs=1.0), "another part is no motion"
 
 
-def test_the_older_track_continues_where_only_the_younger_one_is_seen() -> None:
+def test_older_track_continues_where_the_younger_is_seen() -> None:
     tracker = Tracker()
     for i in range(20):
         parts = [20] if i < 10 else [17, 23] if i < 12 else [23]
