@@ -30,9 +30,9 @@ MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
 
 SYNTHETIC = f"""## Objects on synthetic drives
 
-`python -m benchmarks.accuracy`, with the demo network, on drives that it was not trained on. An object must
+`python -m benchmarks.accuracy` runs the demo network on drives that it was not trained on. An object must
 be found within {RANGE:.0f} m, with {MIN_HITS} LiDAR points and {MIN_HEIGHT} px of visible height or more.
-A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m on the ground plane.
+A fused box is right if an object of its class has its centre within {MAX_DISTANCE:.0f} m.
 """
 
 
@@ -212,11 +212,20 @@ def share(part: float, whole: float) -> str:
 
 
 def details(tallies: dict[Preset, Tally]) -> str:
-    """Format the tables of clusters and detections, which are printed but not on the page."""
+    """Format the tables of ground, clusters and detections, which are printed but not on the page."""
     lines = [
-        "\n### Clusters: objects that have one of their own\n",
-        "| class | objects | " + " | ".join(tallies) + " |",
+        "\n### Ground\n",
+        "| preset | precision | recall | IoU | object points kept |",
+        "| --- | ---: | ---: | ---: | ---: |",
     ]
+    for preset, tally in tallies.items():
+        g = tally.ground
+        lines.append(
+            f"| {preset} | {share(g['tp'], g['tp'] + g['fp'])} | {share(g['tp'], g['tp'] + g['fn'])} "
+            f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
+        )
+    lines.append("\n### Clusters: objects that have one of their own\n")
+    lines.append("| class | objects | " + " | ".join(tallies) + " |")
     lines.append("| --- | ---: |" + " ---: |" * len(tallies))
     for name in CLASSES:
         first = next(iter(tallies.values()))
@@ -232,20 +241,12 @@ def details(tallies: dict[Preset, Tally]) -> str:
 
 
 def tables(tallies: dict[Preset, Tally]) -> str:
+    """Format the table of fused objects."""
     lines = [
-        "\n### Ground\n",
-        "| preset | precision | recall | IoU | object points kept |",
-        "| --- | ---: | ---: | ---: | ---: |",
+        "\n### Fused objects: class and place\n",
+        "| class | preset | precision | recall | centre error, median m | 90 % m |",
+        "| --- | --- | ---: | ---: | ---: | ---: |",
     ]
-    for preset, tally in tallies.items():
-        g = tally.ground
-        lines.append(
-            f"| {preset} | {share(g['tp'], g['tp'] + g['fp'])} | {share(g['tp'], g['tp'] + g['fn'])} "
-            f"| {share(g['tp'], g['tp'] + g['fp'] + g['fn'])} | {share(g['object kept'], g['object'])} |"
-        )
-    lines.append("\n### Fused objects: class and place\n")
-    lines.append("| class | preset | precision | recall | centre error, median m | 90 % m |")
-    lines.append("| --- | --- | ---: | ---: | ---: | ---: |")
     for name in (*CLASSES, "all"):
         for preset, tally in tallies.items():
             chosen = CLASSES if name == "all" else (name,)
@@ -260,8 +261,8 @@ def tables(tallies: dict[Preset, Tally]) -> str:
 def track_table(tallies: Tallies, frames: int, seeds: list[int]) -> str:
     lines = [
         "\n### Tracks: ids and speeds, `default` preset\n",
-        f"{frames} scans in a row of each of the drives {seeds}. All tracks count that are shown and have a",
-        "cluster. Speed errors are of the velocity vector of tracks older than a second.\n",
+        f"{frames} scans in a row of each of the drives {seeds}. Tracks count that are shown and have a",
+        "cluster. Speed errors are those of tracks older than a second.\n",
         "| class | MOTA | IDF1 | precision | recall | id switches | speed error, median m/s | 90 % m/s |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]

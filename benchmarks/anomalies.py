@@ -317,7 +317,7 @@ def sensor_drives(seeds: Sequence[int], folder: Path) -> Iterator[Results]:
 
 def table(tally: Tally, sensors: SensorTally) -> str:
     lines = [
-        "| fault | planted | told within 0.3 s | later | not | delay, median s |",
+        "| fault | planted | reported within 0.3 s | later | not | delay, median s |",
         "| --- |" + " ---: |" * 5,
     ]
     for name, told_after in {**{name: tally.delays[name] for name in FAULTS}, **sensors.delays}.items():

@@ -84,7 +84,7 @@ def by_distance(tallies: Mapping[str, Tally]) -> str:
     return "\n".join(lines)
 
 
-COLUMNS = ("found within 2 m", "error, median m", "IoU 0.5", "cars 0.7", "people 0.5", "wrong")  # on the page
+COLUMNS = ("found within 2 m", "error, median m", "cars 0.7", "people 0.5", "wrong")  # on the page
 
 
 def section(data: Path) -> str:
@@ -97,17 +97,17 @@ def section(data: Path) -> str:
     return f"""## Objects on real frames
 
 Labelled frames of the KITTI object benchmark (Geiger et al. 2012), by `python -m benchmarks.kitti`, which
-also has the tables by distance and visibility. An object must be found within {RANGE:.0f} m with {MIN_HITS}
-LiDAR points or more. It is found if a box of its class has its centre within {FOUND:.0f} m. IoU is seen from
-above. A box is wrong if no labelled object is within {FOUND:.0f} m. In brackets: the 95 % interval of a
-bootstrap over the frames.
+also prints tables by distance and visibility. An object must be found within {RANGE:.0f} m with {MIN_HITS}
+LiDAR points or more. It is found if a box of its class has its centre within {FOUND:.0f} m. A box is wrong if
+no labelled object is within {FOUND:.0f} m. Cars need an IoU of 0.7 from above, people 0.5. Brackets
+hold 95 % intervals.
 
 Twelve frames on which methods were chosen, 000000 to 000011:
 
 {tables[0]}
 
-Twelve more frames, 000012 to 000023. Boxes of people and the doubt about edges of weak detections were
-chosen on both:
+Twelve more frames, 000012 to 000023. Two rules (boxes of people, edges of weak detections) were chosen
+on both:
 
 {tables[1]}
 """

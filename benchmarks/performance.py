@@ -47,7 +47,8 @@ def main() -> None:
         table = stages.profile(messages, frames, scene)
         bag = bags.repeat(drive, folder / "repeated", int(1e9 * (0.2 if options.quick else options.size)))
         rows += runs.compare(bag, 1 if options.quick else 3)
-        rows += stages.growth(messages, frames, scene, repetitions)
+        if options.write is None:  # the page goes without them
+            rows += stages.growth(messages, frames, scene, repetitions)
         networks = runs.networks(drive, len(frames), options.model)
 
     page = "\n".join(

@@ -286,7 +286,7 @@ def _share(cases: Sequence[tuple[str, bool]]) -> str:
         total[frames.index(frame)] += 1
     draws = np.random.default_rng(0).integers(0, len(frames), (2000, len(frames)))
     low, high = np.percentile(held[draws].sum(axis=1) / total[draws].sum(axis=1), (2.5, 97.5))
-    return f"{held.sum():.0f} of {total.sum():.0f} ({100 * low:.0f} to {100 * high:.0f} %)"
+    return f"{held.sum():.0f} of {total.sum():.0f} ({100 * low:.0f}-{100 * high:.0f} %)"
 
 
 def shots(root: Path, names: Iterable[str] | None = None) -> Iterator[Shot]:
