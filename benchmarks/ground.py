@@ -170,8 +170,6 @@ def table(tallies: dict[str, list[Tally]]) -> str:
     heads = (
         "method",
         "synthetic drives: IoU",
-        "precision",
-        "recall",
         "labelled frames: points of objects called ground",
         "flat points of long clusters, a scan",
         "drive: the same",
@@ -182,8 +180,6 @@ def table(tallies: dict[str, list[Tally]]) -> str:
         times = sorted(made.times[1:] + frames.times + real.times)
         cells = [
             f"{made.iou:.3f}",
-            f"{made.true / max(made.true + made.false, 1):.3f}",
-            f"{made.true / max(made.true + made.missed, 1):.3f}",
             f"{100 * frames.lost / max(frames.inside, 1):.1f} %",
             *(f"{t.flat / max(t.scans, 1):.0f}" for t in (frames, real)),
             f"{1e3 * times[len(times) // 2]:.1f}",
