@@ -46,8 +46,8 @@ def main() -> None:
             f"`python -m benchmarks.size`, {datetime.now(UTC):%Y-%m-%d}: {machine()}.",
             "Rows of explanations, objects, tracks and anomalies are the same in each.",
             "",
-            "| drive | keep | MB | of everything | MB a frame | raw clouds | rows |",
-            "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
+            "| drive | keep | MB | of everything | MB a frame | raw clouds |",
+            "| --- | --- | ---: | ---: | ---: | ---: |",
             *rows,
         ]
     )
@@ -69,7 +69,7 @@ def sizes(drive: Path, model: str, folder: Path) -> list[str]:
             raise SystemExit(f"{drive.name}, {keep}: {rows} decisions, of {decided}")
         found.append(
             f"| {drive.stem}, {frames} scans | `{keep}` | {size / 1e6:.1f} | {size / whole:.3f} "
-            f"| {size / frames / 1e6:.2f} | {raw} | {rows} |"
+            f"| {size / frames / 1e6:.2f} | {raw} |"
         )
     return found
 
