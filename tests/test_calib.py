@@ -275,7 +275,7 @@ def test_images_of_other_frames_give_no_answer(kitti: list[Frame]) -> None:
 
 
 def test_the_worst_agreement_of_a_right_calibration(shared: Path) -> None:
-    """Of all real frames, these four are among those that score least."""
+    """These four frames are among the real ones that score least."""
     assert best_score(Kitti(shared / "kitti_more", range(12, 16)).frames) > 1.2 * FIT
 
 

@@ -1,4 +1,4 @@
-"""What nuscenes-devkit makes of the folder of ``tests/support/datasets.py``, for ``tests/test_datasets.py``.
+"""Write what nuscenes-devkit reads from the folder of ``tests/support/datasets.py``.
 
 Needs an environment with nuscenes-devkit 1.2.0 (and its older NumPy), not that of bevviz::
 

@@ -22,6 +22,6 @@ def error_of(capsys: Capture, *arguments: str | Path) -> str:
 
 
 def environment() -> dict[str, str]:
-    """Of a process that finds this checkout and no display."""
+    """Return the environment of a process that finds this checkout and no display."""
     kept = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return {**kept, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}

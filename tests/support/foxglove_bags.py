@@ -59,7 +59,7 @@ def edge(scan: int, parent: str, child: str, matrix: F64) -> Any:
 
 
 def write(path: Path, *, offset: F64 | None = None, image: str = "png") -> Path:
-    """As nuscenes2mcap has its topics; the camera's place is said once."""
+    """Write a bag with the topics of nuscenes2mcap. It states the pose of the camera once."""
     context = foxglove.Context()
     with foxglove.open_mcap(path, context=context):
         cloud = channels.PointCloudChannel("/LIDAR_TOP", context=context)

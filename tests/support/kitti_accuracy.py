@@ -185,7 +185,7 @@ def outline(center: np.ndarray, size: np.ndarray, yaw: float) -> Polygon:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of an object that must be found."""
+    """Outcome of an object that must be found."""
 
     frame: str
     label: Label
@@ -195,7 +195,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """What is there where a box was named."""
+    """Surroundings of a named box."""
 
     frame: str
     name: str
