@@ -9,6 +9,7 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
 from bevviz.stages.fusion import assign
+from bevviz.stages.shared_area import shared_area
 from bevviz.support.kernel import kernel
 
 SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate
@@ -94,9 +95,8 @@ def _outlines(boxes: Boxes3D) -> F64:
 
 @kernel
 def _shared_areas(a: F64, b: F64) -> F64:
-    """Return the (A, B) areas that two outlines share (Sutherland and Hodgman 1974)."""
+    """Return the (A, B) areas that two outlines share."""
     shared = np.zeros((len(a), len(b)))
-    polygon, kept = np.empty((8, 2)), np.empty((8, 2))
     for i in range(len(a)):
         reach_a = _diagonal(a[i])
         for j in range(len(b)):
@@ -104,38 +104,9 @@ def _shared_areas(a: F64, b: F64) -> F64:
                 a[i, 0, 0] + a[i, 2, 0] - b[j, 0, 0] - b[j, 2, 0],
                 a[i, 0, 1] + a[i, 2, 1] - b[j, 0, 1] - b[j, 2, 1],
             )
-            if math.hypot(x, y) >= reach_a + _diagonal(b[j]):
-                continue
-            polygon[:4] = a[i]
-            count = 4
-            for edge in range(4):
-                start, end = b[j, edge], b[j, (edge + 1) % 4]
-                size = 0
-                for k in range(count):
-                    before, here = polygon[(k - 1) % count], polygon[k]
-                    outside = _left_of(start, end, before)
-                    inside = _left_of(start, end, here)
-                    if (outside >= 0) != (inside >= 0):
-                        kept[size] = before + outside / (outside - inside) * (here - before)
-                        size += 1
-                    if inside >= 0:
-                        kept[size] = here
-                        size += 1
-                polygon[:size] = kept[:size]
-                count = size
-                if count == 0:
-                    break
-            for k in range(count):
-                p, q = polygon[k - 1] if k else polygon[count - 1], polygon[k]
-                shared[i, j] += (p[0] * q[1] - p[1] * q[0]) / 2
+            if math.hypot(x, y) < reach_a + _diagonal(b[j]):
+                shared[i, j] = shared_area(a[i], b[j])
     return shared
-
-
-@kernel
-def _left_of(start: F64, end: F64, point: F64) -> float:
-    """Return the distance of a point to the left of an edge, times the length of the edge."""
-    (ax, ay), (bx, by), (x, y) = start, end, point
-    return float((bx - ax) * (y - ay) - (by - ay) * (x - ax))
 
 
 @kernel
