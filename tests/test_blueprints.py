@@ -200,3 +200,14 @@ def test_layouts_are_installed_with_the_package(tmp_path: Path, monkeypatch: pyt
     (package / "blueprints" / "mine.py").write_text("")
     monkeypatch.setattr(blueprints, "PACKAGE", package)
     assert blueprints.names() == ["mine"]
+
+
+def test_each_layout_has_its_own_application_id() -> None:
+    ids = {
+        blueprints.application_id(name, Scene("a", "lidar", ("lidar",), (camera,)))
+        for name in ("debug", "explain")
+        for camera in ("zed", "left")
+    }
+    assert len(ids) == 4
+    renamed = Scene("b", "lidar", ("lidar",), ("zed",))
+    assert blueprints.application_id("debug", renamed) in ids

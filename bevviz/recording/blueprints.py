@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import uuid
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,10 +49,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
     Raises:
         UserError: the name is unknown, the file does not exist, or it does not make a layout.
     """
-    if config is not None:
-        is_complete, logging = keeps_everything(config), config.logging
-        color_by = logging.color_by if is_complete and logging.raw_cloud else ()
-        scene = replace(scene, above=_bounds_ahead(config.bev), raw=is_complete, color_by=color_by)
+    scene = _configured(scene, config)
     if name_or_path in names():
         if not scene.lidar and scene.cameras:
             name_or_path = "cameras"
@@ -65,6 +64,27 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
         return _from_python(path, scene)
     check_decodes(path)
     return SavedBlueprint(path)
+
+
+def application_id(layout: str | rrb.Blueprint, scene: Scene, config: Config | None = None) -> str:
+    """Return the application id of recordings with this layout and these sensors.
+
+    The viewer shows all recordings of an application id in one layout. Recordings of the same layout and
+    sensors share what a user changes in it. A layout made for one recording has its own id.
+    """
+    if not isinstance(layout, str):
+        return f"bevviz-{uuid.uuid4().hex[:8]}"
+    same = replace(_configured(scene, config), name="", bag=(), topics=())
+    return f"bevviz-{Path(layout).stem}-{zlib.crc32(repr((layout, same)).encode()):08x}"
+
+
+def _configured(scene: Scene, config: Config | None) -> Scene:
+    """Return the scene with the fields that depend on the configuration."""
+    if config is None:
+        return scene
+    is_complete, logging = keeps_everything(config), config.logging
+    color_by = logging.color_by if is_complete and logging.raw_cloud else ()
+    return replace(scene, above=_bounds_ahead(config.bev), raw=is_complete, color_by=color_by)
 
 
 def _bounds_ahead(config: BevConfig) -> tuple[float, float, float, float]:

@@ -136,7 +136,9 @@ def open_recording(
             sinks.append(server)
             urls.append(address)
         has_viewer = connect is not None or spawn or serve is not None
-        recording = _new_stream(recording_id, batcher=None if has_viewer else chunk_batching(config))
+        application = blueprints.application_id(blueprint, scene, config)
+        batcher = None if has_viewer else chunk_batching(config)
+        recording = _new_stream(application, recording_id, batcher)
         # The writer waits until Rerun closes the sink. From here on, every interrupt must close it.
         stack.callback(recording.disconnect)
         try:
@@ -160,11 +162,9 @@ def open_recording(
 
 
 def _new_stream(
-    recording_id: str | None, *, properties: bool = True, batcher: rr.ChunkBatcherConfig | None = None
+    application: str, recording_id: str | None, batcher: rr.ChunkBatcherConfig | None
 ) -> rr.RecordingStream:
-    recording = rr.RecordingStream(
-        APPLICATION, recording_id=recording_id, send_properties=properties, batcher_config=batcher
-    )
+    recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batcher)
     recording.set_log_time_enabled(False)  # frames have their own clocks
     return recording
 
