@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from bevviz.model.frame import F32
-from bevviz.recording.labels import MAX_NAMES, choose_named, choose_named_in_3d, choose_named_in_bev
+from bevviz.recording.labels import MAX_NAMES, choose_named, choose_named_in_3d
 from bevviz.recording.states import COLORS, StateLanes
 from bevviz.recording.writer import Writer
 
@@ -42,11 +42,6 @@ def test_earlier_objects_are_named_before_nearer_ones() -> None:
     places = np.array([[10, 0, 0], [10.5, 0.2, 0], [10, 9, 0]], np.float32)
     assert choose_named_in_3d(places).tolist() == [True, False, True]
     assert choose_named_in_3d(places, np.array([False, True, False])).tolist() == [False, True, True]
-
-
-def test_from_above_a_name_is_wide_and_low() -> None:
-    places = np.array([[5, 0], [5, 8], [10, 0]], np.float32)
-    assert choose_named_in_bev(places).tolist() == [True, False, True]
 
 
 def test_a_lane_starts_with_its_first_state() -> None:

@@ -23,7 +23,6 @@ from bevviz.config.trust import USER
 from bevviz.datasets.kitti import label_files, read_labels
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
-from bevviz.model.colors import OPINION_COLORS as OPINION_COLORS
 from bevviz.model.counts import OPINIONS
 from bevviz.model.decisions import explain
 from bevviz.model.frame import F32, Boxes3D, Camera, LabelledBoxes3D
@@ -38,6 +37,7 @@ from bevviz.stages.detector.names import COCO
 from bevviz.stages.opinions import matching_names, opinions
 from bevviz.stages.user_stages import make_objects
 from bevviz.stages.visibility import image_boxes, range_image, visible
+from bevviz.support.colors import OPINION_COLORS as OPINION_COLORS
 from bevviz.sweep.run import SweepOutcome
 from bevviz.synthetic import SyntheticSource
 from bevviz.why import FrameExplainer, Selection

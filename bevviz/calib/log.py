@@ -13,11 +13,11 @@ from bevviz.calib.result import AxisFinding, Calibration
 from bevviz.calib.samples import Shot
 from bevviz.config import LoggingConfig
 from bevviz.model import geometry
-from bevviz.model.colors import StateColor, color_rows
 from bevviz.model.frame import F32, F64, Bool, Intrinsics
 from bevviz.recording import entities
 from bevviz.recording.primitives import CORNER, depth_annotations, document, encode_image
 from bevviz.support import table
+from bevviz.support.colors import StateColor, color_rows
 from bevviz.support.text import fenced, markdown
 
 _STATED, _CORRECTED = StateColor.BAD.value, StateColor.GOOD.value

@@ -15,7 +15,6 @@ from bevviz.compare.differences import (
     FrameDifferences,
     TruthComparison,
 )
-from bevviz.model.colors import SIDE_COLORS, StateColor
 from bevviz.model.frame import F64
 from bevviz.recording import entities
 from bevviz.recording.images import image_frame
@@ -24,6 +23,7 @@ from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, document, tra
 from bevviz.recording.states import StateLanes
 from bevviz.recording.writer import Writer
 from bevviz.support import table
+from bevviz.support.colors import SIDE_COLORS, StateColor
 from bevviz.support.text import markdown
 
 COLORS = {

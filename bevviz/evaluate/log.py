@@ -10,7 +10,6 @@ import rerun as rr
 
 from bevviz.evaluate.evaluation import Evaluation, page
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.model.colors import TRUTH_COLORS
 from bevviz.model.frame import Boxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -18,6 +17,7 @@ from bevviz.recording import entities
 from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
 from bevviz.recording.primitives import boxes3d, document, transform
 from bevviz.recording.writer import SCALAR_WAIT, Writer
+from bevviz.support.colors import TRUTH_COLORS
 from bevviz.support.text import markdown
 
 # Outcome, boxes, rows with this outcome, names of all boxes.

@@ -11,7 +11,6 @@ import rerun as rr
 from bevviz import anomalies
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.colors import class_color
 from bevviz.model.frame import F32, F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
 from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks
 from bevviz.recording import entities
@@ -19,7 +18,6 @@ from bevviz.recording.entities import TRACK_COLORS, ClassId
 from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
 from bevviz.recording.labels import (
     choose_named_in_3d,
-    choose_named_in_bev,
     log_box_label_style,
     log_box_labels,
 )
@@ -35,6 +33,7 @@ from bevviz.recording.primitives import (
     transform,
 )
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import CONTEXT, SERIES_COLORS, Color, class_color
 
 
 def log_object_style(to: Writer) -> None:
@@ -171,17 +170,13 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
     pixels = bev_pixels(config, points_from_world, trail)
     to.put(entities.overlay("trails"), rr.LineStrips2D(strips(pixels, lengths), class_ids=colors))
     outlines = ground_outlines(geometry.corners(tracks.boxes)[rows])
-    is_named = choose_named_in_bev(geometry.apply(points_from_world, tracks.boxes.center[rows]))
     to.put(
         entities.overlay("tracks"),
         rr.LineStrips2D(
             bev_pixels(config, points_from_world, outlines),
             class_ids=colors,
-            labels=[
-                track_label(tracks, row) if is_shown else ""
-                for row, is_shown in zip(rows, is_named, strict=True)
-            ],
-            show_labels=True,
+            labels=[track_label(tracks, row) for row in rows.tolist()],
+            show_labels=False,  # the bird's-eye image has the names of objects
         ),
     )
 
@@ -273,11 +268,9 @@ def _trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
 
 # --- ground truth, and boxes of the robot ------------------------------------------------------
 
-Color = tuple[int, int, int]
 Put = Callable[..., None]  # ``Writer.put`` or ``Writer.write``
 
-_TRUTH_COLOR = (215, 215, 215)
-_ROBOT_COLOR = (255, 210, 0)
+_TRUTH_COLOR, _ROBOT_COLOR = CONTEXT, SERIES_COLORS[4]
 
 
 def log_truth_style(to: Writer) -> None:

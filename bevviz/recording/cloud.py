@@ -14,7 +14,6 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 
 from bevviz.config import ClusteringConfig
 from bevviz.config.sections import Quantity
-from bevviz.model.colors import palette, turbo
 from bevviz.model.frame import F32, I32, I64, RING_FIELDS, Bool, Frame
 from bevviz.model.results import Clusters, ClusterState, FrameResult, Tracks
 from bevviz.recording import entities, retention
@@ -24,6 +23,7 @@ from bevviz.recording.primitives import OUTLINE, boxes3d, point_classes, rounded
 from bevviz.recording.retention import RawCloud
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import spread_to_points
+from bevviz.support.colors import UNNAMED, palette, turbo
 from bevviz.support.kernel import kernel
 
 
@@ -236,7 +236,7 @@ def quantity_annotations() -> rr.AnnotationContext:
             for step, color in enumerate(shares)
         ),
         *(_info(_RING + step, f"ring {step}", rings[step % len(rings)]) for step in range(_RINGS)),
-        _info(_ABSENT, "not in this cloud", (130, 130, 140)),
+        _info(_ABSENT, "not in this cloud", UNNAMED),
     ]
     return rr.AnnotationContext([*point_classes(), *scales])
 
@@ -336,7 +336,7 @@ def log_clusters(
     config: ClusteringConfig,
     packed: float | None = None,
 ) -> None:
-    """Log clusters in the colours of their tracks.
+    """Log clusters with the class ids of their tracks. The annotation context colours them grey.
 
     Args:
         to: writer of the recording.

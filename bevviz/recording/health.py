@@ -9,12 +9,12 @@ import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import KINDS
-from bevviz.model.colors import SERIES_COLORS
 from bevviz.model.counts import count_results
 from bevviz.model.frame import Frame
 from bevviz.model.results import Anomaly, FrameResult
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import SERIES_COLORS
 
 # Curves of one plot, in the order of their colours. The viewer's automatic colours may repeat.
 STAGES = (

@@ -12,7 +12,6 @@ import rerun as rr
 
 from bevviz.config import BevConfig, Config
 from bevviz.model import geometry
-from bevviz.model.colors import class_color, color_rows
 from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import (
     Bev,
@@ -33,7 +32,6 @@ from bevviz.recording.labels import (
 )
 from bevviz.recording.primitives import (
     CORNER,
-    FAINT_COLOR,
     blob,
     boxes2d,
     depth_annotations,
@@ -46,6 +44,7 @@ from bevviz.recording.primitives import (
     transform,
 )
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import FAINT, UNNAMED, class_color, color_rows
 
 if TYPE_CHECKING:
     from bevviz.recording.video import VideoEncoder
@@ -66,7 +65,7 @@ def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
         to.static(
             entities.weak(camera),
             rr.Boxes2D.from_fields(
-                colors=[FAINT_COLOR], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
+                colors=[FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
             ),
         )
 
@@ -274,7 +273,6 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
 # --- frustums ----------------------------------------------------------------------------------
 
 _NEAR = 0.3  # metres from the camera
-_UNMATCHED_COLOR = (80, 80, 92)
 _UNMATCHED_DEPTH = 20.0  # metres to the far end of an unmatched detection's frustum
 
 
@@ -302,7 +300,7 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
         names = [detections.names[row] for row in rows]
         strips.append(edges(corners))
         colors += [
-            class_color(name) if is_matched else _UNMATCHED_COLOR
+            class_color(name) if is_matched else UNNAMED
             for name, is_matched in zip(names, matched[rows], strict=True)
         ]
         labels += scored(names, detections.score[rows])

@@ -13,11 +13,11 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import Color
 from bevviz.model.frame import F32, F64, Bool, Boxes3D
 from bevviz.recording import entities
 from bevviz.recording.primitives import CORNER, edges, strips
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import Color
 
 MAX_NAMES = 6  # boxes with a name; names of all boxes would cover the scene
 EYE, LOOK_TARGET = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
@@ -127,15 +127,6 @@ def choose_named_in_3d(places: F32 | F64, first: Bool | None = None, height: flo
     eye_positions = (places - np.array(EYE)) @ np.stack([right, np.cross(right, ahead), ahead], axis=1)
     tangents = eye_positions[:, :2] / np.maximum(eye_positions[:, 2:], 0.1)
     return choose_named(tangents, _distances(places), (IN_SPACE[0] / height, IN_SPACE[1] / height), first)
-
-
-def choose_named_in_bev(places: F32) -> Bool:
-    """Choose the boxes that get a name in the bird's-eye view. Return a (K,) mask.
-
-    Args:
-        places: (K, 2 or 3) positions around the robot, x ahead.
-    """
-    return choose_named(places[:, 1::-1], _distances(places), FROM_ABOVE)
 
 
 def choose_named(

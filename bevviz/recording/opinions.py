@@ -9,7 +9,6 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import OPINION_COLORS, SERIES_COLORS, Color, StateColor, class_color
 from bevviz.model.counts import OPINIONS as COUNTED
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Camera
 from bevviz.model.results import FrameResult, Objects, Opinion
@@ -36,6 +35,7 @@ from bevviz.recording.primitives import (
     transform,
 )
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import OPINION_COLORS, SERIES_COLORS, Color, StateColor, class_color
 
 SHARED_OBJECT_BRIGHTNESS = 0.65  # factor on the class colour of objects that both methods have
 MISSED = "missed"

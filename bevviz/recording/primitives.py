@@ -12,13 +12,13 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.model import geometry
-from bevviz.model.colors import palette, turbo
 from bevviz.model.frame import F32, F64, U8, Boxes3D, Camera, Image
 from bevviz.model.results import ClusterState, DetectionState, Explanation
 from bevviz.recording import entities
 from bevviz.recording.entities import ClassId
 from bevviz.recording.writer import Writer
 from bevviz.stages.visibility import image_points
+from bevviz.support.colors import CONTEXT, FAINT, GROUND, UNNAMED, turbo
 from bevviz.support.kernel import kernel
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
@@ -162,8 +162,6 @@ def rounded(points: F32, scale: float) -> F32:
 
 # --- class ids ---------------------------------------------------------------------------------
 
-FAINT_COLOR = (150, 150, 160, 110)
-
 
 def log_world(to: Writer) -> None:
     """Log the axes of the fixed frame, and the names and colours of class ids. Both are static."""
@@ -174,17 +172,16 @@ def class_annotations() -> rr.AnnotationContext:
     """Return the names and colours of the class ids of points and boxes."""
     classes: list[tuple[int, str, tuple[int, ...]]] = [
         (entities.DETECTION_CLASS[DetectionState.KEPT], "kept", (255, 255, 255)),
-        (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT_COLOR),
-        (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", FAINT_COLOR),
-        (entities.CLUSTER_CLASS[ClusterState.TOO_SMALL], "too small", (120, 120, 130)),
-        (entities.CLUSTER_CLASS[ClusterState.TOO_LARGE], "too large", (140, 100, 100)),
+        (entities.DETECTION_CLASS[DetectionState.BELOW_THRESHOLD], "below threshold", FAINT),
+        (entities.DETECTION_CLASS[DetectionState.SUPPRESSED], "suppressed", FAINT),
+        (entities.CLUSTER_CLASS[ClusterState.TOO_SMALL], "too small", UNNAMED),
+        (entities.CLUSTER_CLASS[ClusterState.TOO_LARGE], "too large", UNNAMED),
     ]
-    colors = palette(entities.TRACK_COLORS).tolist()
     return rr.AnnotationContext(
         [
             *point_classes(),
             *(rr.AnnotationInfo(id=i, label=label, color=color) for i, label, color in classes),
-            *(rr.AnnotationInfo(id=ClassId.TRACK + i, color=color) for i, color in enumerate(colors)),
+            *(rr.AnnotationInfo(id=ClassId.TRACK + i, color=UNNAMED) for i in range(entities.TRACK_COLORS)),
         ]
     )
 
@@ -192,9 +189,9 @@ def class_annotations() -> rr.AnnotationContext:
 def point_classes() -> list[rr.AnnotationInfo]:
     """Return the names and colours of the class ids of raw points and voxels."""
     return [
-        rr.AnnotationInfo(id=ClassId.UNCLASSIFIED, color=(130, 130, 140)),
-        rr.AnnotationInfo(id=ClassId.GROUND, label="ground", color=(92, 84, 76)),
-        rr.AnnotationInfo(id=ClassId.OBSTACLE, label="obstacle", color=(170, 175, 190)),
+        rr.AnnotationInfo(id=ClassId.UNCLASSIFIED, color=UNNAMED),
+        rr.AnnotationInfo(id=ClassId.GROUND, label="ground", color=GROUND),
+        rr.AnnotationInfo(id=ClassId.OBSTACLE, label="obstacle", color=CONTEXT),
     ]
 
 

@@ -10,11 +10,11 @@ import rerun as rr
 
 from bevviz import anomalies
 from bevviz.anomalies import KINDS
-from bevviz.model.colors import Color, StateColor
 from bevviz.model.reasons import ReasonKind, kind_of
 from bevviz.model.results import CameraResult, Decision, FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import Color, StateColor
 
 COLORS: Mapping[str, Color] = {
     "ok": StateColor.GOOD.value,

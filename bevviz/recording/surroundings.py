@@ -11,7 +11,6 @@ import numpy as np
 import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.colors import color_rows, turbo
 from bevviz.model.frame import (
     ComponentStatus,
     Frame,
@@ -24,15 +23,16 @@ from bevviz.model.frame import (
 from bevviz.recording import entities
 from bevviz.recording.primitives import transform
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import CONTEXT, StateColor, color_rows, turbo
 
 DIAGNOSTIC_LANES = 40  # lanes for the robot's worst diagnostics
 _WORST = ("error", "stale", "warning", "ok")
 _PARTS = ("points", "strips", "solids", "axes", "grid", "surface", "fix", "picture")
 _TYPES = {".dae": "model/vnd.collada+xml"}  # media types that Rerun does not guess from the file name
-_AXES = {"x": (225, 75, 60), "y": (110, 190, 90), "z": (86, 150, 233)}
+_AXES = {"x": StateColor.BAD.value, "y": StateColor.DOUBTFUL.value, "z": StateColor.GOOD.value}
 
 StaticData: TypeAlias = Sequence[rr.AsComponents]
-_COLOR = (120, 200, 255)
+_COLOR = CONTEXT
 
 
 def log_shapes(to: Writer, frame: Frame) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bevviz.model.colors import class_color, color_rows, turbo
 from bevviz.model.frame import U8, Bool
 from bevviz.model.results import Bev, CameraResult, Decision
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
+from bevviz.support.colors import class_color, color_rows, turbo
 
 Series = Sequence[tuple[float, float]]  # (x, y) pairs
 

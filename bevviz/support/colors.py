@@ -1,4 +1,8 @@
-"""Colours that stay the same from frame to frame: for classes by name, for ids by number."""
+"""The palette of all layouts, recordings and pages, and the meaning of each colour.
+
+Context is grey: ground, points, clusters without a name, tracks. A class has one hue. Any two
+states differ by at least 20 (CIEDE2000), also for people without green cones.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.model.frame import F32, U8
+F32: TypeAlias = NDArray[np.float32]
+U8: TypeAlias = NDArray[np.uint8]
 
 Color: TypeAlias = tuple[int, int, int]
 
@@ -34,31 +39,37 @@ CLASS_COLORS: dict[str, Color] = {
 class StateColor(Enum):
     """Colour of each state that a result can have."""
 
-    GOOD = (86, 180, 233)
-    DOUBTFUL = (255, 200, 50)
-    BAD = (225, 75, 60)
-    OTHER = (170, 90, 160)  # neither good nor bad: taken by another detection, or another class
-    UNKNOWN = (120, 125, 135)
+    GOOD = (50, 140, 235)
+    DOUBTFUL = (255, 205, 70)  # false, degraded, contradicted
+    BAD = (225, 60, 55)  # missed, failed
+    OTHER = (130, 45, 90)  # neither good nor bad: taken by another detection, or another class
+    SUBJECT = (255, 255, 255)  # the object that the user asked about
+    UNKNOWN = (130, 135, 145)
 
+
+GROUND: Color = (78, 80, 86)
+UNNAMED: Color = (112, 116, 126)  # clusters without a name, tracks, detections without a match
+CONTEXT: Color = (150, 154, 164)  # obstacle points
+FAINT = (*CONTEXT, 110)
 
 # Colours of the comparison with ground truth, of the two sides of a comparison, of opinions on an object, and
 # of the stages at which points are lost.
 TRUTH_COLORS: dict[str, Color] = {
     "true": StateColor.GOOD.value,
-    "missed": StateColor.DOUBTFUL.value,
-    "false": StateColor.BAD.value,
+    "missed": StateColor.BAD.value,
+    "false": StateColor.DOUBTFUL.value,
 }
 SIDE_COLORS: dict[str, Color] = {
-    "same": (125, 135, 140),
-    "moved": (240, 228, 66),
-    "class": (214, 120, 190),
-    "only A": (230, 110, 30),
-    "only B": (70, 170, 240),
+    "same": StateColor.UNKNOWN.value,
+    "moved": (255, 230, 90),
+    "class": (115, 110, 45),
+    "only A": (90, 230, 255),
+    "only B": StateColor.GOOD.value,
 }
 OPINION_COLORS: dict[str, Color] = {
-    "contradicted": StateColor.BAD.value,
+    "contradicted": StateColor.DOUBTFUL.value,
     "named otherwise": StateColor.OTHER.value,
-    "missed": StateColor.DOUBTFUL.value,
+    "missed": StateColor.BAD.value,
     "confirmed": StateColor.GOOD.value,
     "unseen": StateColor.UNKNOWN.value,
 }
@@ -79,6 +90,14 @@ SERIES_COLORS: tuple[Color, ...] = (
     *((63, 144, 218), (255, 169, 14), (205, 40, 15), (148, 164, 162), (150, 70, 205)),
     *((169, 107, 89), (231, 99, 0), (185, 172, 112), (113, 117, 129), (146, 218, 221)),
 )
+
+
+def css_properties() -> str:
+    """Return the palette as custom properties of CSS: ``--bad``, ``--doubtful`` and so on, and ``--s0``."""
+    colors = {state.name.lower(): state.value for state in StateColor}
+    colors |= {f"s{number}": color for number, color in enumerate(SERIES_COLORS)}
+    lines = [f"--{name}: rgb{color};" for name, color in colors.items()]
+    return f":root {{ {' '.join(lines)} }}\n"
 
 
 @lru_cache(maxsize=4)

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from bevviz.support.colors import css_properties
 from bevviz.support.text import printable
 
 
@@ -34,6 +35,7 @@ def template_environment() -> Environment:
         lstrip_blocks=True,
         finalize=_visible,
     )
+    templates.globals["palette"] = css_properties()
     templates.filters["base64"] = _base64
     templates.filters["words"] = _words
     return templates

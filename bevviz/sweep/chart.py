@@ -12,9 +12,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.model.colors import SERIES_COLORS, Color, StateColor
 from bevviz.model.frame import F64, U8
 from bevviz.recording.primitives import png
+from bevviz.support.colors import SERIES_COLORS, Color, StateColor
 
 Log = Callable[..., None]  # name of the entity below the chart, archetypes
 

@@ -9,12 +9,12 @@ import rerun as rr
 
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.colors import FATE_COLORS
 from bevviz.model.frame import F32, U8, Camera, Frame
 from bevviz.recording import entities
 from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
 from bevviz.recording.primitives import boxes2d, document, edges, transform
 from bevviz.recording.writer import Writer
+from bevviz.support.colors import FATE_COLORS, StateColor
 from bevviz.why.answer import Answer
 from bevviz.why.answer_text import markdown_page
 from bevviz.why.frame_index import Fate
@@ -36,7 +36,7 @@ NAMES = {
     Fate.REPORTED: "in an object",
     Fate.IN_FRONT: "in front of it",
 }
-_SUBJECT = (255, 60, 200)
+_SUBJECT = StateColor.SUBJECT.value
 _LINE = 0.35  # metres between the lines of the legend
 _DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 

@@ -18,17 +18,17 @@ from bevviz.recording.labels import choose_named_in_3d
 from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, transform
 from bevviz.recording.writer import Writer
 from bevviz.stages.robot_results import in_points_frame
+from bevviz.support.colors import Color, StateColor
 from bevviz.why.frame_index import joined_boxes
 from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.findings import Finding
 
-Color = tuple[int, int, int]
 FindingRows: TypeAlias = Mapping[str, Sequence[Finding]]  # findings of an entity, one per logged row
 
 LAYERS = {
-    "missed": (entities.MISSED, (255, 80, 70)),
-    "false": (entities.FALSE, (240, 165, 50)),
-    "unnamed": (entities.UNNAMED, (250, 120, 190)),
+    "missed": (entities.MISSED, StateColor.BAD.value),
+    "false": (entities.FALSE, StateColor.DOUBTFUL.value),
+    "unnamed": (entities.UNNAMED, StateColor.UNKNOWN.value),
 }
 
 

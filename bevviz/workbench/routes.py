@@ -18,6 +18,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError
+from bevviz.support.colors import css_properties
 from bevviz.workbench.access import Guard, cookie_name
 from bevviz.workbench.buffers import PageState
 from bevviz.workbench.page_connection import PageConnection, news_event
@@ -83,7 +84,11 @@ class Site:
 
     async def file(self, request: Request) -> Response:
         """Return a script or style sheet of the page."""
-        return _file(PAGE, FILES, request.path_params["name"], "no-cache")
+        name = request.path_params["name"]
+        if name == "page.css":
+            text = css_properties() + (PAGE / name).read_text()
+            return Response(text, media_type=KINDS[".css"], headers={"Cache-Control": "no-cache"})
+        return _file(PAGE, FILES, name, "no-cache")
 
     async def viewer(self, request: Request) -> Response:
         """Return a file of Rerun's web viewer."""
