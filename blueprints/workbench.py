@@ -10,11 +10,13 @@ from bevviz.recording import entities, views
 
 def blueprint(scene: Scene) -> rrb.Blueprint:
     """Return the layout."""
-    side: list[rrb.Container | rrb.View] = [views.cameras(scene, why=True)] if scene.cameras else []
+    side: list[rrb.Container | rrb.View] = (
+        [views.cameras(scene, why=True, weak=True)] if scene.cameras else []
+    )
     beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.spaces(scene, frustums=False, beside=beside),
+            views.spaces(scene, beside=beside),
             rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4],
         ),

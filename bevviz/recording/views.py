@@ -25,7 +25,7 @@ def space(
     scene: Scene,
     *,
     raw: bool = True,
-    frustums: bool = True,
+    frustums: bool = False,
     why: bool = False,
     names: bool = True,
     name: str = "3D",
@@ -35,7 +35,7 @@ def space(
 ) -> rrb.Spatial3DView:
     """Return a 3D view of points, boxes, frustums and poses, seen from behind and above the robot.
 
-    The origin is the LiDAR, so the robot stays in place and the world moves. The occupancy grid on the ground
+    The origin is the LiDAR, so the robot stays in place and the world moves. Frustums, the occupancy grid
     and tracks without an object are hidden; the user can switch them on.
 
     Args:
@@ -103,11 +103,11 @@ def _eye_near(target: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return an eye position a few metres from a target: on the robot's side, to the left and above."""
     x, y, z = target
     distance = max(math.hypot(x, y), 1e-6)
-    offset = min(distance, 6.0)
+    offset = min(distance, 10.0)
     return (
         x - offset * x / distance - 2.0 * y / distance,
         y - offset * y / distance + 2.0 * x / distance,
-        z + 2.5,
+        z + 4.0,
     )
 
 
@@ -117,12 +117,12 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
     Args:
         scene: names of the sensors.
         name: name of the camera.
-        why: show weak detections and the explanation of ``bevviz why`` instead of points and names.
+        why: show the explanation of ``bevviz why`` instead of points and names.
         weak: show weak detections too.
     """
     contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
     points_and_names = [entities.projected(name), entities.names(entities.detections(name))]
-    hidden = points_and_names if why else [] if weak else [entities.weak(name)]
+    hidden = [*(points_and_names if why else []), *([] if weak else [entities.weak(name)])]
     return rrb.Spatial2DView(
         name=name,
         origin=entities.sensor(name),
@@ -131,9 +131,9 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
     )
 
 
-def cameras(scene: Scene, *, why: bool = False) -> rrb.Container | rrb.View:
+def cameras(scene: Scene, *, why: bool = False, weak: bool = False) -> rrb.Container | rrb.View:
     """Return the views of all cameras, in tabs if there are more than two."""
-    views = [camera(scene, name, why=why) for name in scene.cameras]
+    views = [camera(scene, name, why=why, weak=weak) for name in scene.cameras]
     if len(views) == 1:
         return views[0]
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
