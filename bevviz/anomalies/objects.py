@@ -282,8 +282,7 @@ def _expected_visibility(result: FrameResult, tracks: Tracks) -> _Visibility:
         whole[asked] |= share >= INSIDE
         detections = camera.detections
         near = geometry.iou(xyxy, detections.xyxy) >= SAME
-        same = np.array([[name == tracks.names[t] for name in detections.names] for t in asked], bool)
-        same = same.reshape(len(asked), len(detections))
+        same = np.array(tracks.names, str)[asked, None] == np.array(detections.names, str)
         detected[asked] |= (near & (same | detections.kept)).any(axis=1)
     return _Visibility(boxes, open_, whole, detected)
 
