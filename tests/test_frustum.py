@@ -123,6 +123,24 @@ def test_a_car_from_behind_goes_on_where_it_was_not_seen() -> None:
     assert claims.seen[0].tolist() == [i == back for i in range(4)], "its rear and nothing else was seen"
 
 
+def test_a_box_too_narrow_for_a_car_gets_all_of_it() -> None:
+    whole = car(9, -3.5, 0.1)
+    box = silhouette(whole)
+    box[0] += 0.6 * (box[2] - box[0])  # the detector has missed most of the car's side
+    after, claims, _ = outcome(whole, detections_of([box], names="car"))
+    assert (after.labels == claims.cluster[0]).all()
+    np.testing.assert_allclose(claims.boxes.center[0, :2], [9, -3.5], atol=0.1)
+    assert abs(math.sin(float(claims.boxes.yaw[0]) - 0.1)) < 0.05
+
+
+def test_a_post_taller_than_the_box_is_no_car() -> None:
+    hidden = car(24, 0, math.pi / 2)
+    sign = slab(15, 0.3, 0.2, 1.4, 3.0)  # from the ground to 1.7 m above the camera
+    shown = hidden[np.abs(hidden[:, 1] - 0.5) > 1.2]
+    _, claims, _ = outcome(np.concatenate([shown, sign]), detections_of([silhouette(hidden)], names="car"))
+    np.testing.assert_allclose(claims.boxes.center[0, :2], [24, 0], atol=0.5)
+
+
 def test_what_cannot_be_a_person_is_refused_with_the_reason() -> None:
     wall = slab(40, 0, 3, 12, 14, 0.2)  # fills the image box of somebody at 10 m
     box = silhouette(slab(10, 0, -0.7, 0.6, 1.75))

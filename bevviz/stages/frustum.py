@@ -24,7 +24,15 @@ from bevviz.stages.box_fit import NO_EDGE
 from bevviz.stages.cells import sort_by
 from bevviz.stages.cluster_relabel import ClaimedPoints, relabel_claimed
 from bevviz.stages.clustering import MIN_SIZE
-from bevviz.stages.frustum_points import MARGIN, choose_candidate, cluster_remainder, fit_from, points_inside
+from bevviz.stages.frustum_points import (
+    MARGIN,
+    TIGHT_SHARE,
+    choose_candidate,
+    cluster_remainder,
+    fit_from,
+    points_inside,
+    share_inside,
+)
 from bevviz.stages.mask_lookup import is_covered
 
 EDGE_PIXELS = 2.0  # pixels, one sigma of the edges of an image box,
@@ -42,6 +50,7 @@ BEHIND = 0.05  # metres from the median of such an object's points to its centre
 BORDER = 2.0  # pixels: a box nearer to the image border than this is cut off by it
 SAME_OBJECT_IOU = 0.7  # above it boxes of two classes show one object, because NMS works by class
 MIN_CLUSTER_SHARE = 0.1  # share of an object's points above which a cluster counts as a part of the object
+WHOLE_SHARE = 0.95  # share of an object's clusters in one box of its class above which they are the object
 UNAVAILABLE = -2  # value of ``taker`` for a point that no detection may claim
 
 
@@ -65,10 +74,12 @@ def claim_clusters(
     ``overlap`` is the part of the image box that the candidate's outline covers. ``t(height)`` is the
     agreement of the box's height in metres at the candidate's distance with that of the class. It is
     Student's t, lenient with lower heights because the object may be partly hidden. ``share`` is the share of
-    the connected points that are in the box. The best rated detection of all claims its points. Other
-    detections that wanted these points search again. This is repeated until none is left. Then
-    ``box_fit.fit`` fits a box of the class's size to the candidate, and the detection claims the points in
-    it. This joins parts that an occluder separated, and drops points that stand too near.
+    the connected points, beside and above the box too, that are in the box. The best rated detection of all
+    claims its points. Other detections that wanted these points search again. This is repeated until none is
+    left. Then ``box_fit.fit`` fits a box of the class's size to the candidate, and the detection claims the
+    points in it. This joins parts that an occluder separated, and drops points that stand too near. If a box
+    of the class holds the candidate's clusters whole, the detection claims them even where its image box is
+    too narrow. Otherwise one face of a car, seen alone, would not tell its heading.
 
     For a detection with a mask (``fusion.masks``) only points under the mask are in the frustum. The other
     points in the box are ignored. A mask with too few points is ignored.
@@ -319,7 +330,7 @@ class _CameraFrustums:
         if not grow:
             return rows, *self._upright_box(rows, self._fit(d, rows, candidate.depth))
         # The object's clusters may continue beyond the image border that cuts the box, and beside a tight
-        # box.
+        # box. If one box of the class holds them, they are the object, however narrow the image box is.
         counts = np.bincount(work.clusters.labels[rows] + 1)
         free_rows = [
             work.free_of(k) for k in np.flatnonzero(counts[1:] > MIN_CLUSTER_SHARE * len(rows)).tolist()
@@ -331,7 +342,11 @@ class _CameraFrustums:
             away = work.points[beyond, :2] - work.points[rows, :2].mean(axis=0)
             long = np.nan_to_num(self._sizes[d][:, 0].max(), nan=candidate.depth * self._wide[d])
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
-        flat = self._fit(d, rows, candidate.depth).flat
+        flat, is_whole = self._fit(d, rows, candidate.depth).flat, False
+        if len(kin) > len(rows) and self._sizes[d][:, 0].max() >= NO_SIDES:
+            whole = self._fit(d, kin, candidate.depth).flat
+            is_whole = share_inside(work.points, kin, whole) >= WHOLE_SHARE
+            flat = whole if is_whole else flat
         inside = points_inside(
             work.points,
             self._uv,
@@ -341,7 +356,8 @@ class _CameraFrustums:
             work.owner,
             self._boxes[d],
             flat,
-            cut.any(),
+            np.inf if is_whole else TIGHT_SHARE,
+            is_whole or cut.any(),
         )
         rows = inside if len(inside) >= work.fewest else candidate.rows
         fitted = self._fit(d, rows, candidate.depth, about=flat[4])

@@ -13,6 +13,7 @@ from bevviz.support.kernel import kernel
 MARGIN = 0.05  # share of a box's width that is searched on either side of it
 TIGHT_SHARE = 0.15  # share of a box's sides by which the box may be too tight
 AROUND_SHARE = 0.5  # share of a box's width on either side in which points show that an object continues
+ABOVE_SHARE = 1.0  # the same of its height above it: a post or a hedge is taller than the object in the box
 STUDENT_FREEDOM = 4.0  # degrees of freedom of Student's t for the deviation of a height from its class
 DEPTH_STEPS = 8  # a window in depth moves by its length divided by this
 OWN_MARGIN = 0.1  # metres around a fitted box in which a point still belongs to it
@@ -60,12 +61,13 @@ def choose_candidate(
         The rows of the candidate's points, its rating without the score, and the distance of its front.
     """
     margin, around = MARGIN * (box[2] - box[0]), AROUND_SHARE * (box[2] - box[0])
+    above = ABOVE_SHARE * (box[3] - box[1])
     near = np.empty(len(seen), np.int64)
     n = 0
     for i in seen:
         near[n] = i
         beside = box[0] - around <= uv[i, 0] <= box[2] + around
-        n += beside and box[1] <= uv[i, 1] <= box[3] and taker[i] == -1
+        n += beside and box[1] - above <= uv[i, 1] <= box[3] and taker[i] == -1
     near = near[:n]
     inside, far = np.empty(n, np.bool_), np.empty(n)
     xy = np.empty((n, 2))
@@ -73,7 +75,7 @@ def choose_candidate(
     for i in range(n):
         xy[i, 0], xy[i, 1] = points[near[i], 0] - place[0], points[near[i], 1] - place[1]
         far[i] = math.hypot(xy[i, 0], xy[i, 1])
-        inside[i] = box[0] - margin <= uv[near[i], 0] <= box[2] + margin
+        inside[i] = box[0] - margin <= uv[near[i], 0] <= box[2] + margin and box[1] <= uv[near[i], 1]
         if inside[i]:
             low_x, high_x = min(low_x, xy[i, 0]), max(high_x, xy[i, 0])
             low_y, high_y = min(low_y, xy[i, 1]), max(high_y, xy[i, 1])
@@ -188,6 +190,15 @@ def _within(points: F32, i: int, flat: F64, skin: float) -> bool:
 
 
 @kernel
+def share_inside(points: F32, rows: I64, flat: F64) -> float:
+    """Return the share of these points that a box seen from above holds."""
+    n = 0
+    for i in rows:
+        n += _within(points, i, flat, OWN_MARGIN)
+    return n / len(rows)
+
+
+@kernel
 def points_inside(
     points: F32,
     uv: F32,
@@ -197,6 +208,7 @@ def points_inside(
     owner: I64,
     box: F64,
     flat: F64,
+    tight: float,
     unseen: bool,
 ) -> I64:
     """Return the free points in an object's box.
@@ -212,13 +224,11 @@ def points_inside(
         owner: (P,) -1 for a point that no detection of any camera has.
         box: (4,) image box.
         flat: (5,) centre, length, width and heading of the object's box.
+        tight: share of the image box's width by which it may be too tight for its clusters.
         unseen: whether points of its clusters outside the image count, too.
     """
-    margin, across, along = (
-        MARGIN * (box[2] - box[0]),
-        TIGHT_SHARE * (box[2] - box[0]),
-        TIGHT_SHARE * (box[3] - box[1]),
-    )
+    margin, across = MARGIN * (box[2] - box[0]), tight * (box[2] - box[0])
+    along = TIGHT_SHARE * (box[3] - box[1])
     inside = np.empty(len(seen) + len(kin), np.int64)
     known = np.zeros(len(points), np.bool_)
     n = 0
