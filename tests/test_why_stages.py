@@ -102,7 +102,7 @@ def test_losses_of_a_user_clustering_name_it(here: Path) -> None:
 
 def test_a_hint_may_be_a_parameter_of_a_user_stage(here: Path) -> None:
     """Of ours only those that still have a say."""
-    theirs = ("clustering.method=somebody:cells", "clustering.cell=0.3")
+    theirs = ("clustering.method=somebody:cells", "clustering.cell=1.5")
     result = Session(load(settings=["detector.model=demo", *theirs])).run(frame())
     questioner = FrameExplainer(result, classes=CLASSES)
     hints = [hint for answer in questioner.missed() for hint in questioner.search(answer).hints]
