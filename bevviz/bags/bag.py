@@ -19,9 +19,9 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores
 
 from bevviz.bags import mcap
-from bevviz.bags.file_types import find_saved_bag, open_file
+from bevviz.bags.file_types import BagFile, find_saved_bag, open_file
 from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1
-from bevviz.bags.reader import BagFile, normalized
+from bevviz.bags.reader import normalized
 from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
@@ -432,7 +432,7 @@ class Recording(Closable):
         if dataset is None:
             return False
         reader = DatasetReader(dataset)
-        self.files.append(BagFile(folder, dataset.about, lambda: reader, lambda: reader))
+        self.files.append(BagFile(folder, dataset.about, lambda: reader))
         self.single_frames |= dataset.single_frames
         self.is_dataset = True
         self._aside |= reader.aside

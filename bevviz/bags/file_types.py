@@ -3,62 +3,64 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from backports import zstd
+from rosbags.interfaces import Connection
 
-from bevviz.bags import mcap, ros1
-from bevviz.bags.chunks import ChunkFormat, ChunkReader, rescue_chunks
-from bevviz.bags.reader import PIECE, ZSTD, BagFile, FileBytes, Reader, SoundReader, megabytes
-from bevviz.bags.rescue import mcap as mcap_rescue
-from bevviz.bags.rescue import sqlite_pages
-from bevviz.bags.rescue.sqlite import SqliteRescuer
-from bevviz.bags.sqlite import SoundSqlite
+from bevviz.bags import mcap, ros1, sqlite
+from bevviz.bags.chunks import ChunkReader
+from bevviz.bags.reader import (
+    LAST_TIME,
+    PIECE,
+    ZSTD,
+    DamageError,
+    FileBytes,
+    Message,
+    Reader,
+    UnindexedError,
+    megabytes,
+)
+from bevviz.bags.rescue import rescue
+from bevviz.bags.rescue.report import RescuedReader
+from bevviz.bags.sqlite import SqliteReader
 from bevviz.datasets.cloud_files import CLOUDS
 from bevviz.datasets.dataset import IMAGES, UNREAD
 from bevviz.errors import UserError
+from bevviz.model.frame import I64
 from bevviz.support import progress
 from bevviz.support.files import LFS_HINT, LFS_POINTER
+from bevviz.support.loggers import logger
 from bevviz.support.scratch_folder import ScratchFolder
+
+_log = logger(__name__)
 
 ZSTD_FRAME = re.compile(re.escape(ZSTD))
 
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """One file format and its readers.
+    """One file format and its reader.
 
     Attributes:
         name: name for messages to the user.
         magic: first bytes of a file.
-        suffix: file suffix by which rosbags knows the format.
+        suffix: usual file suffix, by which rosbags knows the format.
         sound: opens a sound file. Its second argument is the same file under a name with that suffix.
-        rescue: opens a damaged file.
     """
 
     name: str
     magic: bytes
     suffix: str
-    sound: Callable[[Path, Path], SoundReader]
-    rescue: Callable[[Path], Reader]
+    sound: Callable[[Path, Path], Reader]
 
 
-def _chunked_format(name: str, magic: bytes, suffix: str, form: ChunkFormat) -> FileFormat:
-    return FileFormat(
-        name,
-        magic,
-        suffix,
-        lambda path, public: ChunkReader(path, form, public),
-        lambda path: rescue_chunks(path, form),
-    )
-
-
-SQLITE = FileFormat("sqlite3", sqlite_pages.MAGIC, ".db3", SoundSqlite, SqliteRescuer)
+SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader)
 FORMATS = (
-    _chunked_format("MCAP", mcap.MAGIC, ".mcap", mcap_rescue.FORM),
-    _chunked_format("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
+    FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path, _: ChunkReader(path, mcap.FORM)),
+    FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path, _: ChunkReader(path, ros1.FORM)),
     SQLITE,
 )
 HEAD_SIZE = 16  # bytes read to recognise a format
@@ -72,6 +74,129 @@ OTHER_FORMATS = {
     LFS_POINTER[:HEAD_SIZE]: LFS_HINT,
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
+
+
+class BagFile:
+    """One bag file. At the first damage its reader is replaced by that of ``rescue``.
+
+    Args:
+        path: file.
+        form: name of the format.
+        sound: opens the reader of a sound file. Raises DamageError.
+        magic: first bytes of the format, see ``rescue``. Empty: no file that could be damaged.
+
+    Attributes:
+        rescued: reader of the damaged file; None: no damage met yet.
+
+    Raises:
+        UserError: nothing of the file is left.
+    """
+
+    def __init__(self, path: Path, form: str, sound: Callable[[], Reader], magic: bytes = b"") -> None:
+        self.path, self.format, self._magic = path, form, magic
+        self.rescued: RescuedReader | None = None
+        self._notes: list[str] = []
+        self._opened: list[Reader] = []
+        self._reader: Reader
+        try:
+            self._reader = sound()
+            self._opened.append(self._reader)
+        except DamageError as error:
+            self._reader = self._rescue_after(error)
+
+    @property
+    def connections(self) -> Sequence[Connection]:
+        """Connections of the file with their message counts."""
+        return self._reader.connections
+
+    @property
+    def compression(self) -> str:
+        """Names of the compressions of the file; empty without compression."""
+        return self._reader.compression
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
+        return self._reader.span
+
+    @property
+    def warnings(self) -> list[str]:
+        """Missing or damaged data met so far, with the file name."""
+        return [f"{self.path.name}: {note}" for note in (*self._notes, *self._reader.warnings)]
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
+    ) -> Iterator[Message]:
+        """Yield messages of ``connections`` with start <= log time < stop, in order of log time."""
+        known = {c.id: c for c in connections}
+        low = max(0, start or 0)
+        high = LAST_TIME if stop is None else min(stop, LAST_TIME)
+        reader = self._reader
+        if reader is self.rescued:
+            for connection, time, data in reader.messages(known, low, high):
+                yield known[connection.id], time, data
+            return
+        yielded, time_sum, latest = 0, 0, low
+        at_latest: list[tuple[int, bytes | memoryview]] = []  # yielded messages of the latest log time
+        resume = low  # log time at which the reader of the damaged file begins
+        try:
+            for connection, time, data in reader.messages(known, low, high):
+                if time != latest:
+                    latest = resume = time
+                    at_latest.clear()
+                at_latest.append((connection.id, data))
+                yielded += 1
+                time_sum += time
+                yield known[connection.id], time, data
+            latest, resume = LAST_TIME, low  # All messages that the index knows are yielded.
+            _check_times(reader.times(known, low, high), yielded, time_sum)
+        except DamageError as error:
+            rescued = self._rescue_after(error)
+            for connection, time, data in rescued.messages(known, resume, high):
+                if time == latest and (connection.id, data) in at_latest:
+                    at_latest.remove((connection.id, data))
+                elif time >= latest:
+                    yielded += 1
+                    yield known[connection.id], time, data
+            if (late := len(rescued.times(known, low, high)) - yielded) > 0:
+                self._notes.append(f"{late} message(s) were found too late to be given in order of time")
+
+    def times(self, connections: Collection[Connection]) -> I64:
+        """Return the sorted log times of all messages of ``connections``. Their data is not read."""
+        ids = [c.id for c in connections]
+        try:
+            return self._reader.times(ids)
+        except DamageError as error:
+            return self._rescue_after(error).times(ids)
+
+    def close(self) -> None:
+        """Close the file."""
+        for reader in self._opened:
+            reader.close()
+
+    def _rescue_after(self, error: DamageError) -> RescuedReader:
+        """Open the damaged file. Messages that are being read from the former reader still come from it."""
+        if self.rescued is None:
+            _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
+            is_whole = isinstance(error, UnindexedError)
+            how = "it is read from end to end" if is_whole else "what is there was rescued"
+            self._notes.append(f"{error}: {how}")
+            self._reader = self.rescued = rescue(self.path, self._magic)
+            self._opened.append(self.rescued)
+        return self.rescued
+
+
+def _check_times(listed: I64, count: int, time_sum: int) -> None:
+    """Compare the times that an index lists with the count and the time sum of the messages.
+
+    Raises:
+        DamageError: they differ.
+    """
+    if len(listed) != count:
+        raise DamageError(f"its index lists {len(listed)} messages where {count} are")
+    # The sum of 64-bit times would overflow an int64; the sums of their halves do not.
+    if (int((listed >> 32).sum()) << 32) + int((listed & 0xFFFFFFFF).sum()) != time_sum:
+        raise DamageError("its index has other times than its messages")
 
 
 def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> BagFile:
@@ -99,7 +224,7 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
     problem = next((text for magic, text in OTHER_FORMATS.items() if head.startswith(magic)), None)
     # The first bytes may be damaged. All messages of a database may still lie in its log.
     kind = next((kind for kind in FORMATS if path.suffix == kind.suffix), None)
-    if not head and not (kind is SQLITE and sqlite_pages.log_path(path).exists()):
+    if not head and not (kind is SQLITE and sqlite.log_path(path).exists()):
         raise UserError(f"{path}: the file is empty")
     if kind and not problem:
         opened = _open_as(kind, path, scratch)
@@ -120,7 +245,7 @@ def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
     if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
         public.symlink_to(path.resolve())
-    return BagFile(path, kind.name, lambda: kind.sound(path, public), lambda: kind.rescue(path))
+    return BagFile(path, kind.name, lambda: kind.sound(path, public), kind.magic)
 
 
 def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> Path:

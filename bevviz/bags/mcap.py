@@ -5,21 +5,25 @@ from __future__ import annotations
 import struct
 from binascii import crc32
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Qos,
+)
+from rosbags.rosbag2.metadata import parse_qos
 
-from bevviz.bags.chunks import Chunk, FileIndex
-from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, unpack
+from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, as_damage
 from bevviz.model.frame import I64
-from bevviz.support.loggers import logger
-
-_log = logger(__name__)
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
@@ -46,7 +50,7 @@ class Channels:
 
     def __init__(self) -> None:
         self.schemas: dict[int, tuple[str, MessageDefinition]] = {}
-        self._channels: dict[int, tuple[int, str, str]] = {}
+        self._channels: dict[int, tuple[int, str, str, bytes]] = {}  # schema, topic, encoding, metadata
 
     def __contains__(self, channel: object) -> bool:
         return channel in self._channels
@@ -68,34 +72,28 @@ class Channels:
             self.schemas.setdefault(number, (msgtype.decode(errors="replace"), definition))
         elif opcode == CHANNEL:
             number, schema = struct.unpack_from("<HH", record)
-            topic, form = (text.decode(errors="replace") for text in read_strings(record, 4, 2))
-            self._channels.setdefault(number, (schema, topic, form))
+            topic, form, metadata = read_strings(record, 4, 3)
+            names = topic.decode(errors="replace"), form.decode(errors="replace")
+            self._channels.setdefault(number, (schema, *names, metadata))
 
-    def correct(self, others: Channels) -> dict[int, str]:
-        """Use the descriptions of ``others`` where they differ. Return the former topics by channel."""
-        known = self._channels.keys() & others._channels.keys()
-        before = {number: (self._channels[number][1], self._description(number)) for number in known}
-        self.schemas |= others.schemas
-        self._channels |= {number: others._channels[number] for number in known}
-        return {
-            number: topic
-            for number, (topic, description) in before.items()
-            if self._description(number) != description
-        }
-
-    def _description(self, number: int) -> tuple[object, ...]:
-        schema, topic, encoding = self._channels[number]
-        return topic, encoding, self.schemas.get(schema)
+    def described(self, number: int) -> tuple[object, ...]:
+        """Return everything that the records say about a channel."""
+        schema, *others = self._channels.get(number, (0,))
+        return self.schemas.get(schema), *others[:2]
 
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
         connections = []
-        for number, (schema, topic, encoding) in self._channels.items():
+        for number, (schema, topic, encoding, metadata) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
-            extra = ConnectionExtRosbag2(encoding, [])
-            connections.append(
-                Connection(number, topic, msgtype, definition, "", counts.get(number, 0), extra, None)
-            )
+            digest, profiles = "", list[Qos]()
+            with suppress(DamageError), as_damage():
+                stated = read_metadata(metadata)
+                digest = stated.get("topic_type_hash", "")
+                profiles = parse_qos(stated.get("offered_qos_profiles", ""))
+            extra = ConnectionExtRosbag2(encoding, profiles)
+            count = counts.get(number, 0)
+            connections.append(Connection(number, topic, msgtype, definition, digest, count, extra, None))
         return connections
 
 
@@ -125,7 +123,7 @@ def read_index(path: Path) -> FileIndex:
         channels = Channels()
         index = _parse_summary(summary[: end - start], start, channels)
         if not crc:
-            _correct_channels(file, index, channels)
+            _check_channels(file, index, channels)
         for chunk in index.chunks[-1:]:  # If bytes are missing or inserted, at least the last chunk is moved.
             at = chunk.data - RECORD.size - CHUNK_HEAD.size - len(chunk.compression) - 8
             length = CHUNK_HEAD.size + len(chunk.compression) + 8 + chunk.packed
@@ -169,24 +167,30 @@ def read_attachments(path: Path) -> dict[str, bytes]:
         file.close()
 
 
-def _correct_channels(file: FileBytes, index: FileIndex, channels: Channels) -> None:
-    """Correct channel descriptions by the data if the summary has no checksum.
+def _check_channels(file: FileBytes, index: FileIndex, channels: Channels) -> None:
+    """Compare channel descriptions with the data if the summary has no checksum.
 
     Reading all data takes too long. A writer describes a channel at its first message at the latest, so the
-    chunk with this message is enough. That is one chunk of most files and a few of others. A channel without
-    a description in these chunks stays unchanged.
+    chunk with this message is enough. That is one chunk of most files and a few of others.
+
+    Raises:
+        DamageError: the data describes a channel in another way.
     """
     in_data, seen = Channels(), set[int]()
     for chunk in sorted(index.chunks, key=attrgetter("data")):
         if chunk.counts.keys() <= seen:
             continue
         seen |= chunk.counts.keys()
-        content, damage, _ = unpack_chunk(file, chunk)
+        content, damage = chunk.unpack(file)
         if not damage:  # Reading its messages reports the damage.
             _note_all(content, in_data)
-    index.corrected = channels.correct(in_data)
-    if index.corrected:
-        index.connections = channels.connections({c.id: c.msgcount for c in index.connections})
+    wrong = [
+        c.topic
+        for c in index.connections
+        if c.id in in_data and in_data.described(c.id) != channels.described(c.id)
+    ]
+    if wrong:
+        raise DamageError(f"its index describes {', '.join(wrong)} in another way than its data")
 
 
 def _note_all(content: bytes, channels: Channels) -> None:
@@ -199,17 +203,6 @@ def _note_all(content: bytes, channels: Channels) -> None:
         if opcode in (SCHEMA, CHANNEL) and offset <= len(content):
             with suppress(struct.error):
                 channels.note(opcode, content[start:offset])
-
-
-def unpack_chunk(file: FileBytes, chunk: Chunk) -> tuple[bytes, str, bool]:
-    """Return the content of a chunk, its damage, and whether the content fits its checksum."""
-    crc = chunk.crc
-    if crc is None:  # The checksum stands before the content.
-        crc = int.from_bytes(file.read(chunk.data - 16 - len(chunk.compression), 4), "little")
-    packed = file.read(chunk.data, chunk.packed)
-    cut = chunk.cut or len(packed) < chunk.packed
-    data, damage = unpack(chunk.compression, packed, chunk.size, crc, cut=cut)
-    return data, damage, bool(crc) and not (cut or damage)
 
 
 def _parse_summary(summary: bytes, end: int, channels: Channels) -> FileIndex:
@@ -272,9 +265,8 @@ def _parse_chunk_index(record: bytes, end: int) -> Chunk:
         if (count := (after - at - 15) // 16) > 0:
             counts[channel] = count
     data = offset + RECORD.size + CHUNK_HEAD.size + len(name) + 8
-    return Chunk(
-        start, last, data, packed, unpacked, name.decode(), counts, index={c: listed[c] for c in counts}
-    )
+    checksum, index = data - 16 - len(name), {c: listed[c] for c in counts}
+    return Chunk(start, last, data, packed, unpacked, name.decode(), counts, index, checksum)
 
 
 def read_times(file: FileBytes, chunk: Chunk, channel: int) -> I64:
@@ -294,6 +286,21 @@ def read_times(file: FileBytes, chunk: Chunk, channel: int) -> I64:
     return times
 
 
+def parse(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
+    """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
+    messages: list[ChunkMessage] = []
+    offset, size = 0, len(data)
+    while offset + RECORD.size <= size:
+        opcode, length = RECORD.unpack_from(data, offset)
+        body = offset + RECORD.size
+        offset = body + length
+        if opcode == MESSAGE and offset <= size and length >= MESSAGE_HEAD.size:
+            channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
+            if channel in channels and time < LAST_TIME:
+                messages.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
+    return messages, offset == size
+
+
 def read_strings(record: bytes, offset: int, count: int) -> list[bytes]:
     """Parse ``count`` strings, each after its length.
 
@@ -309,3 +316,17 @@ def read_strings(record: bytes, offset: int, count: int) -> list[bytes]:
         values.append(bytes(record[offset : offset + size]))
         offset += size
     return values
+
+
+def read_metadata(record: bytes) -> dict[str, str]:
+    """Parse the pairs of strings of a map."""
+    texts: list[str] = []
+    offset = 0
+    while offset < len(record):
+        (text,) = read_strings(record, offset, 1)
+        texts.append(text.decode())
+        offset += 4 + len(text)
+    return dict(zip(texts[::2], texts[1::2], strict=True))
+
+
+FORM = ChunkFormat(read_index, read_times, parse)

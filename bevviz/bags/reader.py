@@ -1,4 +1,4 @@
-"""Common interface of bag readers. rosbags reads a sound file, a rescuer a damaged one."""
+"""Common interface of bag readers, and the bytes that they read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import apsw
-import rosbags.rosbag1
 import rosbags.rosbag2
 from backports import zstd
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -22,9 +21,6 @@ from rosbags.interfaces import Connection
 
 from bevviz.errors import first_line
 from bevviz.model.frame import I64
-from bevviz.support.loggers import logger
-
-_log = logger(__name__)
 
 Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
@@ -47,7 +43,7 @@ class UnindexedError(DamageError):
 
 # Exceptions of rosbags and its libraries for damaged bytes.
 _DAMAGE: tuple[type[Exception], ...] = (
-    *(rosbags.rosbag1.ReaderError, rosbags.rosbag2.ReaderError, apsw.Error),
+    *(rosbags.rosbag2.ReaderError, apsw.Error),
     *(zstd.ZstdError, EOFError, RuntimeError),  # RuntimeError is lz4's.
     *(OSError, ValueError),  # bz2, text that is not UTF-8, disk errors
     *(struct.error, LookupError, TypeError, AssertionError),  # missing fields, references that lead nowhere
@@ -64,14 +60,11 @@ def as_damage() -> Iterator[None]:
         raise DamageError(f"damaged ({first_line(error)})" if str(error) else "damaged") from error
 
 
-def public_messages(messages: Iterator[Message]) -> Iterator[Message]:
-    """Yield the messages that rosbags reads. Its exceptions on damage become a DamageError."""
-    with as_damage():
-        yield from messages
-
-
 class Reader(Protocol):
-    """Reader of one file. Its ``connections`` have their ``msgcount``."""
+    """Reader of one file. Its ``connections`` have their ``msgcount``.
+
+    Every method of a reader of sound files may raise DamageError.
+    """
 
     @property
     def connections(self) -> Sequence[Connection]:
@@ -97,148 +90,16 @@ class Reader(Protocol):
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         ...
 
-    def times(self, ids: Collection[int]) -> I64:
-        """Return the sorted log times of all messages of the connections ``ids``. Their data is not read."""
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
+        """Return the sorted log times of the connections ``ids`` with start <= time < stop.
+
+        The data of the messages is not read.
+        """
         ...
 
     def close(self) -> None:
         """Close the file."""
         ...
-
-
-class SoundReader(Reader, Protocol):
-    """Reader of an undamaged file. Every method may raise DamageError."""
-
-    def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
-        """Return the number of messages and the sum of their log times, both by the index."""
-        ...
-
-    def rescuer(self) -> Reader:
-        """Return the reader to continue with after damage."""
-        ...
-
-
-class BagFile:
-    """One bag file. At the first damage its sound reader is replaced by a rescuer.
-
-    Args:
-        path: file.
-        form: name of the format.
-        sound: opens the reader of a sound file. Raises DamageError.
-        rescue: opens the reader of a damaged file. Raises UserError if no message is left.
-    """
-
-    def __init__(
-        self, path: Path, form: str, sound: Callable[[], SoundReader], rescue: Callable[[], Reader]
-    ) -> None:
-        self.path, self.format = path, form
-        self._notes: list[str] = []
-        self._sound: SoundReader | None = None
-        self._reader: Reader
-        try:
-            self._reader = self._sound = sound()
-        except DamageError as error:
-            self._note_damage(error)
-            self._reader = rescue()
-
-    @property
-    def connections(self) -> Sequence[Connection]:
-        """Connections of the file with their message counts."""
-        return self._reader.connections
-
-    @property
-    def compression(self) -> str:
-        """Names of the compressions of the file; empty without compression."""
-        return self._reader.compression
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """Log time of the first message, and log time of the last message plus one nanosecond."""
-        return self._reader.span
-
-    @property
-    def warnings(self) -> list[str]:
-        """Missing or damaged data met so far, with the file name."""
-        return [f"{self.path.name}: {note}" for note in (*self._notes, *self._reader.warnings)]
-
-    def messages(
-        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
-    ) -> Iterator[Message]:
-        """Yield messages of ``connections`` with start <= log time < stop, in order of log time."""
-        known = {c.id: c for c in connections}
-        low = max(0, start or 0)
-        high = LAST_TIME if stop is None else min(stop, LAST_TIME)
-        yielded, time_sum, latest = 0, 0, low
-        at_latest: list[tuple[int, bytes | memoryview]] = []  # yielded messages of the latest log time
-        if self._sound is None:
-            for connection, time, data in self._reader.messages(known, low, high):
-                yield known[connection.id], time, data
-            return
-        resume = low  # log time at which the rescuer begins
-        try:
-            for connection, time, data in self._sound.messages(known, low, high):
-                if time != latest:
-                    latest = resume = time
-                    at_latest.clear()
-                at_latest.append((connection.id, data))
-                yielded += 1
-                time_sum += time
-                yield known[connection.id], time, data
-            latest, resume = LAST_TIME, low  # All messages that the index knows are yielded.
-            self._check(known, low, high, (yielded, time_sum))
-        except DamageError as error:
-            self._switch_to_rescuer(error)
-            for connection, time, data in self._reader.messages(known, resume, high):
-                if time == latest and (connection.id, data) in at_latest:
-                    at_latest.remove((connection.id, data))
-                elif time >= latest:
-                    yielded += 1
-                    yield known[connection.id], time, data
-            times = self._reader.times(known)
-            if (late := int(((times >= low) & (times < high)).sum()) - yielded) > 0:
-                self._notes.append(f"{late} message(s) were found too late to be given in order of time")
-
-    def times(self, connections: Collection[Connection]) -> I64:
-        """Return the sorted log times of all messages of ``connections``. Their data is not read."""
-        ids = [c.id for c in connections]
-        if self._sound is not None:
-            try:
-                return self._sound.times(ids)
-            except DamageError as error:
-                self._switch_to_rescuer(error)
-        return self._reader.times(ids)
-
-    def close(self) -> None:
-        """Close the current reader."""
-        self._reader.close()
-
-    def _check(self, ids: Collection[int], start: int, stop: int, yielded: tuple[int, int]) -> None:
-        """Compare the count and the time sum of the yielded messages with the index.
-
-        Raises:
-            DamageError: they differ.
-        """
-        assert self._sound is not None
-        listed = self._sound.sums(ids, start, stop)
-        if listed[0] != yielded[0]:
-            raise DamageError(f"its index lists {listed[0]} messages where {yielded[0]} are")
-        if listed != yielded:
-            raise DamageError("its index has other times than its messages")
-
-    def _switch_to_rescuer(self, error: DamageError) -> None:
-        """Replace the sound reader by its rescuer."""
-        self._note_damage(error)
-        sound, self._sound = self._sound, None
-        assert sound is not None
-        self._reader = sound.rescuer()
-        sound.close()
-
-    def _note_damage(self, error: DamageError) -> None:
-        _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
-        how = (
-            "it is read from end to end" if isinstance(error, UnindexedError) else "what is there was rescued"
-        )
-        self._notes.append(f"{error}: {how}")
 
 
 class FileBytes:
@@ -347,17 +208,11 @@ _STREAMS: dict[str, Callable[[], Any]] = {
     "lz4": LZ4FrameDecompressor,
     "bz2": BZ2Decompressor,
 }
-_UNPACK_ERRORS = (
-    OSError,
-    ValueError,
-    RuntimeError,
-    EOFError,
-    zstd.ZstdError,
-)  # exceptions of these on damage
+_UNPACK_ERRORS = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # exceptions on damage
 
 
 def _decompress(stream: Any, packed: bytes, limit: int) -> bytes:
-    """Decompress bytes into at most ``most`` bytes."""
+    """Decompress bytes into at most ``limit`` bytes."""
     parts = [stream.decompress(packed, limit)]
     limit -= len(parts[0])
     while limit > 0 and not stream.eof and not stream.needs_input:

@@ -1,27 +1,22 @@
-"""ROS 1 bags (http://wiki.ros.org/Bags/Format/2.0): the index of a sound bag, a scan of a damaged bag."""
+"""Records of a ROS 1 bag (http://wiki.ros.org/Bags/Format/2.0), and the index of a sound bag."""
 
 from __future__ import annotations
 
-import re
 import struct
-from array import array
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag1 import Reader
 
-from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex, ScanResult
-from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, MemoryBytes, normalized, unpack
+from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, normalized
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
-OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # Every header contains an opcode.
 LONGEST_HEADER = 1 << 16  # bytes; the data of a connection has the form of a header and may be longer
-SEARCH_BACK = 160  # bytes of a header before its opcode that are searched
 
 # The fields of a record determine its kind. A damaged opcode leaves no trace; damaged fields do.
 RECORD_FIELDS: Mapping[str, Mapping[str, int | None]] = {  # field sizes in bytes; None: any
@@ -59,8 +54,13 @@ class Record:
 
     def time(self, name: str) -> int:
         """Return a time field in nanoseconds."""
-        sec, nsec = struct.unpack("<II", self.fields[name])
-        return int(sec) * 10**9 + int(nsec)
+        return nanoseconds(self.fields[name])
+
+
+def nanoseconds(field: bytes) -> int:
+    """Parse a time field to nanoseconds."""
+    seconds, nanoseconds = struct.unpack("<II", field)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def read_record(source: FileBytes, offset: int) -> Record | None:
@@ -72,7 +72,7 @@ def read_record(source: FileBytes, offset: int) -> Record | None:
     length = source.read(offset + 4 + size, 4)
     if fields is None or len(length) < 4 or len(fields.get("op", b"")) != 1:
         return None
-    kind = next((name for name, layout in RECORD_FIELDS.items() if _fits(fields, layout)), "")
+    kind = next((name for name, layout in RECORD_FIELDS.items() if fits(fields, layout)), "")
     body = offset + size + 8
     return Record(kind, fields, offset, body, body + int.from_bytes(length, "little"))
 
@@ -93,11 +93,12 @@ def read_fields(header: bytes, size: int) -> Fields | None:
     return fields
 
 
-def _fits(fields: Fields, layout: Mapping[str, int | None]) -> bool:
+def fits(fields: Fields, layout: Mapping[str, int | None]) -> bool:
+    """Tell whether a record has the fields of a kind."""
     return all(name in fields and size in (None, len(fields[name])) for name, size in layout.items())
 
 
-def _is_sane(record: Record, size: int) -> bool:
+def is_sane(record: Record, size: int) -> bool:
     """Tell whether the data of a record has the size that its fields state.
 
     The data must end within ``size`` bytes, except that of a chunk.
@@ -145,12 +146,9 @@ class Connections:
             None,
         )
 
-    def counted(self, counts: Mapping[int, int]) -> list[Connection]:
+    def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
         return [c._replace(msgcount=counts.get(number, 0)) for number, c in self._known.items()]
-
-
-# --- the index of a sound bag ------------------------------------------------------------------
 
 
 def read_index(path: Path) -> FileIndex:
@@ -185,7 +183,7 @@ def _read_index(file: FileBytes, offset: int, connection_count: int, chunk_count
     described = 0
     while offset < file.size:
         record = read_record(file, offset)
-        if record is None or not _is_sane(record, file.size):
+        if record is None or not is_sane(record, file.size):
             raise DamageError("the bag's index ends early or is damaged")
         if record.kind == "connection" and record.fields["op"] == b"\x07":
             connections.note(record, file.read(record.body, record.end - record.body))
@@ -205,7 +203,7 @@ def _read_index(file: FileBytes, offset: int, connection_count: int, chunk_count
         counts.update(chunk.counts)
     if not all(number in connections for number in counts):
         raise DamageError("the bag's index has messages of connections that it does not describe")
-    return FileIndex(chunks, connections.counted(counts))
+    return FileIndex(chunks, connections.connections(counts))
 
 
 def _read_chunk(file: FileBytes, info: Record, end: int) -> Chunk:
@@ -219,7 +217,7 @@ def _read_chunk(file: FileBytes, info: Record, end: int) -> Chunk:
     index, at = {}, record.end
     for _ in range(len(pairs)):
         entries = read_record(file, at)
-        if entries is None or entries.kind != "index" or not _is_sane(entries, end):
+        if entries is None or entries.kind != "index" or not is_sane(entries, end):
             raise DamageError("the index of a chunk ends early or is damaged")
         number = entries.number("conn")
         if entries.number("count") != counts.get(number, 0) or entries.fields["op"] != b"\x04":
@@ -230,7 +228,7 @@ def _read_chunk(file: FileBytes, info: Record, end: int) -> Chunk:
         raise DamageError("the index of a chunk disagrees with that of the bag")
     start, last = (info.time("start_time"), info.time("end_time")) if counts else (LAST_TIME, -1)
     length = record.end - record.body
-    return Chunk(start, last, record.body, length, record.number("size"), compression, counts, index=index)
+    return Chunk(start, last, record.body, length, record.number("size"), compression, counts, index)
 
 
 def read_times(file: FileBytes, chunk: Chunk, number: int) -> I64:
@@ -250,135 +248,22 @@ def read_times(file: FileBytes, chunk: Chunk, number: int) -> I64:
     return times
 
 
-# --- a damaged bag -----------------------------------------------------------------------------
+def parse(data: memoryview, connections: Container[int]) -> tuple[list[ChunkMessage], bool]:
+    """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
+    messages: list[ChunkMessage] = []
+    offset, size = 0, len(data)
+    while offset + 8 <= size:
+        length = int.from_bytes(data[offset : offset + 4], "little")
+        body = offset + length + 8
+        fields = read_fields(bytes(data[offset + 4 : body - 4]), length)
+        if fields is None or body > size:
+            return messages, False
+        offset = body + int.from_bytes(data[body - 4 : body], "little")
+        if fits(fields, RECORD_FIELDS["message"]) and offset <= size:
+            number, time = int.from_bytes(fields["conn"], "little"), nanoseconds(fields["time"])
+            if number in connections and time < LAST_TIME:
+                messages.append((time, number, data[body:offset]))
+    return messages, offset == size
 
 
-class RecordWalker:
-    """Iterator over the records of a bag or of a chunk. After a broken record it finds the next sound one.
-
-    Only a chunk may be cut: it may end beyond the bytes.
-    """
-
-    def __init__(self, source: FileBytes) -> None:
-        self._source = source
-        self.broken = self.passed = 0
-
-    def __call__(self, offset: int) -> Iterator[Record]:
-        """Yield the records from ``offset`` on."""
-        size = self._source.size
-        record = self._at(offset)
-        while offset < size:
-            if record is None:
-                record = self._search(offset + 1, size)
-                self.broken += 1
-                self.passed += (record.start if record else size) - offset
-                if record is None:
-                    return
-                offset = record.start
-            assert record is not None
-            following = self._at(record.end)
-            if following is None and record.end != size:
-                # The length is wrong and the next record lies within, or the next record is broken.
-                is_chunk = record.kind == "chunk"
-                nearer = self._search(record.body, min(record.end, size), is_chunk)
-                if nearer is not None and is_chunk:
-                    record.end, following = nearer.start, nearer
-                elif nearer is not None:
-                    self.broken += 1
-                    self.passed += nearer.start - offset
-                    record, offset = nearer, nearer.start
-                    continue
-            yield record
-            offset = record.end
-            record = following
-
-    def _at(self, offset: int) -> Record | None:
-        record = read_record(self._source, offset)
-        return record if record is not None and _is_sane(record, self._source.size) else None
-
-    def _search(self, start: int, stop: int, chunk: bool = False) -> Record | None:
-        """Return the next sound record, or the next chunk. It must precede another record or the end."""
-        for at in self._source.search(OPCODE, start):
-            if at >= stop:
-                return None
-            before = self._source.read(max(start, at - SEARCH_BACK), SEARCH_BACK)[
-                : at - max(start, at - SEARCH_BACK)
-            ]
-            for back in range(4, len(before) + 1):
-                size = int.from_bytes(before[len(before) - back :][:4], "little")
-                if not back + 3 < size <= LONGEST_HEADER:
-                    continue
-                record = self._at(at - back)
-                if record is None or (chunk and record.kind != "chunk"):
-                    continue
-                if record.end >= self._source.size or self._at(record.end) is not None:
-                    return record
-        return None
-
-
-def scan(file: FileBytes, result: ScanResult, report: Callable[[int], object]) -> None:
-    """Scan a bag from front to back, with the content of every chunk."""
-    connections, walker = Connections(), RecordWalker(file)
-    outside = array("q")  # messages of an uncompressed chunk whose head is damaged
-    for record in walker(len(MAGIC)):
-        report(record.end)
-        if record.kind == "connection":
-            connections.note(record, file.read(record.body, record.end - record.body))
-        elif record.kind == "chunk":
-            compression = record.fields["compression"].decode(errors="replace")
-            packed = min(record.end, file.size) - record.body
-            chunk = Chunk(LAST_TIME, -1, record.body, packed, record.number("size"), compression, {}, 0, {})
-            chunk.cut = record.end > file.size
-            result.begin(chunk)
-            _describe(file, chunk, connections, result)
-            if chunk.cut:
-                result.cut, result.rescued = file.size - record.body, sum(chunk.counts.values())
-        elif record.kind == "index":
-            result.listed[record.number("conn")] += record.number("count")
-        elif record.kind == "message":
-            size = record.end - record.body
-            outside.extend((record.time("time"), record.number("conn"), record.body, size))
-    result.end()
-    result.broken += walker.broken
-    result.passed += walker.passed
-    result.index.connections = connections.counted(result.finish(connections, outside))
-
-
-def _describe(file: FileBytes, chunk: Chunk, connections: Connections, result: ScanResult) -> None:
-    """Fill in the messages and connections of a chunk."""
-    times: dict[int, array[int]] = defaultdict(lambda: array("q"))
-    content, chunk.damage = _unpacked(file, chunk)
-    walker = RecordWalker(content)
-    for record in walker(0):
-        if record.kind == "message":
-            times[record.number("conn")].append(record.time("time"))
-        elif record.kind == "connection":
-            connections.note(record, content.read(record.body, record.end - record.body))
-    if not (chunk.cut or chunk.damage):
-        result.broken += walker.broken
-        result.passed += walker.passed
-    chunk.fill(times)
-
-
-def read_messages(file: FileBytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
-    """Return the messages of a chunk on the connections of its index, and the damage of its content."""
-    content, damage = _unpacked(file, chunk)
-    data = memoryview(content.read(0, content.size))
-    messages = [
-        (r.time("time"), r.number("conn"), data[r.body : r.end])
-        for r in RecordWalker(content)(0)
-        if r.kind == "message" and r.number("conn") in chunk.counts
-    ]
-    return messages, damage
-
-
-def _unpacked(file: FileBytes, chunk: Chunk) -> tuple[MemoryBytes, str]:
-    """Return the content of a chunk and its damage."""
-    packed = file.read(chunk.data, chunk.packed)
-    cut = chunk.cut or len(packed) < chunk.packed
-    data, damage = unpack(chunk.compression, packed, chunk.size, cut=cut)
-    return MemoryBytes(data), damage
-
-
-REPAIR = "'rosbag reindex' repairs the file"
-FORM = ChunkFormat(Reader, False, read_index, read_times, read_messages, scan, REPAIR)
+FORM = ChunkFormat(read_index, read_times, parse)

@@ -1,8 +1,9 @@
-"""sqlite3 bags. rosbags reads a sound file; ``rescue.sqlite`` reads the pages of a damaged one."""
+"""sqlite3 bags, read by rosbags."""
 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,22 +13,16 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader as PublicReader
 
-from bevviz.bags.reader import (
-    LAST_TIME,
-    DamageError,
-    Message,
-    Reader,
-    as_damage,
-    megabytes,
-    public_messages,
-)
-from bevviz.bags.rescue.sqlite import SqliteRescuer
-from bevviz.bags.rescue.sqlite_pages import LOG_HEAD, log_path, page_size_of
+from bevviz.bags.reader import LAST_TIME, DamageError, Message, as_damage, megabytes
 from bevviz.model.frame import I64
 
+MAGIC = b"SQLite format 3\0"
+PAGE_SIZES = [1 << bits for bits in range(9, 17)]
+LOG_HEAD = struct.Struct(">8I")
 
-class SoundSqlite:
-    """Reader of a complete sqlite3 bag, by rosbags.
+
+class SqliteReader:
+    """Reader of a complete sqlite3 bag.
 
     Args:
         path: file.
@@ -41,7 +36,6 @@ class SoundSqlite:
     warnings: Sequence[str] = ()
 
     def __init__(self, path: Path, public: Path) -> None:
-        self._path = path
         self._file = path.open("rb")
         head, size = self._file.read(100), self._file.seek(0, 2)
         self._size = size
@@ -70,30 +64,21 @@ class SoundSqlite:
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
         wanted = [c for c in self.connections if c.id in ids]
-        for message in public_messages(self._public.messages(wanted, start, stop)):
-            # sqlite3 reads zeros where pages are missing.
-            if os.fstat(self._file.fileno()).st_size < self._size:
-                raise DamageError("the file was cut while it was read")
-            yield message
+        with as_damage():
+            for message in self._public.messages(wanted, start, stop):
+                # sqlite3 reads zeros where pages are missing.
+                if os.fstat(self._file.fileno()).st_size < self._size:
+                    raise DamageError("the file was cut while it was read")
+                yield message
 
-    def times(self, ids: Collection[int]) -> I64:
-        """Return the sorted log times of the connections ``ids``."""
-        query = f"SELECT timestamp FROM messages WHERE topic_id IN ({_placeholders(ids)}) ORDER BY timestamp"
-        return np.array([time for (time,) in self._numbers(query, *ids)], np.int64)
-
-    def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
-        """Return the number of messages and the sum of their log times, both by the index."""
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
+        """Return the sorted log times of the connections ``ids`` with start <= time < stop."""
         query = (
-            "SELECT count(*), sum(timestamp >> 32), sum(timestamp & 4294967295) "
-            "FROM messages NOT INDEXED "
-            f"WHERE topic_id IN ({_placeholders(ids)}) AND timestamp >= ? AND timestamp < ?"
+            f"SELECT timestamp FROM messages NOT INDEXED WHERE topic_id IN ({','.join('?' * len(ids))}) "
+            "AND timestamp >= ? AND timestamp < ?"
         )
-        ((count, high, low),) = self._numbers(query, *ids, start, stop)
-        return count, ((high or 0) << 32) + (low or 0)
-
-    def rescuer(self) -> Reader:
-        """Return a reader of the pages."""
-        return SqliteRescuer(self._path)
+        rows = self._numbers(query, *ids, start, stop)
+        return np.sort(np.array([time for (time,) in rows], np.int64))
 
     def _check(self) -> None:
         """Compare the tables and the index with each other.
@@ -124,5 +109,13 @@ class SoundSqlite:
         self._queries.close()
 
 
-def _placeholders(ids: Collection[int]) -> str:
-    return ",".join("?" for _ in ids)
+def page_size_of(head: bytes) -> int | None:
+    """Return the page size that the head of a file states. None: it is no sqlite3 head."""
+    size = int.from_bytes(head[16:18], "big")
+    size = 65536 if size == 1 else size
+    return size if head[: len(MAGIC)] == MAGIC and size in PAGE_SIZES else None
+
+
+def log_path(path: Path) -> Path:
+    """Return the path of the write-ahead log of a database."""
+    return path.with_name(path.name + "-wal")

@@ -13,6 +13,8 @@ from bevviz.errors import UserError
 from bevviz.messages.definitions import typestore
 from bevviz.model.frame import I64
 
+LAST_TIME = 2**63 - 1  # nanoseconds
+
 
 class DatasetReader:
     """Messages of one drive in order of stamp. The stamp is also the log time."""
@@ -82,19 +84,10 @@ class DatasetReader:
                     )
             yield self.connections[int(stream_of[i])], int(stamps[i]), data
 
-    def times(self, ids: Collection[int]) -> I64:
-        """Return the sorted log times of the connections ``ids``."""
-        return np.sort(np.concatenate([self._streams[number].times for number in ids]))
-
-    def sums(self, ids: Collection[int], start: int, stop: int) -> tuple[int, int]:
-        """Return the number of messages and the sum of their log times."""
-        times = self.times(ids)
-        chosen = times[(times >= start) & (times < stop)]
-        return len(chosen), sum(chosen.tolist())
-
-    def rescuer(self) -> DatasetReader:
-        """Return this reader: a data set has no rescuer."""
-        return self
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
+        """Return the sorted log times of the connections ``ids`` with start <= time < stop."""
+        times = np.sort(np.concatenate([self._streams[number].times for number in ids]))
+        return times[(times >= start) & (times < stop)]
 
     def close(self) -> None:
         """Do nothing: no file stays open."""

@@ -1,17 +1,12 @@
-"""Scan of a damaged MCAP file record by record. After a broken record it searches for the next sound one."""
+"""Records of a damaged MCAP file."""
 
 from __future__ import annotations
 
 import re
 import struct
-from array import array
-from collections import defaultdict
-from collections.abc import Callable, Container, Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
 
-from rosbags.rosbag2 import Reader
-
-from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, ScanResult
+from bevviz.bags.chunks import Chunk
 from bevviz.bags.mcap import (
     CHANNEL,
     CHUNK,
@@ -28,12 +23,10 @@ from bevviz.bags.mcap import (
     SCHEMA,
     STATISTICS,
     Channels,
-    read_index,
     read_strings,
-    read_times,
-    unpack_chunk,
 )
-from bevviz.bags.reader import LAST_TIME, FileBytes, MemoryBytes
+from bevviz.bags.reader import LAST_TIME
+from bevviz.bags.rescue.chunks import RecordWalker
 
 RECORD_START = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
@@ -45,79 +38,79 @@ FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
 _SUMMARY = {CHUNK_INDEX, STATISTICS, 0x0A, 0x0C, 0x0D, 0x0E}
 
 
-class Record(NamedTuple):
+KINDS = {
+    SCHEMA: "connection",
+    CHANNEL: "connection",
+    MESSAGE: "message",
+    CHUNK: "chunk",
+    MESSAGE_INDEX: "index",
+    STATISTICS: "statistics",
+}
+
+
+@dataclass(slots=True)
+class Record:
     """A record of an MCAP file.
 
     Attributes:
         opcode: kind of the record.
+        start: offset of the record.
         body: offset of the content.
         end: offset of the end. It lies beyond the end of the file if the record is cut.
     """
 
     opcode: int
+    start: int
     body: int
     end: int
 
     @property
-    def start(self) -> int:
-        """Offset of the record."""
-        return self.body - RECORD.size
+    def kind(self) -> str:
+        """Kind as ``RecordWalker`` names it."""
+        return KINDS.get(self.opcode, "")
 
 
-class RecordWalker:
-    """Iterator over the records of a file or of the content of a chunk.
+class McapWalker(RecordWalker[Record]):
+    """Walker over the records of an MCAP file."""
 
-    Args:
-        source: bytes to walk.
-        channels: known channels. The caller adds channels during the walk.
-        span: first and last plausible log time of a message found by searching; None: not known yet.
-    """
+    descriptions = Channels
+    first = len(MAGIC)
 
-    def __init__(
-        self, source: FileBytes, channels: Container[int], span: tuple[int, int] | None = None
-    ) -> None:
-        self._source, self._channels, self._span = source, channels, span
-        self.broken = self.passed = 0  # places without a sound record, and their bytes
+    def note(self, record: Record) -> None:
+        """Add a schema or a channel."""
+        self._known.note(record.opcode, self._source.read(record.body, record.end - record.body))
 
-    def __call__(self, offset: int) -> Iterator[Record]:
-        """Yield the records from ``offset`` on. Only a chunk may be cut: it may end beyond the bytes."""
-        size = self._source.size
-        record = self._at(offset)
-        while offset < size:
-            if record is None:
-                record = self._skip(offset) or self._search(offset + 1, size)
-                self._count_broken((record.start if record else size) - offset)
-                if record is None:
-                    return
-                offset = record.start
-            sound, following = self._resolve(record)
-            if sound is not None:
-                self._extend_span(sound)
-                yield sound
-                if sound.opcode == FOOTER:
-                    return
-                offset = sound.end
-            elif following is not None:
-                self._count_broken(following.start - offset)
-                offset = following.start
-            record = following
+    def message(self, record: Record) -> tuple[int, int, int, int]:
+        """Return log time and channel of a message, and the offset and size of its data."""
+        channel, _, time, _ = MESSAGE_HEAD.unpack(self._source.read(record.body, MESSAGE_HEAD.size))
+        first, last = self._span or (time, time)
+        self._span = min(first, time), max(last, time)
+        return time, channel, record.body + MESSAGE_HEAD.size, record.end - record.body - MESSAGE_HEAD.size
 
-    def _resolve(self, record: Record) -> tuple[Record | None, Record | None]:
-        """Return a record with its corrected end (None: broken), and the next record (None: unknown)."""
-        size, is_chunk = self._source.size, record.opcode == CHUNK
-        if record.end == size or record.opcode == FOOTER:
-            return record, None
-        following = self._at(record.end) if record.end < size else None
-        if following is not None or self._skip(record.end) is not None:
-            return record, following
-        # The length is wrong and the next record lies within or slightly behind; or the next one is broken.
-        nearer = self._search(record.body, min(record.end, size), is_chunk)
-        if is_chunk:
-            return (record._replace(end=nearer.start) if nearer else record), nearer
-        if nearer is None and record.end < size:
-            doubtful = record.opcode == MESSAGE and not self._begins_message(record.end)
-            return (None if doubtful else record), None
-        return None, nearer
+    def chunk(self, record: Record) -> Chunk:
+        """Return the chunk of a record, without messages."""
+        head = record.body + CHUNK_HEAD.size
+        first, last, size, _, name_size = CHUNK_HEAD.unpack(self._source.read(record.body, CHUNK_HEAD.size))
+        name, data = self._source.read(head, name_size).decode(), head + name_size + 8
+        packed = min(record.end, self._source.size) - data
+        cut = record.end > self._source.size
+        return Chunk(first, last, data, packed, size, name, {}, {}, record.body + 24, cut)
+
+    def listed(self, record: Record) -> tuple[int, int]:
+        """Return the channel of a message index, and its number of messages."""
+        channel, size = struct.unpack("<HI", self._source.read(record.body, 6))
+        return channel, size // 16
+
+    def stated(self, record: Record) -> int | None:
+        """Return the number of messages by the statistics."""
+        data = self._source.read(record.body, 8)
+        return int.from_bytes(data, "little") if record.end - record.body >= 8 else None
+
+    def _is_last(self, record: Record) -> bool:
+        return record.opcode == FOOTER
+
+    def _is_doubtful(self, record: Record) -> bool:
+        return record.opcode == MESSAGE and not self._begins_message(record.end)
 
     def _begins_message(self, offset: int) -> bool:
         """Tell whether a message with a possibly wrong length begins here. The end of the file counts."""
@@ -125,16 +118,6 @@ class RecordWalker:
         if len(head) < RECORD.size + MESSAGE_HEAD.size:
             return True
         return head[0] == MESSAGE and self._fits(offset + RECORD.size)
-
-    def _count_broken(self, size: int) -> None:
-        self.broken += 1
-        self.passed += size
-
-    def _extend_span(self, record: Record) -> None:
-        if record.opcode == MESSAGE:
-            _, _, time, _ = MESSAGE_HEAD.unpack(self._source.read(record.body, MESSAGE_HEAD.size))
-            first, last = self._span or (time, time)
-            self._span = min(first, time), max(last, time)
 
     def _skip(self, offset: int) -> Record | None:
         """Return the record after a broken one if the broken one's length still leads to it."""
@@ -171,7 +154,7 @@ class RecordWalker:
             return None
         opcode, length = RECORD.unpack(head)
         body, size = offset + RECORD.size, self._source.size
-        record = Record(opcode, body, body + length)
+        record = Record(opcode, offset, body, body + length)
         if opcode == CHUNK or (length > CHUNK_HEAD.size + 8 and self._is_chunk(offset)):
             return self._chunk(offset)
         if record.end > size:
@@ -191,7 +174,7 @@ class RecordWalker:
         """Tell whether a message has a known channel and a time close to that of the others."""
         head = self._source.read(body, MESSAGE_HEAD.size)
         channel, _, time, published = MESSAGE_HEAD.unpack(head)
-        if self._channels and channel not in self._channels:
+        if self._known and channel not in self._known:
             return False
         if self._span is None:
             return not published or abs(time - published) < DAY
@@ -200,7 +183,7 @@ class RecordWalker:
 
     def _is_sane(self, record: Record) -> bool:
         """Tell whether the lengths within a record fit its own length, as far as its bytes exist."""
-        opcode, body, end = record
+        opcode, body, end = record.opcode, record.body, record.end
         length = end - body
         if opcode == MESSAGE:
             head = self._source.read(body, MESSAGE_HEAD.size)
@@ -251,97 +234,8 @@ class RecordWalker:
             offset + at + name_size + 8 + int.from_bytes(head[at + name_size : at + name_size + 8], "little"),
         ]
         if ends[0] == ends[1]:
-            return Record(CHUNK, body, ends[0])
+            return Record(CHUNK, offset, body, ends[0])
         for end in ends:
             if body + at < end < size and self._at(end, searched=True) is not None:
-                return Record(CHUNK, body, end)
+                return Record(CHUNK, offset, body, end)
         return None
-
-
-def scan(file: FileBytes, result: ScanResult, report: Callable[[int], object]) -> None:
-    """Scan a file from front to back, with the content of every chunk."""
-    channels = Channels()
-    walker = RecordWalker(file, channels)
-    outside = array("q")
-    for opcode, body, end in walker(len(MAGIC) if file.read(0, len(MAGIC)) == MAGIC else 0):
-        report(end)
-        if opcode in (SCHEMA, CHANNEL):
-            channels.note(opcode, file.read(body, end - body))
-        elif opcode == MESSAGE:
-            channel, _, time, _ = MESSAGE_HEAD.unpack(file.read(body, MESSAGE_HEAD.size))
-            outside.extend((time, channel, body + MESSAGE_HEAD.size, end - body - MESSAGE_HEAD.size))
-        elif opcode == CHUNK:
-            chunk = _read_head(file, body, end)
-            result.begin(chunk)
-            _describe(file, chunk, channels, result)
-            if chunk.cut:
-                result.cut, result.rescued = file.size - body, sum(chunk.counts.values())
-        elif opcode == MESSAGE_INDEX:
-            channel, size = struct.unpack("<HI", file.read(body, 6))
-            result.listed[channel] += size // 16
-        elif opcode == STATISTICS and end - body >= 8:
-            result.stated = int.from_bytes(file.read(body, 8), "little")
-    result.end()
-    result.broken += walker.broken
-    result.passed += walker.passed
-    result.index.connections = channels.connections(result.finish(channels, outside))
-
-
-def _read_head(file: FileBytes, body: int, end: int) -> Chunk:
-    first, last, size, crc, name_size = CHUNK_HEAD.unpack(file.read(body, CHUNK_HEAD.size))
-    name = file.read(body + CHUNK_HEAD.size, name_size).decode()
-    data = body + CHUNK_HEAD.size + name_size + 8
-    cut = end > file.size
-    return Chunk(first, last, data, min(end, file.size) - data, size, name, {}, crc, times={}, cut=cut)
-
-
-def _describe(file: FileBytes, chunk: Chunk, channels: Channels, result: ScanResult) -> None:
-    """Fill in the messages and channels of a chunk."""
-    times: dict[int, array[int]] = defaultdict(lambda: array("q"))
-    data, chunk.damage, _ = unpack_chunk(file, chunk)
-    content = MemoryBytes(data)
-    walker = RecordWalker(content, channels, _span(chunk))
-    for opcode, body, end in walker(0):
-        if opcode == MESSAGE:
-            channel, _, time, _ = MESSAGE_HEAD.unpack(content.read(body, MESSAGE_HEAD.size))
-            times[channel].append(time)
-        elif opcode in (SCHEMA, CHANNEL):
-            channels.note(opcode, content.read(body, end - body))
-    if not (chunk.cut or chunk.damage):
-        result.broken += walker.broken
-        result.passed += walker.passed
-    chunk.fill(times)
-
-
-def read_messages(file: FileBytes, chunk: Chunk) -> tuple[list[ChunkMessage], str]:
-    """Return the messages of a chunk on the channels of its index, and the damage of its content."""
-    content, damage, checked = unpack_chunk(file, chunk)
-    data = memoryview(content)
-    messages, whole = _messages(data, chunk.counts)
-    if not checked and not (whole and len(messages) == sum(chunk.counts.values())):
-        walk = RecordWalker(MemoryBytes(content), chunk.counts, _span(chunk))(0)
-        records = [data[r.start : r.end] for r in walk if r.opcode == MESSAGE]
-        messages = [message for record in records for message in _messages(record, chunk.counts)[0]]
-    return messages, damage
-
-
-def _messages(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
-    """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
-    messages, offset, size = [], 0, len(data)
-    while offset + RECORD.size <= size:
-        opcode, length = RECORD.unpack_from(data, offset)
-        body = offset + RECORD.size
-        offset = body + length
-        if opcode == MESSAGE and offset <= size and length >= MESSAGE_HEAD.size:
-            channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
-            if channel in channels and time < LAST_TIME:
-                messages.append((time, channel, data[body + MESSAGE_HEAD.size : offset]))
-    return messages, offset == size
-
-
-def _span(chunk: Chunk) -> tuple[int, int] | None:
-    return (chunk.start, chunk.end) if 0 < chunk.start <= chunk.end < LAST_TIME else None
-
-
-REPAIR = "'mcap recover' writes a sound copy"
-FORM = ChunkFormat(Reader, True, read_index, read_times, read_messages, scan, REPAIR)

@@ -17,7 +17,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 
 from bevviz.bags.mcap import FORMATS, NO_DEFINITION
 from bevviz.bags.reader import LAST_TIME, DamageError, Message
-from bevviz.bags.rescue.sqlite_pages import PAGE_SIZES, Pages
+from bevviz.bags.rescue.report import DamageReport
+from bevviz.bags.rescue.sqlite_pages import Pages
+from bevviz.bags.sqlite import PAGE_SIZES
 from bevviz.errors import UserError
 from bevviz.model.frame import I64
 from bevviz.support import progress
@@ -39,11 +41,14 @@ class Cell:
     columns: tuple[tuple[int, int], ...]  # serial type, offset in the row
 
 
-class SqliteRescuer:
+class RescuedSqliteReader:
     """Reader of the rows of a damaged file, page by page.
 
     Args:
         path: file.
+
+    Attributes:
+        report: counts of the messages read and lost so far.
 
     Raises:
         UserError: the file has no readable row.
@@ -74,19 +79,8 @@ class SqliteRescuer:
 
     @property
     def warnings(self) -> list[str]:
-        """Rescued and lost messages, one sentence each."""
-        notes = [f"read {len(self._rows)} messages"]
-        if self._incomplete:
-            notes.append(f"{self._incomplete} more are incomplete: lost")
-        if self._undescribed:
-            notes.append(f"{self._undescribed} messages are of topics that nothing describes: lost")
-        if self._broken:
-            notes.append(f"{self._broken} broken row(s) or page(s) passed over")
-        if self._pages.log_frames:
-            notes.append(f"{self._pages.log_frames} page(s) of the log do not fit their checksum")
-        if self._unread:
-            notes.append(f"{len(self._unread)} messages could no longer be read: lost")
-        return notes
+        """Sentences of the report."""
+        return self.report.sentences
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
@@ -98,13 +92,14 @@ class SqliteRescuer:
                     data = self._content(cell)[cell.columns[3][1] :]
                 except DamageError:
                     self._unread.add(number)
+                    self.report.unread = len(self._unread)
                     continue
                 yield known[topic], time, data
 
-    def times(self, ids: Collection[int]) -> I64:
-        """Return the sorted log times of the connections ``ids``."""
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
+        """Return the sorted log times of the connections ``ids`` with start <= time < stop."""
         times: I64 = self._rows[np.isin(self._rows[:, 1], list(ids)), 0]
-        return times
+        return times[(times >= start) & (times < stop)]
 
     def close(self) -> None:
         """Close the file."""
@@ -113,7 +108,7 @@ class SqliteRescuer:
     def _collect(self, path: Path) -> None:
         rows, topics = array("q"), dict[int, tuple[str, str, str]]()
         definitions: dict[str, MessageDefinition] = {}
-        self._incomplete = self._broken = 0
+        self.report = DamageReport(log_pages=self._pages.log_frames)
         self._unread: set[int] = set()
         count = self._pages.count
         bar = progress.bar(total=count, unit="page", desc=f"rescue {path.name}", delay=1)
@@ -126,10 +121,10 @@ class SqliteRescuer:
                     try:
                         self._add_row(self._cell(page, at), (number, at), rows, topics, definitions, seen)
                     except DamageError:
-                        self._broken += 1
+                        self.report.broken += 1
         table: I64 = np.frombuffer(rows, np.int64).reshape(-1, 5)
         known = np.isin(table[:, 1], list(topics))
-        self._undescribed = int((~known).sum())
+        self.report.undescribed, self.report.read = int((~known).sum()), int(known.sum())
         table = table[known]
         table = table[np.lexsort((table[:, 4], table[:, 0]))]  # rows with the same time in order of their ids
         self._rows: I64 = table[:, :4]  # time, topic, page, offset of the cell
@@ -149,7 +144,7 @@ class SqliteRescuer:
         count = int.from_bytes(page[head + 3 : head + 5], "big")
         listed = page[head + 8 : head + 8 + 2 * count]
         if len(listed) < 2 * count:
-            self._broken += 1
+            self.report.broken += 1
         return [int(at) for at in np.frombuffer(listed[: len(listed) // 2 * 2], ">u2")]
 
     def _cell(self, page: bytes, at: int) -> Cell:
@@ -204,7 +199,7 @@ class SqliteRescuer:
             try:
                 self._overflow_pages(cell)
             except DamageError:
-                self._incomplete += 1
+                self.report.incomplete += 1
                 return
             rows.extend((time, topic, *position, cell.rowid))
         elif len(kinds) >= 3 and kinds[0] >= 13 and kinds[0] % 2:

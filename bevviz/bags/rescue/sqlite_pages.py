@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.bags.reader import FileBytes
+from bevviz.bags.sqlite import LOG_HEAD, PAGE_SIZES, log_path, page_size_of
 
-MAGIC = b"SQLite format 3\0"
 LEAF = 0x0D  # first byte of a page with table rows
-PAGE_SIZES = [1 << bits for bits in range(9, 17)]
 LOG_MAGIC = (0x377F0682, 0x377F0683)
-LOG_HEAD, FRAME_HEAD = struct.Struct(">8I"), struct.Struct(">6I")
+FRAME_HEAD = struct.Struct(">6I")
 
 
 class Pages:
@@ -121,18 +120,6 @@ class Pages:
             if committed:
                 self.in_log.update(pages)
                 pages.clear()
-
-
-def page_size_of(head: bytes) -> int | None:
-    """Return the page size that the head of a file states. None: it is no sqlite3 head."""
-    size = int.from_bytes(head[16:18], "big")
-    size = 65536 if size == 1 else size
-    return size if head[: len(MAGIC)] == MAGIC and size in PAGE_SIZES else None
-
-
-def log_path(path: Path) -> Path:
-    """Return the path of the write-ahead log of a database."""
-    return path.with_name(path.name + "-wal")
 
 
 @cache
