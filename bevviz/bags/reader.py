@@ -189,7 +189,7 @@ def unpack(
     else:
         stream = _STREAMS[compression]()
         try:
-            data = _decompress(stream, packed, limit)
+            data = _decompress(stream, packed, limit, size)
             whole = stream.eof
         except _UNPACK_ERRORS as error:
             data = _before_damage(_STREAMS[compression], packed, limit)
@@ -211,9 +211,9 @@ _STREAMS: dict[str, Callable[[], Any]] = {
 _UNPACK_ERRORS = (OSError, ValueError, RuntimeError, EOFError, zstd.ZstdError)  # exceptions on damage
 
 
-def _decompress(stream: Any, packed: bytes, limit: int) -> bytes:
-    """Decompress bytes into at most ``limit`` bytes."""
-    parts = [stream.decompress(packed, limit)]
+def _decompress(stream: Any, packed: bytes, limit: int, expected: int = 0) -> bytes:
+    """Decompress bytes into at most ``limit`` bytes. lz4 reserves memory for ``expected`` bytes at first."""
+    parts = [stream.decompress(packed, min(expected, limit) or limit)]
     limit -= len(parts[0])
     while limit > 0 and not stream.eof and not stream.needs_input:
         parts.append(stream.decompress(b"", limit))

@@ -16,6 +16,7 @@ from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, normalized
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
+LENGTH = struct.Struct("<I")
 LONGEST_HEADER = 1 << 16  # bytes; the data of a connection has the form of a header and may be longer
 
 # The fields of a record determine its kind. A damaged opcode leaves no trace; damaged fields do.
@@ -253,12 +254,12 @@ def parse(data: memoryview, connections: Container[int]) -> tuple[list[ChunkMess
     messages: list[ChunkMessage] = []
     offset, size = 0, len(data)
     while offset + 8 <= size:
-        length = int.from_bytes(data[offset : offset + 4], "little")
+        (length,) = LENGTH.unpack_from(data, offset)
         body = offset + length + 8
-        fields = read_fields(bytes(data[offset + 4 : body - 4]), length)
-        if fields is None or body > size:
+        fields = read_fields(bytes(data[offset + 4 : body - 4]), length) if body <= size else None
+        if fields is None:
             return messages, False
-        offset = body + int.from_bytes(data[body - 4 : body], "little")
+        offset = body + LENGTH.unpack_from(data, body - 4)[0]
         if fits(fields, RECORD_FIELDS["message"]) and offset <= size:
             number, time = int.from_bytes(fields["conn"], "little"), nanoseconds(fields["time"])
             if number in connections and time < LAST_TIME:
