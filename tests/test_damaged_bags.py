@@ -20,10 +20,12 @@ from bevviz.bags.bag import Recording
 from bevviz.bags.reader import LEAST, DamageError, FileBytes, unpack
 from bevviz.bags.rescue.sqlite_pages import checksum_of
 from bevviz.bags.source import BagSource
+from bevviz.cli import main
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import describe_bag, render_bag_info
 from tests.support.bag_formats import FORMATS, items
+from tests.support.commands import error_of
 from tests.support.foreign_readers import judges, taken
 
 Found = list[tuple[str, int, bytes]]
@@ -514,7 +516,8 @@ def test_topics_are_read_if_the_summary_is_damaged(tmp_path: Path, name: str) ->
     found, said = read(path)
     assert not missing(found, name)
     assert said == [
-        "bag.mcap: its index describes /velodyne_pojnts in another way than its data: what is there was rescued",
+        "bag.mcap: its index describes /velodyne_pojnts in another way than its data: "
+        "what is there was rescued",
         "bag.mcap: read 161 messages; 'bevviz recover' writes a sound copy",
     ]
 
@@ -543,3 +546,30 @@ def test_only_chunks_with_a_first_message_are_compared(
     monkeypatch.setattr(chunks.Chunk, "unpack", counted)
     index = mcap.read_index(path)
     assert len(index.chunks) > 5 and chunks_read == {index.chunks[0].data: 1}
+
+
+# --- a sound copy ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap, zstd", "sqlite3", "ros1"])
+def test_recover_writes_a_sound_copy(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    path, fixed = FORMATS[name](tmp_path), tmp_path / "fixed.mcap"
+    assert "is not damaged" in error_of(capsys, "recover", path, "--output", fixed)
+    assert not fixed.exists()
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 2 // 3])
+    left, _ = read(path)
+    assert 60 < len(left) < 161
+    assert main(["recover", str(path), "--output", str(fixed)]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert re.search(rf"fixed\.mcap: {len(left)} messages of \d topics read, \d+ known to be lost$", said[-1])
+    found, warnings = read(fixed)
+    assert Counter(found) == Counter(left)
+    assert not warnings
+    assert "already there" in error_of(capsys, "recover", path, "--output", fixed)
+    path.write_bytes(data[:10])
+    other = tmp_path / "other.mcap"
+    assert re.search(
+        "no messages|nothing of it is left|not a bag", error_of(capsys, "recover", path, "-o", other)
+    )
+    assert not other.exists()

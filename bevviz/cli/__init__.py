@@ -27,6 +27,7 @@ from bevviz.cli import (
     interrupts,
     live,
     outputs,
+    recover,
     report,
     sweep,
     trust,
@@ -51,6 +52,7 @@ EPILOG = """examples:
   bevviz bag drive.mcap --save drive.rrd      the same, saved to send with a bug report
   bevviz why drive.mcap --at 12.5             why an object was not reported then
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
+  bevviz recover drive.mcap -o sound.mcap     a sound copy of a damaged bag
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
   bevviz evaluate drive.mcap --model yolo11n.onnx --min recall=0.8                how right? a gate for CI
@@ -157,6 +159,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         tune,
         calib,
         report,
+        recover,
         demo,
         live,
         config,

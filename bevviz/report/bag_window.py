@@ -179,7 +179,8 @@ def cut_bag(
 
 def _needed(recording: Recording, topic: str, low: int) -> list[RawMessage]:
     """Return the video messages before the window that its first image is decoded from."""
-    times = sorted({packet.received for packet in recording.packets(topic, low - 1)})
+    received = {packet.received for packet in recording.packets(topic, low - 1)}
+    times = sorted(time for time in received if time < low)
     return [message for time in times for message in recording.messages([topic], time, time + 1)]
 
 
