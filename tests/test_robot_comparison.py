@@ -577,18 +577,21 @@ def test_the_list_contains_doubtful_objects() -> None:
     """Without the truth, which speaks for itself; each asks about what it is."""
     result = without_truth(foreign())
     assert result.opinions is not None and result.objects is not None
-    found = find_findings(result, None)
+    found = find_findings(FrameExplainer(result, classes=KNOWN))
     [denied] = [find for find in found if find.what == "contradicted"]
     assert (denied.name, denied.selection) == ("car", Selection(object=1)) and abs(denied.distance - 12) < 0.1
     lost = [find.selection for find in found if find.what == "lost"]
     fused, missed = result.opinions.fused, result.opinions.missed
-    near = missed & (np.hypot(*fused.boxes.center[:, :2].T) <= 40)
-    assert lost and len(lost) == near.sum()
     questioner = FrameExplainer(result, classes=KNOWN)
+    rows = [(int(fused.detection[row]), fused.camera[row]) for row in np.flatnonzero(missed)]
+    away = [questioner.about(Selection(detection=row, camera=camera)).distance for row, camera in rows]
+    assert lost and len(lost) == sum(distance <= 40 for distance in away)
     for asked in lost:
         [answer] = questioner.ask(asked)
         assert "our fusion has it" in answer.verdict.text
-    assert not [find for find in find_findings(ours(), None) if find.what in ("contradicted", "lost")]
+    assert not [
+        find for find in find_findings(FrameExplainer(ours())) if find.what in ("contradicted", "lost")
+    ]
 
 
 def test_effects_of_other_limits_are_counted() -> None:

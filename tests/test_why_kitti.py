@@ -18,6 +18,7 @@ from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.workbench.findings import find_findings
 
 NAMES = {"Car": "car", "Van": "car", "Truck": "truck", "Tram": "train"}  # any other label is a person
 
@@ -182,6 +183,31 @@ def test_without_ground_truth_doubtful_objects_are_false_ones(asked: dict[str, A
             doubtful += len(rows)
             right += sum(partner[row] >= 0 for row in rows)
     assert doubtful >= 4 and right <= 1
+
+
+def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None:
+    """With ground truth and without, the list has the kind, subject, distance and reason of the answer."""
+    rows = 0
+    for frame in asked.values():
+        unlabelled = replace(frame.result, frame=replace(frame.result.frame, truth=None))
+        for result in (frame.result, unlabelled):
+            listed = find_findings(FrameExplainer(result, classes=frame.explainer.traces.classes))
+            again = FrameExplainer(result, classes=frame.explainer.traces.classes)
+            for finding in listed:
+                answer = again.ask(Selection.parse(str(finding.selection)))[0]
+                assert (answer.selection, answer.subject.label.lower() or "cluster") == (
+                    finding.selection,
+                    finding.name.lower(),
+                )
+                assert answer.verdict.kind == finding.reason
+                assert answer.distance == pytest.approx(finding.distance, nan_ok=True)
+                assert answer.false == (finding.what in ("false", "doubtful"))
+                assert answer.verdict.reported == answer.false, (frame.name, answer.verdict.text)
+            if result is frame.result:
+                false = [finding.selection.row for finding in listed if finding.what == "false"]
+                assert sorted(false) == sorted(answer.subject.row for answer in frame.false)
+            rows += len(listed)
+    assert rows > 200
 
 
 def test_a_change_with_the_objects_own_detection_is_a_hint(asked: dict[str, Asked]) -> None:

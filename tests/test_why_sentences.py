@@ -167,7 +167,7 @@ FALSE: dict[str, Any] = {
     "other": Scored("car", 0.9),
     "off": -18.0,
     "size": (12.3, 3.4),
-    "camera": "zed",
+    "opinion": "",
 }
 FALSE_CASES = [
     (K.DUPLICATE, FALSE),

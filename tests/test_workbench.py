@@ -28,7 +28,7 @@ from bevviz.pipeline.notes import Note, Notes
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.stages.robot_results import in_points_frame
-from bevviz.why import Selection
+from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.access import persistent_token
@@ -160,7 +160,7 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     (camera,), boxes = result.frame.cameras, in_points_frame(result.frame, result.frame.truth)
     around = {
         str(find.selection): [float(p) for p in box]
-        for find in find_findings(result, truth_of(result.frame, result.frame.truth))
+        for find in find_findings(FrameExplainer(result))
         if find.what == "missed"
         and find.selection.truth is not None
         and (box := projected_box(single_box(boxes, find.selection.truth), camera)) is not None
@@ -353,6 +353,20 @@ def test_one_missed_object_is_one_entry(talk: Talk) -> None:
         numbers = [frame for frame, *_ in entry["sights"]]
         assert numbers == sorted(set(numbers))
         assert all(sight[5] for sight in entry["sights"]), "its reason"
+
+
+def test_rows_of_the_list_agree_with_their_answers(talk: Talk) -> None:
+    """One kind, subject, distance and reason, whether it is read in the list or asked for."""
+    for entry in talk.of("missed", "false"):
+        for _, stamp, distance, pick, tried, reason, *_ in entry["sights"]:
+            answer = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
+            assert (answer["pick"], answer["label"].lower(), answer["reason"]) == (
+                pick,
+                entry["name"],
+                reason,
+            )
+            assert abs(answer["distance"] - distance) <= 0.06 and not tried
+            assert answer["reported"] == answer["false"] == (entry["what"] == "false")
 
 
 def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
@@ -715,7 +729,7 @@ def test_objects_missed_against_the_truth_are_listed(result: FrameResult) -> Non
     assert frame.truth is not None
     assert result.objects is not None
     truth = truth_of(frame, frame.truth)
-    missed = {find.selection.truth for find in find_findings(result, truth) if find.what == "missed"}
+    missed = {find.selection.truth for find in find_findings(FrameExplainer(result)) if find.what == "missed"}
     assert missed
     for row, (label, must) in enumerate(zip(truth.labels, truth.must, strict=True)):
         near = [
@@ -733,8 +747,9 @@ def test_without_truth_unexplained_objects_are_listed(result: FrameResult) -> No
     few = changed_config(
         result.config, ["detector.conf_threshold=0.6"]
     )  # so that not every near cluster has a name
-    listed = find_findings(Session(few).run(result.frame), None)
-    assert {find.what for find in listed} <= {"unmatched", "unnamed"}
+    unlabelled = Session(few).run(replace(result.frame, truth=None))
+    listed = find_findings(FrameExplainer(unlabelled))
+    assert {find.what for find in listed} <= {"doubtful", "unmatched", "unnamed"}
     assert any(find.what == "unnamed" for find in listed)
     assert all(not find.distance > 40 for find in listed)
 

@@ -255,7 +255,7 @@ def _empty(result: FrameResult, tracks: Tracks, visibility: _Visibility, row: in
 
 def _rank(visibility: _Visibility, row: int, strange: float) -> float:
     """Return a rank from 0 to 1. Near and very surprising objects rank highest."""
-    distance = float(np.hypot(*visibility.boxes.center[row, :2]))
+    distance = float(visibility.boxes.distance[row])
     return min(strange, 1.0) / (1 + distance / 20)
 
 

@@ -228,7 +228,7 @@ class TruthComparison:
 
     def text(self, row: int) -> str:
         """Return class and distance of an object, as ``person at 12.3 m``."""
-        return f"{self.labels[row].lower()} at {np.hypot(*self.boxes.center[row, :2]):.1f} m"
+        return f"{self.labels[row].lower()} at {self.boxes.distance[row]:.1f} m"
 
 
 def compare_with_truth(a: FrameResult, b: FrameResult, truth: Truth) -> TruthComparison:

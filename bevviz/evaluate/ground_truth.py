@@ -138,7 +138,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
             of COCO's classes use for it. Any other label accepts its own name only.
     """
     boxes = in_points_frame(frame, labelled)
-    must = (np.hypot(*boxes.center[:, :2].T) <= RANGE) & _in_view(frame, boxes)
+    must = (boxes.distance <= RANGE) & _in_view(frame, boxes)
     must[must] = [
         geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
     ]

@@ -64,6 +64,7 @@ NUSCENES_WITHOUT_CLASS = frozenset(  # categories of nuScenes that belong to no 
         "vehicle.emergency.police",
     }
 )
+DATA_SETS = (KITTI, NUSCENES, SEMANTIC_KITTI, VIEW_OF_DELFT)
 ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
 
 _SYNONYMS = {label.lower(): names for label, names in ACCEPTED_NAMES.items()} | {

@@ -252,7 +252,7 @@ def cluster_reason(clusters: Clusters, row: int, config: Config) -> Reason:
 def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
     """Yield the explanation of each cluster for each camera that sees it."""
     compared = [result.camera.name for result in cameras if result.fusion is not None]
-    ranges = np.hypot(clusters.centroid[:, 0], clusters.centroid[:, 1])
+    ranges = clusters.boxes(config.clustering).distance
     for k, (count, distance) in enumerate(zip(clusters.count, ranges, strict=True)):
         head, reason = (
             f"cluster {k}: {_points(count)} at {distance:.1f} m",
@@ -416,7 +416,8 @@ def _nearest(
         return f"{text}, {not_kept_text(reason)}"
     if fusion is not None and clusters is not None and fusion.detection_decision[d] == Decision.MATCHED:
         cluster = int(fusion.detection_cluster[d])
-        return f"{text}, which is cluster {cluster} at {np.hypot(*clusters.centroid[cluster, :2]):.1f} m"
+        away = clusters.boxes(config.clustering).distance[cluster]
+        return f"{text}, which is cluster {cluster} at {away:.1f} m"
     if opinions.iou[k] < config.opinions.min_iou:
         return f"{text}, {limit(config, 'opinions.min_iou')}"
     return f"{text}, which fits another box better"
@@ -442,7 +443,7 @@ def _fused(
 
 def _object(objects: Objects, row: int) -> str:
     """Return name, score and distance of an object."""
-    return f"{scored(objects, row)} at {np.hypot(*objects.boxes.center[row, :2]):.1f} m"
+    return f"{scored(objects, row)} at {objects.boxes.distance[row]:.1f} m"
 
 
 def _points(count: int | np.integer) -> str:

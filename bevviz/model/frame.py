@@ -157,6 +157,11 @@ class Boxes3D:
         return Boxes3D(self.center[indices], self.size[indices], self.yaw[indices])
 
     @property
+    def distance(self) -> F64:
+        """(K,) metres on the ground plane from the origin, which is the sensor's place, to each centre."""
+        return np.hypot(self.center[:, 0], self.center[:, 1], dtype=np.float64)
+
+    @property
     def columns(self) -> dict[str, F32]:
         """Columns of a table: centre, size and heading."""
         x, y, z = self.center.T

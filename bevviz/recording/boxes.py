@@ -87,7 +87,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             **values,
         ),
     )
-    distances = np.hypot(*objects.boxes.center[:, :2].T)
+    distances = objects.boxes.distance
     is_named = choose_named_in_3d(objects.boxes.center, is_unusual)
     log_box_labels(
         to,

@@ -261,7 +261,7 @@ def _write_names(image: U8, objects: Objects, outlines: I32, colors: Sequence[Se
     """Write each name at a corner of its box, nearest box first. Omit names without free space."""
     rows, columns = image.shape[:2]
     occupied = np.zeros((0, 4), np.int64)
-    for k in np.argsort(np.hypot(*objects.boxes.center[:, :2].T), kind="stable").tolist():
+    for k in np.argsort(objects.boxes.distance, kind="stable").tolist():
         text = f"{objects.names[k]} {objects.score[k]:.2f}"
         (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
         (left, top), (right, bottom) = outlines[k].min(axis=0).tolist(), outlines[k].max(axis=0).tolist()

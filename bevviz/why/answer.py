@@ -38,7 +38,7 @@ class Answer:
         steps: the result of each stage.
         hints: changes of the configuration that change the verdict. Each was run.
         fate: (N,) ``Fate`` of each raw point.
-        distance: horizontal metres, NaN where unknown.
+        distance: metres on the ground from the sensor to its centre, see ``Evidence``.
         points: number of raw points on the subject.
         evidence: the points, clusters and detections of the subject.
         tried: changes that were run and did not help.
@@ -58,6 +58,11 @@ class Answer:
     def near(self) -> bool:
         """Whether the pipeline should report it: it is within 40 m and has 10 points or more."""
         return self.distance <= RANGE and self.points >= MIN_HITS
+
+    @property
+    def center(self) -> tuple[float, float, float] | None:
+        """Centre of its 3D box, or of the box of its cluster, in Frame.points_frame. None: it has neither."""
+        return self.evidence.center
 
     @property
     def weak(self) -> bool:
@@ -226,6 +231,10 @@ class FrameExplainer:
         ]
         order = sorted(answers, key=lambda pair: _place_rank(*pair))
         return [answer for answer, _ in order]
+
+    def about(self, selection: Selection) -> Answer:
+        """Explain the one subject of a selection that selects a row."""
+        return self._answer(select_subjects(self.traces, selection)[0])
 
     def missed(self) -> list[Answer]:
         """Explain the objects that should have been reported and were not, the nearest first."""

@@ -46,6 +46,7 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     named = find_reported_object(subject, traces, parts, candidates)
     if named is not None and named.cluster >= 0:
         main = named.cluster
+    center = _center(subject, result, main)
     candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
     mates = find_mates(subject, traces, main, obstacle)
     shared = separation(subject, traces, main, obstacle, mates)
@@ -55,7 +56,8 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     return Evidence(
         points=points,
         fate=fate,
-        distance=_distance(subject, traces, points, main),
+        center=center,
+        distance=_distance(center, result.frame.points[points]),
         voxels=len(rows),
         ground=heights,
         noise=len(noise),
@@ -167,16 +169,22 @@ def _most_around(centers: F32, points: F32, eps2: float) -> int:
     return largest
 
 
-def _distance(subject: Subject, traces: FrameIndex, points: I64, main: int) -> float:
-    """Return the horizontal distance of the subject in metres, NaN where unknown."""
-    result = traces.result
-    if subject.box is not None:
-        return float(np.hypot(*subject.box.center[0, :2]))
-    if main >= 0 and result.clusters is not None:
-        return float(np.hypot(*result.clusters.centroid[main, :2]))
-    if subject.kind in ("pixel", "detection") and len(points):
-        return float(np.median(np.hypot(*result.frame.points[points, :2].T)))
-    return float("nan")
+def _center(subject: Subject, result: FrameResult, main: int) -> tuple[float, float, float] | None:
+    """Return the centre of the subject's box, or of the box of its cluster."""
+    boxes, row = subject.box, 0
+    if boxes is None and main >= 0 and result.clusters is not None:
+        boxes, row = result.clusters.boxes(result.config.clustering), main
+    if boxes is None:
+        return None
+    x, y, z = boxes.center[row].tolist()
+    return x, y, z
+
+
+def _distance(center: tuple[float, float, float] | None, points: F32) -> float:
+    """Return the metres on the ground to a centre, or the median of the points; NaN without both."""
+    if center is not None:
+        return float(np.hypot(*center[:2]))
+    return float(np.median(np.hypot(*points[:, :2].T))) if len(points) else float("nan")
 
 
 def _largest_gap(result: FrameResult, parts: Sequence[ClusterPart]) -> float:

@@ -96,7 +96,9 @@ class Evidence:
     Attributes:
         points: rows of the raw points of the subject.
         fate: (N,) Fate of every raw point.
-        distance: horizontal metres from the origin of the points; NaN where unknown.
+        center: centre of its 3D box or of that of its cluster, in Frame.points_frame; None: it has neither.
+        distance: metres on the ground from the sensor, which is the origin of the points, to that centre.
+            Without a centre it is the median of its points; NaN: unknown.
         voxels: number of voxels of the subject.
         ground: heights in metres above the local ground of its voxels that are ground.
         noise: number of its voxels that the clustering itself put in no cluster.
@@ -120,6 +122,7 @@ class Evidence:
 
     points: I64
     fate: U8
+    center: tuple[float, float, float] | None
     distance: float
     voxels: int
     ground: F32

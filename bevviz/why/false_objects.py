@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.evaluate import MAX_DISTANCE
+from bevviz.evaluate import MAX_DISTANCE, Truth
 from bevviz.model import geometry
-from bevviz.model.class_names import ACCEPTED_NAMES
+from bevviz.model.class_names import DATA_SETS
 from bevviz.model.reasons import Reason, ReasonKind, scored
-from bevviz.model.results import Decision, Objects
+from bevviz.model.results import Decision, FrameResult, Objects
+from bevviz.why.belonging import opinion_on
 from bevviz.why.evidence import MOST, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex, detection_subject
 from bevviz.why.subject import points_in_box, single_box
@@ -20,13 +21,22 @@ LARGER = 1.5  # a cluster that is this many times as long as the object's box is
 BARELY = 2.0  # factor on a limit of the fusion within which it accepts an object only just
 DOUBLE = 0.1  # IoU from above from which two objects are one
 DEPTH = 3.0  # metres that an object may be nearer than the points in the middle of its 2D box
-_JUDGED = frozenset().union(*ACCEPTED_NAMES.values())  # names that some label of a data set accepts
+
+
+def false_causes(result: FrameResult, truth: Truth | None = None) -> Mapping[int, Reason]:
+    """Return object row -> cause, for the false objects of a result.
+
+    Args:
+        result: result of the frame.
+        truth: ground truth of the frame; None: its own.
+    """
+    return false_reasons(FrameIndex(result, truth=truth))
 
 
 def false_reasons(traces: FrameIndex) -> Mapping[int, Reason]:
     """Return object row -> cause, for the objects that ``evaluate`` calls false.
 
-    Without ground truth these are the doubtful objects. Only objects of our fusion are judged.
+    Without ground truth these are the doubtful objects of our fusion.
     """
     if traces.false is None:
         traces.false = dict(_false_reasons(traces))
@@ -36,14 +46,16 @@ def false_reasons(traces: FrameIndex) -> Mapping[int, Reason]:
 def _false_reasons(traces: FrameIndex) -> Iterator[tuple[int, Reason]]:
     """Yield the false objects with their causes."""
     objects, truth, matches = traces.result.objects, traces.labels_in_evaluate, traces.matches
-    if objects is None or not traces.origin("objects").ours:
+    if objects is None:
         return
     if truth is None or matches is None:
-        for row in range(len(objects)):
+        for row in range(len(objects)) if traces.origin("objects").ours else ():
             if (doubt := _doubt(traces, objects, row)) is not None:
                 yield row, doubt
         return
-    judged = _JUDGED.union(*truth.accepted)
+    # A label of the same data set in another frame may accept a name that no label of this frame does.
+    families = [names for names in DATA_SETS if names.keys() & set(truth.labels)] or DATA_SETS
+    judged = frozenset().union(*truth.accepted, *(names for family in families for names in family.values()))
     for row in np.flatnonzero(matches.false).tolist():
         if objects.names[row].lower() in judged:
             yield row, _cause(traces, objects, row)
@@ -55,7 +67,7 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
     name, partner = objects.names[row], traces.matches.partner
     owner = _owner(traces, objects, row)
     values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
-    holder = _holder_of_points(traces, int(objects.cluster[row]))
+    holder = _holder_of_points(traces, objects, row)
     for number in dict.fromkeys((holder, owner)):
         if number < 0:
             continue
@@ -76,14 +88,13 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
     if owner >= 0:
         truth_box = traces.truth[owner].box
         assert truth_box is not None
-        values["off"] = float(np.hypot(*objects.boxes.center[row, :2]) - np.hypot(*truth_box.center[0, :2]))
+        values["off"] = float(objects.boxes.distance[row] - truth_box.distance[0])
     if (size := _larger_whole(traces, objects, row)) is not None:
         return Reason(ReasonKind.WALL, None, {**values, "size": size})
     if owner >= 0:
         return Reason(ReasonKind.WRONG_DEPTH, None, values)
-    return Reason(
-        ReasonKind.DETECTOR_ERROR, None, {"object": values["object"], "camera": objects.camera[row]}
-    )
+    opinion = "" if traces.origin("objects").ours else opinion_on(traces.result, row)
+    return Reason(ReasonKind.DETECTOR_ERROR, None, {"object": values["object"], "opinion": opinion})
 
 
 def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
@@ -111,9 +122,12 @@ def _owner(traces: FrameIndex, objects: Objects, row: int) -> int:
     return -1 if camera is None else int(traces.owners(camera)[objects.detection[row]])
 
 
-def _holder_of_points(traces: FrameIndex, cluster: int) -> int:
-    """Return the row of the ground truth object that holds most points of a cluster, -1: none."""
-    points = traces.result.frame.points[traces.cluster == cluster]
+def _holder_of_points(traces: FrameIndex, objects: Objects, row: int) -> int:
+    """Return the row of the ground truth object that holds most points of an object, -1: none."""
+    points, cluster = traces.result.frame.points, int(objects.cluster[row])
+    has_cluster = cluster >= 0 and traces.origin("objects").ours
+    is_own = traces.cluster == cluster if has_cluster else geometry.inside(points, objects.boxes, row)
+    points = points[is_own]
     shares = [
         points_in_box(subject.box, points).mean() if subject.box is not None and len(points) else 0.0
         for subject in traces.truth
@@ -169,7 +183,7 @@ def _off_its_box(traces: FrameIndex, objects: Objects, row: int) -> float:
     if fusion.detection_decision[detection] != Decision.MATCHED:
         return 0.0
     pair = fusion.pair(detection, int(objects.cluster[row]))
-    points = traces.place(detection_subject(camera, detection))
+    points = traces.place(detection_subject(traces.result, camera, detection))
     if pair is None or not len(points):
         return 0.0
     depth = geometry.apply(view.camera_from_points, traces.result.frame.points[points])[:, 2]

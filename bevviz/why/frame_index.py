@@ -12,11 +12,10 @@ import numpy as np
 from bevviz.evaluate import Matches, Truth, judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
-from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D, Frame
+from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.clustering import dbscan
-from bevviz.stages.robot_results import in_points_frame
 from bevviz.stages.visibility import share_in_image
 from bevviz.why.fits import Fits, find_fits
 from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_box, single_box
@@ -55,10 +54,11 @@ class FrameIndex:
     Args:
         result: result of the frame.
         classes: names of the classes that the detector knows. Classes detected in this frame are added.
+        truth: ground truth of the frame; None: its own.
     """
 
-    def __init__(self, result: FrameResult, classes: Sequence[str] = ()) -> None:
-        self.result = result
+    def __init__(self, result: FrameResult, classes: Sequence[str] = (), truth: Truth | None = None) -> None:
+        self.result, self._truth = result, truth
         seen = [name for c in result.cameras if c.detections is not None for name in c.detections.names]
         self.classes = tuple(dict.fromkeys([*classes, *seen]))
         self._places: dict[tuple[object, ...], I64] = {}
@@ -228,13 +228,16 @@ class FrameIndex:
     @cached_property
     def truth(self) -> tuple[Subject, ...]:
         """Objects of the ground truth, in order of their rows."""
-        return truth_subjects(self.result.frame, self.classes)
+        truth = self.labels_in_evaluate
+        return () if truth is None else truth_subjects(truth, self.classes)
 
     @cached_property
     def labels_in_evaluate(self) -> Truth | None:
         """The ground truth in the form that ``evaluate`` judges objects by."""
         frame = self.result.frame
-        return None if frame.truth is None else truth_of(frame, frame.truth)
+        if self._truth is not None or frame.truth is None:
+            return self._truth
+        return truth_of(frame, frame.truth)
 
     @cached_property
     def matches(self) -> Matches | None:
@@ -257,7 +260,7 @@ class FrameIndex:
     def shown(self) -> F32:
         """(K, cameras) share of each object of the ground truth that is inside each camera's image."""
         share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
-        boxes = joined_boxes([subject.box for subject in self.truth if subject.box is not None])
+        boxes = Boxes3D.joined([subject.box for subject in self.truth if subject.box is not None])
         for column, camera in enumerate(self.result.cameras):
             share[:, column] = share_in_image(boxes, camera.camera)
         return share
@@ -338,22 +341,20 @@ class FrameIndex:
         for camera in self.result.cameras:
             if camera.detections is not None:
                 kept = camera.detections.kept & (self.owners(camera) < 0)
-                subjects += [detection_subject(camera, row) for row in np.flatnonzero(kept).tolist()]
+                subjects += [
+                    detection_subject(self.result, camera, row) for row in np.flatnonzero(kept).tolist()
+                ]
         return tuple(subjects)
 
 
-def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
+def truth_subjects(truth: Truth, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
     """Return the objects of a frame's ground truth, in order of their rows.
 
     Args:
-        frame: the frame.
+        truth: the ground truth.
         classes: names of the classes that the detector knows.
     """
-    stated = frame.truth
-    if stated is None:
-        return ()
-    boxes = in_points_frame(frame, stated)
-    away = np.hypot(*boxes.center[:, :2].T)
+    away = truth.boxes.distance
     return tuple(
         Subject(
             "truth",
@@ -361,29 +362,21 @@ def truth_subjects(frame: Frame, classes: Sequence[str] = ()) -> tuple[Subject, 
             label,
             accepted_names(label, classes),
             row,
-            box=single_box(boxes, row),
+            box=single_box(truth.boxes, row),
         )
-        for row, label in enumerate(stated.labels)
+        for row, label in enumerate(truth.labels)
     )
 
 
-def joined_boxes(boxes: Sequence[Boxes3D]) -> Boxes3D:
-    """Return several lists of boxes as one list."""
-    if not boxes:
-        return Boxes3D.empty()
-    columns = ([getattr(box, name) for box in boxes] for name in ("center", "size", "yaw"))
-    return Boxes3D(*map(np.concatenate, columns))
-
-
-def detection_subject(camera: CameraResult, row: int) -> Subject:
+def detection_subject(result: FrameResult, camera: CameraResult, row: int) -> Subject:
     """Return a detection as a subject of its own."""
-    detections = camera.detections
+    detections, clusters = camera.detections, result.clusters
     assert detections is not None
     label, fusion = detections.names[row], camera.fusion
     name = f"the {label} {detections.score[row]:.2f} in {camera.camera.name}"
-    if fusion is not None and fusion.detection_decision[row] == Decision.MATCHED:
-        pair = fusion.pair(row, int(fusion.detection_cluster[row]))
-        name += f" at {pair.depth:.1f} m" if pair is not None else ""
+    if clusters is not None and fusion is not None and fusion.detection_decision[row] == Decision.MATCHED:
+        boxes = clusters.boxes(result.config.clustering)
+        name += f" at {boxes.distance[fusion.detection_cluster[row]]:.1f} m"
     return Subject(
         "detection", name, label, frozenset({label.lower()}), row, camera.camera.name, detections.xyxy[row]
     )

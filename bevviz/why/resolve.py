@@ -15,7 +15,7 @@ from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
 from bevviz.why.belonging import OVERLAP
 from bevviz.why.false_objects import false_reasons
-from bevviz.why.frame_index import FEW, FrameIndex, detection_subject, joined_boxes
+from bevviz.why.frame_index import FEW, FrameIndex, detection_subject
 from bevviz.why.selection import Selection
 from bevviz.why.subject import IN_VIEW, LINK, Subject, projected_box, single_box
 
@@ -47,7 +47,7 @@ def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
             raise UserError(
                 f"there is no detection {selection.detection} in {camera.camera.name}: it has {number}"
             )
-        return [detection_subject(camera, selection.detection)]
+        return [detection_subject(result, camera, selection.detection)]
     if selection.point or selection.cell:
         return [_surroundings(traces, selection)]
     if selection.box:
@@ -95,7 +95,7 @@ def object_subject(traces: FrameIndex, row: int) -> Subject:
     if objects is None or not 0 <= row < number:
         raise UserError(f"there is no object {row} in this frame: it has {number}")
     box, name = single_box(objects.boxes, row), objects.names[row]
-    away = float(np.hypot(*box.center[0, :2]))
+    away = float(box.distance[0])
     cluster = int(objects.cluster[row])
     points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
     title = f"the {name} {objects.score[row]:.2f} at {away:.1f} m"
@@ -112,10 +112,9 @@ def cluster_subject(traces: FrameIndex, row: int) -> Subject:
     number = 0 if clusters is None else len(clusters)
     if clusters is None or not 0 <= row < number:
         raise UserError(f"there is no cluster {row} in this frame: it has {number}")
-    away = float(np.hypot(*clusters.centroid[row, :2]))
     points = np.flatnonzero(traces.cluster == row)
-    name = f"cluster {row} at {away:.1f} m"
     box = single_box(clusters.boxes(traces.result.config.clustering), row)
+    name = f"cluster {row} at {box.distance[0]:.1f} m"
     return Subject("cluster", name, row=row, box=box, points=points)
 
 
@@ -136,7 +135,7 @@ def track_subject(traces: FrameIndex, number: int) -> Subject:
     box, name, cluster = single_box(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
     if tracks.absolute:
         box = geometry.transform_boxes(box, geometry.inverse(frame.pose))
-    title = f"track {number}{f' ({name})' if name else ''} at {float(np.hypot(*box.center[0, :2])):.1f} m"
+    title = f"track {number}{f' ({name})' if name else ''} at {float(box.distance[0]):.1f} m"
     points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
     accepted = frozenset({name.lower()} if name else ())
     return Subject("track", title, name, accepted, number, box=box, points=points)
@@ -241,7 +240,7 @@ def _strange_detections(traces: FrameIndex, camera: str) -> Iterator[Subject]:
         strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(camera_result) < 0)
         strange[_detections_of_false_objects(traces, camera_result)] = False
         for row in np.flatnonzero(strange).tolist():
-            yield detection_subject(camera_result, row)
+            yield detection_subject(traces.result, camera_result, row)
 
 
 def _detections_of_false_objects(traces: FrameIndex, camera: CameraResult) -> list[int]:
@@ -266,10 +265,11 @@ def _contradicted_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
     opinions, objects = traces.result.opinions, traces.result.objects
     if opinions is None or objects is None:
         return
-    real = joined_boxes([subject.box for subject in traces.truth if subject.box is not None])
+    real = Boxes3D.joined([subject.box for subject in traces.truth if subject.box is not None])
+    false = false_reasons(traces)  # subjects themselves
     in_truth = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
     for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
-        if not in_truth[row] and camera in ("", opinions.camera[row]):
+        if not in_truth[row] and row not in false and camera in ("", opinions.camera[row]):
             yield object_subject(traces, row)
 
 
@@ -323,7 +323,7 @@ def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subjec
     rows = {subject.row for subject, _ in things}
     for row, fit in _detections_at_box(camera, image_box, pixel):
         if camera.detections is not None and traces.owners(camera)[row] not in rows:
-            subject = detection_subject(camera, row)
+            subject = detection_subject(traces.result, camera, row)
             if camera.fusion is not None and camera.fusion.detection_decision[row] == Decision.MATCHED:
                 covered.add(int(camera.fusion.detection_cluster[row]))
             things.append((subject, fit))

@@ -353,6 +353,11 @@ def _wall(reason: Reason, _: Subject) -> str:
     return f"{text}, {_side(reason)} {reason['truth']}" if reason["truth"] else text
 
 
+def _nothing_labelled(reason: Reason, _: Subject) -> str:
+    text = "it is the detector's own error: nothing is labelled there"
+    return f"{text}, and it is {reason['opinion']}" if reason["opinion"] else text
+
+
 FALSE_SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words after "but"
     ReasonKind.DUPLICATE: _duplicate,
     ReasonKind.SPLIT: _part,
@@ -360,7 +365,7 @@ FALSE_SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the w
     ReasonKind.MISPLACED: _off,
     ReasonKind.WRONG_DEPTH: _wrong_depth,
     ReasonKind.WALL: _wall,
-    ReasonKind.DETECTOR_ERROR: lambda *_: "it is the detector's own error: nothing is labelled there",
+    ReasonKind.DETECTOR_ERROR: _nothing_labelled,
 }
 
 SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words after "because"

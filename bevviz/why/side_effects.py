@@ -12,7 +12,6 @@ from bevviz.evaluate import Truth, match
 from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
-from bevviz.why.frame_index import joined_boxes
 from bevviz.why.subject import Subject, count
 
 
@@ -156,14 +155,14 @@ def _seen(objects: Objects | None) -> SideResult:
 
 def _name(name: str, boxes: Boxes3D, row: int) -> str:
     """Return the class and distance of an object."""
-    return f"{name} at {float(np.hypot(*boxes.center[row, :2])):.1f} m"
+    return f"{name} at {boxes.distance[row]:.1f} m"
 
 
 def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]:
     """Return the ground truth row of each object by the rule of ``evaluate``, -1: none."""
     if objects is None:
         return []
-    boxes = joined_boxes([subject.box for subject in subjects if subject.box is not None])
+    boxes = Boxes3D.joined([subject.box for subject in subjects if subject.box is not None])
     accepted = tuple(_accepted_names(subject.label) for subject in subjects)
     labels = tuple(subject.label for subject in subjects)
     partner, _ = match(objects, Truth(boxes, labels, accepted, np.ones(len(labels), np.bool_)))

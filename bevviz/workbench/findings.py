@@ -1,6 +1,6 @@
 """Findings: missed, false and unexplained objects of a frame, and the list of them over the drive.
 
-A finding that lasts several frames is one group of the list.
+A finding is an answer of ``why`` in brief. One that lasts several frames is one group of the list.
 """
 
 from __future__ import annotations
@@ -8,17 +8,16 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from bevviz.evaluate import RANGE, Truth, match
+from bevviz.evaluate import RANGE
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Frame
-from bevviz.model.results import Anomaly, Decision, FrameResult, Opinion
-from bevviz.pipeline.session import Session
-from bevviz.why import FrameExplainer, Selection
+from bevviz.model.results import Anomaly, Decision, Opinion
+from bevviz.why import Answer, FrameExplainer, Selection
 
 FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
 
@@ -37,11 +36,11 @@ class Finding:
     Attributes:
         frame: number of the scan.
         stamp: stamp of the scan, in nanoseconds.
-        what: missed, false, contradicted, lost, unmatched or unnamed.
+        what: kind: missed, false, doubtful, contradicted, lost, unmatched, unnamed, or a difference.
         name: name of the class, or "cluster".
-        distance: horizontal distance in metres. NaN: unknown.
+        distance: distance that the answer gives. NaN: unknown.
         selection: selection that asks about it.
-        reason: short reason.
+        reason: reason that the answer gives.
         position: position in the fixed frame, if known.
         box: (4,) box in the image, for a detection without position.
     """
@@ -57,89 +56,64 @@ class Finding:
     box: F32 | None = None
 
 
-def find_findings(result: FrameResult, truth: Truth | None) -> list[Finding]:
-    """Return the findings of a frame within 40 m, nearest first.
+def find_findings(explainer: FrameExplainer) -> list[Finding]:
+    """Return the findings of a frame, those within 40 m and all false objects, nearest first.
 
     With ground truth these are missed and false objects. Without it they are:
 
     - objects of another perception that a camera contradicts,
     - objects that it has lost and our fusion has,
+    - doubtful objects,
     - kept detections without a cluster,
     - clusters in view without a detection.
     """
-    findings = list(
-        _judged(result, truth) if truth is not None else [*_doubted(result), *_unexplained(result)]
-    )
-    near_findings = [finding for finding in findings if not finding.distance > RANGE]
+    traces = explainer.traces
+    named = _judged(explainer) if traces.labels_in_evaluate is not None else _unexplained(explainer)
+    findings = [finding_of(traces.result.frame, what, answer) for what, answer in named]
+    near_findings = [
+        finding for finding in findings if finding.what == "false" or not finding.distance > RANGE
+    ]
     return sorted(
         near_findings,
         key=lambda finding: (finding.what == "false", np.nan_to_num(finding.distance, nan=RANGE)),
     )
 
 
-def with_reasons(findings: Sequence[Finding], result: FrameResult, session: Session) -> list[Finding]:
-    """Return the findings with the reason of the verdict at each missed object.
-
-    Args:
-        findings: findings of the frame.
-        result: result of the frame.
-        session: session with the loaded stages.
-    """
-    if not any(finding.what == "missed" for finding in findings):
-        return list(findings)
-    explainer = FrameExplainer(result, session.loader, session.stages.class_names)
-
-    def with_reason(finding: Finding) -> Finding:
-        answers = explainer.ask(finding.selection) if finding.what == "missed" else []
-        return replace(finding, reason=answers[0].verdict.kind.value) if answers else finding
-
-    return [with_reason(finding) for finding in findings]
+def finding_of(frame: Frame, what: str, answer: Answer) -> Finding:
+    """Return an answer about an object, a detection or a cluster as a finding."""
+    subject, selection, position = answer.subject, answer.selection, None
+    assert selection is not None
+    if answer.center is not None:
+        x, y, z = geometry.apply(frame.pose, np.asarray(answer.center, np.float32)[None])[0].tolist()
+        position = x, y, z
+    name, reason = subject.label or subject.kind, answer.verdict.kind.value
+    if subject.kind == "truth":
+        name = name.lower()
+    return Finding(
+        frame.index, frame.stamp, what, name, answer.distance, selection, reason, position, subject.xyxy
+    )
 
 
-def finding_at(
-    frame: Frame, kind: str, name: str, center: F32, selection: Selection, reason: str = ""
-) -> Finding:
-    """Return a finding at a centre in the frame of the points."""
-    x, y, z = geometry.apply(frame.pose, np.asarray(center, np.float32)[None])[0].tolist()
-    distance = float(np.hypot(*center[:2]))
-    return Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z))
+def _judged(explainer: FrameExplainer) -> Iterator[tuple[str, Answer]]:
+    """Yield the missed objects and the false ones, by ground truth."""
+    truth, matches = explainer.traces.labels_in_evaluate, explainer.traces.matches
+    assert truth is not None
+    for row in np.flatnonzero(truth.must if matches is None else matches.missed).tolist():
+        yield "missed", explainer.about(Selection(truth=row))
+    yield from (("false", answer) for answer in explainer.false_objects())
 
 
-def _judged(result: FrameResult, truth: Truth) -> Iterator[Finding]:
-    """Yield the false and the missed objects by ground truth."""
-    frame, objects = result.frame, result.objects
-    unmatched = truth.must.copy()
-    if objects is not None and len(objects):
-        partner, _ = match(objects, truth)
-        unmatched[partner[partner >= 0]] = False
-        judged = frozenset().union(*truth.accepted)
-        for row in np.flatnonzero(partner < 0).tolist():
-            name, center = objects.names[row], objects.boxes.center[row]
-            if name.lower() in judged:
-                yield finding_at(frame, "false", name, center, Selection(object=row))
-    for row in np.flatnonzero(unmatched).tolist():
-        name, center = truth.labels[row].lower(), truth.boxes.center[row]
-        yield finding_at(frame, "missed", name, center, Selection(truth=row))
-
-
-def _doubted(result: FrameResult) -> Iterator[Finding]:
-    """Yield the findings about objects of another perception: contradicted by a camera, or lost."""
-    frame, opinions, objects = result.frame, result.opinions, result.objects
-    if opinions is None or objects is None:
-        return
-    for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
-        name, center, reason = objects.names[row], objects.boxes.center[row], f"by {opinions.camera[row]}"
-        yield finding_at(frame, "contradicted", name, center, Selection(object=row), reason)
-    fused = opinions.fused
-    for row in np.flatnonzero(opinions.missed).tolist():
-        camera, reason = fused.camera[row], f"{fused.score[row]:.2f} in {fused.camera[row]}"
-        selection = Selection(detection=int(fused.detection[row]), camera=camera)
-        yield finding_at(frame, "lost", fused.names[row], fused.boxes.center[row], selection, reason)
-
-
-def _unexplained(result: FrameResult) -> Iterator[Finding]:
-    """Yield the detections without a cluster and the clusters without a detection."""
-    frame, clusters = result.frame, result.clusters
+def _unexplained(explainer: FrameExplainer) -> Iterator[tuple[str, Answer]]:
+    """Yield doubtful objects, detections without a cluster and clusters without a detection."""
+    result = explainer.traces.result
+    clusters, opinions = result.clusters, result.opinions
+    if opinions is not None:
+        for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
+            yield "contradicted", explainer.about(Selection(object=row))
+        for row in np.flatnonzero(opinions.missed).tolist():
+            detection, camera_name = int(opinions.fused.detection[row]), opinions.fused.camera[row]
+            yield "lost", explainer.about(Selection(detection=detection, camera=camera_name))
+    yield from (("doubtful", answer) for answer in explainer.false_objects())
     named = np.zeros(0 if clusters is None else len(clusters), bool)
     in_view = named.copy()
     for camera in result.cameras:
@@ -149,20 +123,12 @@ def _unexplained(result: FrameResult) -> Iterator[Finding]:
         named |= fusion.cluster_decision == Decision.MATCHED
         in_view |= fusion.cluster_decision == Decision.NO_DETECTION
         for row in np.flatnonzero(detections.kept & (fusion.detection_decision != Decision.MATCHED)).tolist():
-            reason = Decision(int(fusion.detection_decision[row])).name.lower().replace("_", " ")
-            name, selection = detections.names[row], Selection(detection=row, camera=camera.camera.name)
-            if (cluster := int(fusion.detection_cluster[row])) >= 0 and clusters is not None:
-                center = clusters.centroid[cluster]
-                finding = finding_at(frame, "unmatched", name, center, selection, reason)
-            else:
-                finding = Finding(frame.index, frame.stamp, "unmatched", name, math.nan, selection, reason)
-            yield replace(finding, box=detections.xyxy[row])
+            yield "unmatched", explainer.about(Selection(detection=row, camera=camera.camera.name))
     if clusters is None:
         return
-    for row in np.flatnonzero(in_view & ~named & clusters.kept & (clusters.count >= FEW)).tolist():
-        reason = f"{clusters.count[row]} points, no detection"
-        center, selection = clusters.centroid[row], Selection(cluster=row)
-        yield finding_at(frame, "unnamed", "cluster", center, selection, reason)
+    near = clusters.boxes(result.config.clustering).distance <= RANGE
+    for row in np.flatnonzero(in_view & ~named & clusters.kept & (clusters.count >= FEW) & near).tolist():
+        yield "unnamed", explainer.about(Selection(cluster=row))
 
 
 # --- list over the drive -----------------------------------------------------------------------
@@ -264,6 +230,12 @@ class FindingList:
                 del self._groups[number]
             for key in [key for key in self._recent if key[0] in kinds]:
                 del self._recent[key]
+
+    def reasons(self) -> dict[tuple[int, str], str]:
+        """Return the reasons of the findings of the drive as opened, by frame and text of the selection."""
+        with self._lock:
+            frames = [one for group in self._groups.values() for one in group.frames]
+        return {(one.frame, one.pick): one.text for one in frames if not one.tried}
 
     def news(self, sent_counts: dict[int, int]) -> Iterator[dict[str, Any]]:
         """Yield the news for a page. ``sent_counts`` counts the frames that it has of each group."""

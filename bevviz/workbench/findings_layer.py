@@ -19,7 +19,6 @@ from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, transform
 from bevviz.recording.writer import Writer
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.support.colors import Color, StateColor
-from bevviz.why.frame_index import joined_boxes
 from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.findings import Finding
 
@@ -30,6 +29,7 @@ LAYERS = {
     "false": (entities.FALSE, StateColor.DOUBTFUL.value),
     "unnamed": (entities.UNNAMED, StateColor.UNKNOWN.value),
 }
+DRAWN_AS = {"doubtful": "false"}
 
 
 def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) -> FindingRows:
@@ -42,12 +42,12 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
     """
     layer: dict[str, Sequence[Finding]] = {}
     for kind, (path, color) in LAYERS.items():
-        layer_findings = [finding for finding in findings if finding.what == kind]
+        layer_findings = [finding for finding in findings if DRAWN_AS.get(finding.what, finding.what) == kind]
         if not layer_findings:
             continue
-        boxes = joined_boxes([_box(result, finding) for finding in layer_findings])
+        boxes = Boxes3D.joined([_box(result, finding) for finding in layer_findings])
         labels = [
-            f"{finding.name} {kind}{f': {finding.reason}' if finding.reason else ''}"
+            f"{finding.name} {finding.what}{f': {finding.reason}' if finding.reason else ''}"
             for finding in layer_findings
         ]
         shows_label = (

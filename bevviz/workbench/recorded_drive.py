@@ -30,11 +30,11 @@ from bevviz.recording import blueprints, entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import APPLICATION
 from bevviz.recording.writer import SCALAR_WAIT
-from bevviz.why import Answer, Selection
+from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.workbench.buffers import BufferReader, PageState, Reader, RecordingBuffer
-from bevviz.workbench.findings import Finding, find_findings, with_reasons
+from bevviz.workbench.findings import Finding, find_findings
 from bevviz.workbench.findings_layer import FindingRows, log_layer
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.session import DriveTools, WorkbenchSession
@@ -148,7 +148,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def _run(self) -> None:
         try:
             first = self.look(self._first)
-            self.show(first, find_findings(first, self.truth(first.frame)))
+            self.show(first, find_findings(self.explainer(first)))
             self._go.wait(FIRST)
             run(self.again, self.drive.new_session(), [self], stop=self._stop)
         except Exception as error:
@@ -165,7 +165,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def observe(self, result: FrameResult) -> None:
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
-        findings = with_reasons(find_findings(result, self.truth(frame)), result, self.pipeline)
+        findings = find_findings(self.explainer(result))
         self.show(result, findings)
         self._reached = max(self._reached, frame.stamp)
         if result.tracks is not None:
@@ -246,15 +246,16 @@ class RecordedDrive(Source, Observer[FrameResult]):
             self.opening = frame.stamp
             self.news.tell()
 
-    def draw_tried(self, logger: FrameLogger, result: FrameResult) -> None:
+    def draw_tried(self, logger: FrameLogger, explainer: FrameExplainer) -> None:
         """Log a frame with other values beside the result of the run."""
+        result = explainer.traces.result
         logger.refresh(self._run_logger.results)
         # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
         # always drawn again, so that its colours change back, too.
         config, opened, number = result.config, self.drive.config, result.frame.index
         if (config.voxel, config.ground) != (opened.voxel, opened.ground):
             self._recoloured.add(number)
-        findings = find_findings(result, self.truth(result.frame))
+        findings = find_findings(explainer)
         self._draw(logger, result, findings, tried=True, cloud=number in self._recoloured)
 
     def _draw(
@@ -368,7 +369,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
             UserError: as ``look``.
         """
         before, after = self.look(number), self.look(number, settings)
-        self.draw_tried(self._tried_logger, after)
+        self.draw_tried(self._tried_logger, self.explainer(after))
         self._tried_logger.flush()
         self.desk.add(self._desk_stream.read())
         return before, after

@@ -26,13 +26,13 @@ from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.findings import find_findings, with_reasons
+from bevviz.workbench.findings import find_findings
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.source import Message, Settings, Source
 
 KEPT = 4  # held frames that are kept
 TRIED = 2  # results of held frames with other values that are kept
-LISTED = ("missed", "false", "contradicted", "lost", "unmatched", "unnamed")
+LISTED = ("missed", "false", "doubtful", "contradicted", "lost", "unmatched", "unnamed")
 
 
 class RunningRobot(Source):
@@ -144,9 +144,8 @@ class RunningRobot(Source):
             self._kept.move_to_end(index)
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
-        findings = find_findings(result, self.truth(result.frame))
         self.findings.replace(LISTED)
-        self.findings.add(with_reasons(findings, result, self.pipeline))
+        self.findings.add(find_findings(self.explainer(result)))
         self.news.tell()
         return result
 

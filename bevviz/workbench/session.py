@@ -123,8 +123,7 @@ class WorkbenchSession(Closable):
         """Return the explainer of the frame, the answers, and those of them that a place selects."""
         result = self.source.look(number, settings)
         if self._explainer is None or self._explainer.traces.result is not result:
-            pipeline = self.source.pipeline
-            self._explainer = FrameExplainer(result, pipeline.loader, pipeline.stages.class_names)
+            self._explainer = self.source.explainer(result)
         candidates = self._explainer.candidates(selection) if selection.is_place else []
         return self._explainer, candidates or self._explainer.ask(selection), candidates
 

@@ -14,7 +14,7 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.support.contexts import Closable
-from bevviz.why import Answer, Selection
+from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.findings import FindingList
 
@@ -48,6 +48,10 @@ class Source(Closable):
     def truth(self, frame: Frame) -> Truth | None:
         """Return the ground truth of a frame, if there is any."""
         return None if self.truth_of is None else self.truth_of(frame)
+
+    def explainer(self, result: FrameResult) -> FrameExplainer:
+        """Return an explainer of a result, for the list and for questions."""
+        return FrameExplainer(result, self.pipeline.loader, self.pipeline.stages.class_names)
 
     def start(self) -> None:
         """Start to make frames, if they are not made already."""

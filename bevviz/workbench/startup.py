@@ -93,6 +93,14 @@ class LabelledSource(BagSource):
             return frame
         scores = np.ones(len(truth.labels), np.float32)
         boxes = LabelledBoxes3D(
-            "", frame.stamp, frame.points_frame, truth.boxes, truth.labels, scores, frame.pose
+            "",
+            frame.stamp,
+            frame.points_frame,
+            truth.boxes,
+            truth.labels,
+            scores,
+            frame.pose,
+            ids=truth.ids,
+            image=truth.image,
         )
         return replace(frame, truth=boxes)

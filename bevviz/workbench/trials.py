@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +13,18 @@ import numpy as np
 from bevviz.config import changed_config, changes
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import ObjectScore, Truth
+from bevviz.model import geometry
 from bevviz.model.counts import OPINIONS, count_opinions
-from bevviz.model.frame import F32
 from bevviz.model.protocols import Observer
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.why.frame_index import truth_subjects
-from bevviz.why.selection import Selection
+from bevviz.why import FrameExplainer, Selection
+from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
-from bevviz.why.subject import Subject
-from bevviz.workbench.findings import Finding, finding_at
+from bevviz.workbench.findings import Finding, finding_of
 
 if TYPE_CHECKING:
     from bevviz.workbench.recorded_drive import RecordedDrive
@@ -154,15 +154,16 @@ class _TrialObserver(Observer[FrameResult]):
         self, drive: RecordedDrive, trial: Trial, logger: FrameLogger, show: Callable[[], None]
     ) -> None:
         self._drive, self._trial, self._logger, self._show = drive, trial, logger, show
+        self._reasons = drive.findings.reasons()
 
     def observe(self, result: FrameResult) -> None:
         """Log a frame, list its differences and count them."""
         drive, trial, frame = self._drive, self._trial, result.frame
         before, truth = drive.objects(frame.index), drive.truth(frame)
-        drive.draw_tried(self._logger, result)
-        subjects = truth_subjects(frame, drive.pipeline.stages.class_names)
-        side_effects = effects(before, result.objects, subjects)
-        findings = list(difference_findings(result, side_effects, subjects, before))
+        explainer = drive.explainer(result)
+        drive.draw_tried(self._logger, explainer)
+        side_effects = effects(before, result.objects, explainer.traces.truth)
+        findings = list(difference_findings(explainer, side_effects, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
         trial.counts["changed"] += side_effects.changed
         for tried in (False, True):
@@ -188,30 +189,40 @@ class _TrialObserver(Observer[FrameResult]):
 
 
 def difference_findings(
-    result: FrameResult, side_effects: Effects, truth: Sequence[Subject], before: Objects | None
+    explainer: FrameExplainer,
+    side_effects: Effects,
+    before: Objects | None,
+    reasons: Mapping[tuple[int, str], str],
 ) -> Iterator[tuple[Finding, bool]]:
-    """Yield the findings that other values cause in a frame, and whether the tried side shows them."""
-    frame, after = result.frame, result.objects
+    """Yield the findings that other values cause in a frame, and whether the tried side shows them.
 
-    def difference(kind: str, name: str, center: F32, selection: Selection) -> Finding:
-        return finding_at(frame, kind, name.rsplit(" at ", 1)[0], center, selection)
+    Args:
+        explainer: explainer of the result with the other values.
+        side_effects: their effects.
+        before: objects of the drive as opened.
+        reasons: reasons of the findings of the drive as opened, by frame and text of the selection.
+    """
+    frame = explainer.traces.result.frame
+
+    def tried(kind: str, selection: Selection) -> tuple[Finding, bool]:
+        return finding_of(frame, kind, explainer.about(selection)), True
 
     for effect in side_effects.made:
-        if effect.truth >= 0 and (box := truth[effect.truth].box) is not None:
-            yield difference("fixed", effect.name, box.center[0], Selection(truth=effect.truth)), True
+        if effect.truth >= 0:
+            yield tried("fixed", Selection(truth=effect.truth))
     for effect in side_effects.more:
-        assert after is not None
         if not side_effects.known or effect.truth < 0:
-            kind, center = "new false" if side_effects.known else "new", after.boxes.center[effect.after]
-            yield difference(kind, effect.name, center, Selection(object=effect.after)), True
+            yield tried("new false" if side_effects.known else "new", Selection(object=effect.after))
     for effect in side_effects.gone:
         assert before is not None
-        center = before.boxes.center[effect.before]
         if effect.missed:
-            yield difference("broken", effect.name, center, Selection(truth=effect.truth)), True
+            yield tried("broken", Selection(truth=effect.truth))
         elif not side_effects.known or effect.truth < 0:
-            kind = "false gone" if side_effects.known else "gone"
-            yield difference(kind, effect.name, center, Selection(object=effect.before)), False
+            kind, selection = "false gone" if side_effects.known else "gone", Selection(object=effect.before)
+            name, distance = before.names[effect.before], float(before.boxes.distance[effect.before])
+            x, y, z = geometry.apply(frame.pose, before.boxes.center[[effect.before]])[0].tolist()
+            reason = reasons.get((frame.index, str(selection)), ReasonKind.REPORTED.value)
+            yield Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z)), False
 
 
 def trial_effects(
@@ -225,7 +236,7 @@ def trial_effects(
         truth: ground truth of the frame.
         truth_row: row of the ground truth object that was asked about. Its effect comes first. -1: none.
     """
-    subjects = truth_subjects(after.frame, _names(before))
+    subjects = FrameIndex(after, _names(before)).truth
     side_effects = effects(before.objects, after.objects, subjects, truth_row)
     message: dict[str, Any] = {
         "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},

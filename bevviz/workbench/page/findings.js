@@ -5,7 +5,7 @@ import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
 const PAUSE = 200; // ms between two updates of the page
-const KINDS = ["missed", "lost", "contradicted", "unmatched", "broken", "new false", "fixed", "false gone", "new", "gone",
+const KINDS = ["missed", "lost", "contradicted", "unmatched", "doubtful", "broken", "new false", "fixed", "false gone", "new", "gone",
   "unnamed", "false", "anomaly", "note"];
 const RANK = new Map(KINDS.map((kind, row) => [kind, row]));
 RANK.set("unmatched", 0);
