@@ -283,8 +283,9 @@ class Drive(Closable):
         """
         from bevviz.evaluate.evaluation import Evaluation
         from bevviz.evaluate.ground_truth import truth_in
+        from bevviz.why.false_objects import false_causes
 
-        evaluation = Evaluation(truth_in(self.frames, truth, _path(kitti_labels)))
+        evaluation = Evaluation(truth_in(self.frames, truth, _path(kitti_labels)), false_causes)
         self.run([evaluation])
         return evaluation
 

@@ -65,11 +65,12 @@ def _evaluate(options: argparse.Namespace) -> int:
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.ground_truth import truth_in
     from bevviz.evaluate.metrics import parse_limits
+    from bevviz.why.false_objects import false_causes
 
     limits = parse_limits(options.min, options.max)
     config = load_config(options)
     with open_bag(options, config) as frames:
-        evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels))
+        evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels), false_causes)
         status = _run(frames, config, evaluation, Outputs.of(options), table=not json_on_stdout(options))
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")

@@ -6,7 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from bevviz.evaluate.metrics import base_of, ranges
 from bevviz.evaluate.tracking_score import HINT, TrackScore
 from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.protocols import Observer
+from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult, Objects
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support import table
@@ -34,6 +35,7 @@ OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
 UNLABELLED = (0, 1)
 
 Row = tuple[str, ...]
+CauseLookup: TypeAlias = "Callable[[FrameResult, Truth], Mapping[int, Reason]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class JudgedFrame:
     stamp: int
     true: tuple[str, ...]  # text as ``person at 12.3 m, 4° left``
     missed: tuple[str, ...]
-    false: tuple[tuple[str, str], ...]  # name and text; a name that no label accepts is not judged
+    false: tuple[tuple[str, str, str], ...]  # name, text, cause; a name that no label accepts is not judged
 
 
 class Evaluation(Observer[FrameResult]):
@@ -52,17 +54,20 @@ class Evaluation(Observer[FrameResult]):
 
     Args:
         truth: returns the ground truth of a frame. None: it is not known.
+        causes: returns the causes of the false objects of a frame by row. None: they are not asked for.
 
     Attributes:
         last: result, ground truth and matches of the last frame.
+        causes: causes of its false objects, by row.
 
     Example:
         >>> evaluation = drive.evaluate()
         >>> evaluation.metrics["recall.person"]
     """
 
-    def __init__(self, truth: TruthLookup) -> None:
-        self._truth = truth
+    def __init__(self, truth: TruthLookup, causes: CauseLookup | None = None) -> None:
+        self._truth, self._causes = truth, causes
+        self.causes: Mapping[int, Reason] = {}
         self.judged: list[JudgedFrame] = []
         self.without = 0  # frames without ground truth
         self.unusable: list[str] = []  # one sentence for each label that cannot be used
@@ -87,7 +92,9 @@ class Evaluation(Observer[FrameResult]):
         objects = result.objects if result.objects is not None else _no_objects()
         matches = self._score.add(objects, truth)
         self.last = result, truth, matches
-        self.judged.append(_judged_frame(result.frame, objects, truth, matches))
+        asked = self._causes is not None and matches.false.any()
+        self.causes = self._causes(result, truth) if self._causes is not None and asked else {}
+        self.judged.append(_judged_frame(result.frame, objects, truth, matches, self.causes))
         self._store_positions(objects, truth, matches)
         if result.objects is not None:
             self._precision.add(scored_objects(result, truth), truth)
@@ -101,12 +108,12 @@ class Evaluation(Observer[FrameResult]):
         for j in np.flatnonzero(matches.true).tolist():
             k = int(matches.partner[j])
             label = truth.labels[k].lower()
-            self._rows.append(("true", label, _distance(truth.boxes, k)))
+            self._rows.append(("true", label, float(truth.boxes.distance[k])))
             self._errors[label].append(float(matches.distance[j]))
         for row in np.flatnonzero(matches.missed).tolist():
-            self._rows.append(("missed", truth.labels[row].lower(), _distance(truth.boxes, row)))
+            self._rows.append(("missed", truth.labels[row].lower(), float(truth.boxes.distance[row])))
         for j in np.flatnonzero(matches.false).tolist():
-            self._rows.append(("false", objects.names[j].lower(), _distance(objects.boxes, j)))
+            self._rows.append(("false", objects.names[j].lower(), float(objects.boxes.distance[j])))
 
     # --- numbers -------------------------------------------------------------------------------
 
@@ -208,8 +215,25 @@ class Evaluation(Observer[FrameResult]):
             "stamp": frame.stamp,
             "true": list(frame.true),
             "missed": list(frame.missed),
-            "false": [text for name, text in frame.false if self.judges(name)],
+            "false": [
+                f"{text}: {cause}" if cause else text
+                for name, text, cause in frame.false
+                if self.judges(name)
+            ],
         }
+
+    @property
+    def last_causes(self) -> list[str]:
+        """Causes of the false objects of the last frame."""
+        return [cause for name, _, cause in self.judged[-1].false if cause and self.judges(name)]
+
+    @property
+    def false_causes(self) -> Counter[str]:
+        """Number of false objects by cause, the most frequent first. Empty: the causes were not asked for."""
+        causes = Counter(
+            cause for frame in self.judged for name, _, cause in frame.false if cause and self.judges(name)
+        )
+        return Counter(dict(causes.most_common()))
 
     # --- how it is shown -----------------------------------------------------------------------
 
@@ -225,6 +249,7 @@ class Evaluation(Observer[FrameResult]):
             "unusable_labels": len(self.unusable),
             "unusable_examples": self.unusable[:UNUSABLE],
             "metrics": {name: _plain(value) for name, value in self.metrics.items()},
+            "false_causes": dict(self.false_causes),
             "worst": self.worst,
         }
 
@@ -272,7 +297,9 @@ def count_ground(counts: Counter[str], result: FrameResult) -> None:
 # --- words -------------------------------------------------------------------------------------
 
 
-def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches) -> JudgedFrame:
+def _judged_frame(
+    frame: Frame, objects: Objects, truth: Truth, matches: Matches, causes: Mapping[int, Reason]
+) -> JudgedFrame:
     def label_text(k: int) -> str:
         return f"{truth.labels[k].lower()} {position_text(truth.boxes, k)}"
 
@@ -282,14 +309,14 @@ def _judged_frame(frame: Frame, objects: Objects, truth: Truth, matches: Matches
         tuple(label_text(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
         tuple(label_text(k) for k in np.flatnonzero(matches.missed).tolist()),
         tuple(
-            (objects.names[j].lower(), f"{objects.names[j].lower()} {position_text(objects.boxes, j)}")
+            (
+                objects.names[j].lower(),
+                f"{objects.names[j].lower()} {position_text(objects.boxes, j)}",
+                causes[j].kind.value if j in causes else "",
+            )
             for j in np.flatnonzero(matches.false).tolist()
         ),
     )
-
-
-def _distance(boxes: Boxes3D, row: int) -> float:
-    return float(np.hypot(*boxes.center[row, :2]))
 
 
 def _no_objects() -> Objects:
@@ -345,6 +372,8 @@ def tables(evaluation: Evaluation) -> Iterator[list[Row]]:
     ]
     by_range = (_row(evaluation, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
     yield [("range", *heads[1:7]), *by_range]
+    if causes := evaluation.false_causes:
+        yield [("false objects", "number"), *((cause, str(count)) for cause, count in causes.items())]
     metrics = evaluation.metrics
     if labels := evaluation.labels:
         columns = [f"ap_{view}_{overlap}" for view in VIEWS for overlap in OVERLAPS]

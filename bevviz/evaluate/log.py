@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -12,6 +12,7 @@ from bevviz.evaluate.evaluation import Evaluation, page
 from bevviz.evaluate.ground_truth import Truth
 from bevviz.model.frame import Boxes3D
 from bevviz.model.protocols import Items, Observer
+from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
@@ -88,11 +89,12 @@ class EvaluationRecorder(Observer[FrameResult]):
         named = iter((choose_named_in_3d(centers, wrong) & wrong).tolist() if len(wrong) else [])
         for outcome, boxes, rows, names in groups:
             chosen, path = boxes.chosen(rows), entities.judged(outcome)
-            labels = [f"{outcome}: {names[row]}" for row in rows]
+            causes = self._evaluation.causes if outcome == "false" else {}
+            labels = [f"{outcome}: {names[row]}{_cause(causes, row)}" for row in rows]
             logged = boxes3d(boxes, np.asarray(rows), labels)
             self._writer.put(path, transform(result.frame.pose), logged)
             visible_labels = [label if next(named) else "" for label in labels]
-            distances = np.hypot(*chosen.center[:, :2].T).tolist()
+            distances = chosen.distance.tolist()
             descriptions = [
                 f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)
             ]
@@ -104,6 +106,11 @@ class EvaluationRecorder(Observer[FrameResult]):
         """Log the tables of the whole run."""
         self._writer.static(entities.EVALUATE_ABOUT, document(f"# Evaluation\n\n{page(self._evaluation)}"))
         self._writer.close()
+
+
+def _cause(causes: Mapping[int, Reason], row: int) -> str:
+    """Return the cause of a false object for its label; empty: unknown."""
+    return f", {causes[row].kind.value}" if row in causes else ""
 
 
 def _page(index: int, truth: Truth, texts_by_outcome: dict[str, Sequence[str]]) -> str:

@@ -36,6 +36,7 @@ class BagTotals:
     p95_ms: float
     kinds: Mapping[str, int]  # number of frames by severity
     worst: float
+    false_causes: str = ""  # number of false objects by cause, in words
 
     @property
     def start(self) -> str:
@@ -143,8 +144,15 @@ def _totals(name: str, info: RunInfo, bag_frames: pa.Table) -> BagTotals:
         median_ms=float(np.median(times)),
         p95_ms=float(np.percentile(times, 95)),
         kinds={kind: kinds[kind] for kind in SEVERITIES},
+        false_causes=_false_causes(bag_frames),
         worst=float(bag_frames["badness"].to_numpy().max()),
     )
+
+
+def _false_causes(bag_frames: pa.Table) -> str:
+    """Return the number of false objects of a bag by cause, the most frequent first."""
+    causes = Counter(cause for of_frame in bag_frames["false_causes"].to_pylist() for cause in of_frame or ())
+    return ", ".join(f"{count} {cause}" for cause, count in causes.most_common())
 
 
 def write_summary(

@@ -60,6 +60,7 @@ SCHEMA = pa.schema(
         ("badness", pa.float64()),
         ("missed", pa.int64()),
         ("false", pa.int64()),
+        ("false_causes", pa.list_(pa.string())),  # of the judged false objects
         # JPEGs, only for the worst frames: the first camera with its detections, and the bird's-eye view.
         ("picture", pa.binary()),
         ("above", pa.binary()),
@@ -168,19 +169,23 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     }
 
 
-def add_judgement(row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str]) -> dict[str, Any]:
+def add_judgement(
+    row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str], causes: Sequence[str]
+) -> dict[str, Any]:
     """Add the results of the evaluation to the row of a frame.
 
     Args:
         row: of the frame.
         missed: missed objects as text.
         false: false objects as text.
+        causes: causes of the false objects.
     """
     wrong = [*(f"missed {text}" for text in missed), *(f"false {text}" for text in false)]
     return {
         **row,
         "missed": len(missed),
         "false": len(false),
+        "false_causes": list(causes),
         "remarks": [*wrong, *row["remarks"]],
         "badness": row["badness"] + WRONG * len(wrong),
     }

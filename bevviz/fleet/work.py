@@ -27,6 +27,7 @@ from bevviz.recording.sinks import open_recording
 from bevviz.report.pictures import camera_picture, crop_ahead, jpeg, shrink
 from bevviz.support.files import unfinished_files
 from bevviz.support.text import path_text
+from bevviz.why.false_objects import false_causes
 
 PICTURED = 12  # worst frames of a bag that have pictures in the table
 WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's-eye view's
@@ -103,7 +104,7 @@ def _fill(
                 Recorder(sinks.recording, job.config, session.stages.provider)
             ]
             if job.truth is not None:
-                evaluation = Evaluation(truth_in(source, job.truth or None))
+                evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
             assert sinks.file is not None
             collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation)
@@ -145,7 +146,9 @@ class _RowCollector(Observer[FrameResult]):
         values = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             judgement = self._evaluation.now
-            values = add_judgement(values, judgement["missed"], judgement["false"])
+            values = add_judgement(
+                values, judgement["missed"], judgement["false"], self._evaluation.last_causes
+            )
         rank = values["badness"], -len(self._rows)
         if len(self._worst) < PICTURED or rank > self._worst[0][:2]:
             heapq.heappush(self._worst, (*rank, _pictures(result)))

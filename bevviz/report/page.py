@@ -13,6 +13,7 @@ from bevviz.report.facts import Facts
 from bevviz.report.pictures import Plot, Series, camera_picture, jpeg, plot, shrink
 from bevviz.report.summary import WindowSummary
 from bevviz.support.html import render
+from bevviz.why import FrameExplainer
 
 PICTURE_WIDTH = 960
 COMMON = 5  # problems that are listed
@@ -136,6 +137,7 @@ def _verdict(result: FrameResult) -> Iterator[str]:
     if result.objects is not None:
         names = Counter(result.objects.names)
         yield "objects: " + (", ".join(f"{n} {name}" for name, n in names.items()) or "none")
+        yield from (answer.verdict.text for answer in FrameExplainer(result).false_objects())
 
 
 def _pictures(result: FrameResult) -> Iterator[Picture]:

@@ -10,6 +10,7 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.recording.health import FrameRates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
+from bevviz.why.false_objects import false_causes
 
 STRIP_PICTURES = 48  # pictures of all cameras and the bird's-eye view together
 STRIP_WIDTH = 400
@@ -65,6 +66,10 @@ class WindowSummary:
             for explanation in result.explanations
             if explanation.subject != "camera"
         )
+        word = "doubtful" if frame.truth is None else "false"
+        for row, reason in false_causes(result).items():
+            assert result.objects is not None
+            states["object", result.objects.names[row], f"{word}: {reason.kind.value}"] += 1
         self.tracebacks.update(
             (failure.stage, failure.traceback) for failure in result.failures if failure.traceback
         )
