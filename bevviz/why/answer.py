@@ -20,7 +20,7 @@ from bevviz.why.frame_index import FrameIndex
 from bevviz.why.hints import Hint, HintFinder, HintSearch, TriedChange
 from bevviz.why.resolve import object_subject, select_subjects, subjects_at_place
 from bevviz.why.selection import Selection
-from bevviz.why.sentences import make_verdict
+from bevviz.why.sentences import make_verdict, untried_text
 from bevviz.why.steps import Step, steps_of
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import FALSE, HOPELESS, Verdict, find_reason
@@ -42,6 +42,8 @@ class Answer:
         points: number of raw points on the subject.
         evidence: the points, clusters and detections of the subject.
         tried: changes that were run and did not help.
+        remark: one sentence about the search for hints: the best one, or what was tried, or why nothing could
+            be. Empty: none was searched, or there is nothing to mend.
     """
 
     subject: Subject
@@ -53,6 +55,7 @@ class Answer:
     points: int
     evidence: Evidence = field(repr=False)
     tried: tuple[TriedChange, ...] = ()
+    remark: str = ""
 
     @property
     def near(self) -> bool:
@@ -139,6 +142,7 @@ class Answer:
             "false": self.false,
             "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
             "hints": [_hint_dict(hint) for hint in self.hints],
+            "remark": self.remark,
             "tried": [{"settings": list(change.settings), "text": change.text} for change in self.tried],
         }
 
@@ -256,20 +260,20 @@ class FrameExplainer:
         return self._hint_finder.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
 
     def with_hints(self, answer: Answer) -> Answer:
-        """Add hints to an answer. Its sentence then names the first hint, or says that no change helps."""
+        """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
         search, verdict = self.search(answer), answer.verdict
-        hints = search.hints
-        if not hints:
-            if verdict.kind is ReasonKind.REPORTED or answer.folded or not search.tried:
-                return answer
-            answer = replace(answer, tried=search.tried)
-            text = f"{verdict.text.removesuffix('.')}; {answer.tried_text()}."
-            return replace(answer, verdict=replace(verdict, text=text))
-        hint = hints[0]
-        also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
-        settings = ", ".join(hint.settings)
-        text = f"{verdict.text.removesuffix('.')}; change {settings}: {hint.text}{also}."
-        return replace(answer, verdict=replace(verdict, text=text), hints=hints, tried=search.tried)
+        answer = replace(answer, hints=search.hints, tried=search.tried)
+        if search.hints:
+            hint = search.hints[0]
+            also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
+            clause = f"change {', '.join(hint.settings)}: {hint.text}{also}"
+        else:
+            clause = answer.tried_text()
+        text = verdict.text if answer.folded or not clause else f"{verdict.text.removesuffix('.')}; {clause}."
+        brief = clause if search.hints else answer.tried_text(named=1)
+        remark = brief or untried_text(answer.subject, verdict)
+        remark = f"{remark[:1].upper()}{remark[1:]}." if remark else ""
+        return replace(answer, verdict=replace(verdict, text=text), remark=remark)
 
     def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""

@@ -40,8 +40,17 @@ _OTHER_OWNER = {  # another subject has the detection or the cluster
 }
 
 
-def changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Iterator[Change]:
-    """Yield changes that may help: parameters of our stages, or of the user's function."""
+def changes_for(
+    evidence: Evidence, reason: Reason, traces: FrameIndex, *, is_false: bool = False
+) -> Iterator[Change]:
+    """Yield changes that may help: parameters of our stages, or of the user's function.
+
+    Args:
+        evidence: evidence about the subject.
+        reason: reason why it was lost, or is false.
+        traces: index of the frame.
+        is_false: whether it is a false object.
+    """
     result = traces.result
     section = _SECTION.get(reason.kind, "")
     if section and not traces.origin(section).ours:
@@ -49,7 +58,7 @@ def changes_for(evidence: Evidence, reason: Reason, traces: FrameIndex) -> Itera
     if not traces.origin("objects").ours:
         return
     config = result.config
-    for change in _our_changes(evidence, reason, config):
+    for change in _our_changes(evidence, reason, config, is_false=is_false):
         if all(_has_effect(key, traces) for key in change):
             yield change
 
@@ -85,7 +94,7 @@ def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
                 yield {f"{section}.params.{name}": other}
 
 
-def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator[Change]:
+def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false: bool) -> Iterator[Change]:
     """Yield changes of our parameters that may help against the reason."""
     kind, clustering, best = reason.kind, config.clustering, evidence.best
     if kind is ReasonKind.GROUND:
@@ -103,11 +112,10 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif kind is ReasonKind.TOO_LARGE:
         yield {"clustering.max_cluster_points": reason["count"]}
-    elif kind in (ReasonKind.DUPLICATE, ReasonKind.DETECTOR_ERROR, ReasonKind.WALL, ReasonKind.WRONG_DEPTH):
-        yield from _stricter_changes(kind, reason["object"].score, config)
+    elif is_false:
+        yield from _changes_against_false(kind, reason["object"].score, config)
     elif kind is ReasonKind.MISPLACED:
-        yield {"fusion.split": not config.fusion.split}
-        yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 1.5))
+        yield from _regrouped(config, 0.8, 1.5)
     elif kind is ReasonKind.MERGED:
         if reason["joined_by"] is not None:
             yield {"fusion.min_rating": round(2 * config.fusion.min_rating, 4)}
@@ -127,17 +135,29 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config) -> Iterator
         yield from _detection_changes(kind, best, config)
 
 
-def _stricter_changes(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
-    """Yield stricter limits, which may remove a false object."""
-    fusion = config.fusion
+def _changes_against_false(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
+    """Yield changes that may remove a false object: those for its cause, then stricter limits."""
+    fusion, detector = config.fusion, config.detector
     if kind is ReasonKind.DUPLICATE:
-        limits = (factor * config.detector.iou_threshold for factor in (0.8, 0.6))
-        yield from ({"detector.iou_threshold": round(value, 3)} for value in limits)
-    if kind in (ReasonKind.WALL, ReasonKind.WRONG_DEPTH) and fusion.method == "frustum":
+        yield from ({"detector.iou_threshold": round(f * detector.iou_threshold, 3)} for f in (0.8, 0.6))
+    if kind in (ReasonKind.DUPLICATE, ReasonKind.SPLIT):
+        yield from _regrouped(config, 1.5)
+    elif kind is not ReasonKind.DETECTOR_ERROR:
+        yield from _regrouped(config, 0.8, 1.5)
+    if fusion.method == "frustum":
         yield from ({"fusion.min_rating": round(fusion.min_rating * factor, 4)} for factor in (2, 4))
         yield from ({"fusion.min_iou": round(fusion.min_iou * factor, 3)} for factor in (2, 3))
+    elif kind in (ReasonKind.WALL, ReasonKind.WRONG_DEPTH, ReasonKind.DUPLICATE):
+        yield {"fusion.method": "frustum"}
     if score < 0.6:  # A higher threshold would lose too many right objects.
         yield {"detector.conf_threshold": math.floor(100 * score + 1) / 100}
+
+
+def _regrouped(config: Config, *factors: float) -> Iterator[Change]:
+    """Yield changes that group the points in another way: by the detections, or by another eps."""
+    if config.fusion.method == "frustum":
+        yield {"fusion.split": not config.fusion.split}
+    yield from ({"clustering.eps": round(config.clustering.eps * factor, 3)} for factor in factors)
 
 
 def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Iterator[Change]:
@@ -168,6 +188,8 @@ def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Ite
     elif kind in _OTHER_OWNER:
         if config.fusion.method == "centroid":
             yield {"fusion.method": "frustum"}
+        elif kind in (ReasonKind.TAKEN, ReasonKind.OTHER_CLUSTER):
+            yield from _regrouped(config, 0.8, 0.6)
     elif kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
         # The subject has no cluster of its own: the fusion compared the nearest other one.
         yield from _ground_changes(config)

@@ -19,7 +19,6 @@ from bevviz.model.results import Detections, DetectionState
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.pipeline.stage_log import Memo
-from bevviz.why.belonging import SURE
 from bevviz.why.changes import Change, changes_for
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
@@ -30,6 +29,7 @@ from bevviz.why.subject import Subject
 from bevviz.why.verdict import FALSE, FLAWED, find_reason
 
 TRIES = 10  # configurations to run for one subject
+OFFERED = 3  # hints of one answer
 FURTHER = 10  # more configurations, combined with the best changes so far
 RESULTS = 20  # results of other configurations in the cache, for other subjects of the frame
 
@@ -65,11 +65,18 @@ class Hint:
         settings: settings as ``--set`` takes them.
         text: the result for the subject.
         effects: other objects of the frame that change.
+        balance: number of objects that it fixes, the subject included, minus those that it breaks.
     """
 
     settings: tuple[str, ...]
     text: str
     effects: Effects
+    balance: int = 1
+
+    @property
+    def objection(self) -> str:
+        """The result, and what speaks against it."""
+        return f"{self.text}, but it breaks as much as it fixes: it {self.effects.text}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +116,11 @@ class HintFinder:
     def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> HintSearch:
         """Search the mildest change that changes the verdict and makes no other object worse.
 
-        If each helpful change makes another object worse, return the one that does the least harm. If none
-        helps, combine the changes that bring the subject to a later stage with the changes for the reason
-        there.
+        If each helpful change makes another object worse, return those that fix more objects than they break,
+        the best first. The others count as tried in vain. If none helps, combine the changes that bring the
+        subject to a later stage with the changes for the reason there.
         """
+        is_false = reason.kind in FALSE and subject.kind == "object"
         hints: list[Hint] = []
         start = _ReachedStage(reported, reason.kind)
         reached: dict[_ReachedStage, _Step] = {}  # by the mildest change
@@ -120,7 +128,8 @@ class HintFinder:
 
         def ways() -> Iterator[Change]:
             """Yield the changes to try."""
-            yield from islice(changes_for(evidence, reason, self._traces), TRIES)
+            changes = changes_for(evidence, reason, self._traces, is_false=is_false)
+            yield from islice(changes, TRIES)
             if not hints:
                 yield from islice(_combined_changes(reached), FURTHER)
 
@@ -128,9 +137,9 @@ class HintFinder:
             after = self._run(change)
             if after is None:
                 continue
-            if reason.kind in FALSE and subject.kind == "object":
+            if is_false:
                 self._try_on_false(subject, change, after, hints, tried)
-                if hints and not hints[-1].effects.harm:
+                if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
                     break
                 continue
             then = collect_evidence(subject, after)
@@ -139,17 +148,30 @@ class HintFinder:
             text, object_row = _new_outcome(subject, old_kind, new_kind, then, after)
             if text and _is_sure(subject, change, then):
                 row = subject.row if subject.kind == "truth" else -1
-                objects, then_objects = self._result.objects, after.result.objects
-                harm = effects(objects, then_objects, self._traces.truth, row, object_row)
-                hints.append(Hint(_settings(change), text, harm))
-                if not hints[-1].effects.harm:
+                hints.append(self._hint(change, text, after, row, object_row))
+                if not hints[-1].effects.harm and hints[-1].balance > 0:
                     break
                 continue
             result = _result_text(subject, reason, new, now_reported, then)
             tried.append(TriedChange(_settings(change), result))
             if not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
                 reached.setdefault(stage, _Step(change, new, then, after))
-        return HintSearch(tuple(sorted(hints, key=lambda hint: hint.effects.harm)[:1]), tuple(tried))
+        best = sorted(hints, key=lambda hint: -hint.balance)
+        tried += [TriedChange(hint.settings, hint.objection) for hint in best if hint.balance <= 0]
+        return HintSearch(tuple(hint for hint in best if hint.balance > 0)[:OFFERED], tuple(tried))
+
+    def _hint(self, change: Change, text: str, after: FrameIndex, asked: int = -1, own: int = -1) -> Hint:
+        """Return a hint with its effects on all objects of the frame, as ``evaluate`` counts them."""
+        before = self._traces
+        more = 0 if before.truth else len(false_reasons(after)) - len(false_reasons(before))
+        objects, then_objects = before.result.objects, after.result.objects
+        changed = effects(objects, then_objects, before.truth, asked, own, more)
+        if before.matches is None or after.matches is None:
+            return Hint(_settings(change), text, changed, max(changed.good, 1) - changed.harm)
+        right = int((after.matches.partner >= 0).sum()) - int((before.matches.partner >= 0).sum())
+        false = int(after.matches.false.sum()) - int(before.matches.false.sum())
+        flawed = 1 if right == false == 0 and not changed.harm else 0  # The subject loses a flaw alone.
+        return Hint(_settings(change), text, changed, right - false + flawed)
 
     def _try_on_false(
         self, subject: Subject, change: Change, after: FrameIndex, hints: list[Hint], tried: list[TriedChange]
@@ -166,9 +188,7 @@ class HintFinder:
             if int(away.argmin()) in false_reasons(after):
                 tried.append(TriedChange(_settings(change), "it stays false"))
                 return
-        hints.append(
-            Hint(_settings(change), text, effects(self._result.objects, objects, self._traces.truth))
-        )
+        hints.append(self._hint(change, text, after))
 
     def _run(self, change: Change) -> FrameIndex | None:
         """Run the frame with a change, once. None: the configuration cannot be run."""
@@ -242,9 +262,9 @@ def _new_outcome(
 
 
 def _is_sure(subject: Subject, change: Change, evidence: Evidence) -> bool:
-    """Return whether a detection that passes only with other limits surely belongs to the subject.
+    """Return whether a detection that passes only with other limits belongs to the subject.
 
-    A kept detection does if the verdict calls it the subject's own. A weak one has to fit well, too.
+    It does if the verdict calls it the subject's own, and evaluate counts its object for the subject.
     """
     named = evidence.named
     if subject.kind != "truth" or named is None or named.detection < 0:
@@ -252,10 +272,7 @@ def _is_sure(subject: Subject, change: Change, evidence: Evidence) -> bool:
     if not any(key.startswith(("detector.", "fusion.min", "fusion.split")) for key in change):
         return True
     detection = (named.camera, named.detection)
-    fits = [c.overlap for c in evidence.own_candidates if (c.camera, c.row) == detection]
-    if any(key.startswith("detector.") for key in change):
-        return max(fits, default=0.0) >= SURE
-    return named.right and bool(fits)
+    return named.right and any((c.camera, c.row) == detection for c in evidence.own_candidates)
 
 
 def _result_text(subject: Subject, before: Reason, after: Reason, reported: bool, evidence: Evidence) -> str:

@@ -400,3 +400,29 @@ SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words a
     ReasonKind.NOT_AMONG: _not_among,
     ReasonKind.LOST_IN_FUSION: _lost_in_fusion,
 }
+
+
+# --- no change was tried -----------------------------------------------------------------------
+
+_UNTRIED = {  # the reason why no parameter can be tried
+    ReasonKind.FAILED: "a stage has failed, which has to be mended first",
+    ReasonKind.OUT_OF_VIEW: "no camera has it in view",
+    ReasonKind.HIDDEN: "something hides it from the LiDAR",
+    ReasonKind.NO_POINTS: "the LiDAR has no points on it",
+    ReasonKind.MERGED: "no smaller clustering.eps parts its points from the others",
+    ReasonKind.NOT_RUN: "the detector needs a model and an image",
+    ReasonKind.NOT_DETECTED: "the detector has no candidate for it, only another model may have one",
+    ReasonKind.BELOW_THRESHOLD: "a threshold below its score lets noise pass, only another model may help",
+    ReasonKind.SUPPRESSED: "its score is too low as well",
+    ReasonKind.NOT_FUSED: "the camera needs a pose and intrinsics",
+    ReasonKind.DETECTOR_ERROR: "the detector is as sure of it as of right objects, another model may not be",
+}
+
+
+def untried_text(subject: Subject, verdict: Verdict) -> str:
+    """Return a clause with the reason why no change was tried; empty: there is nothing to mend."""
+    if verdict.kind is ReasonKind.REPORTED or subject.is_place:
+        return ""
+    by = verdict.reason.values.get("by", "")
+    decided = f"{by} decides this, and bevviz cannot run it with other values" if by else ""
+    return f"nothing was tried: {decided or _UNTRIED.get(verdict.kind, 'no parameter decides this')}"

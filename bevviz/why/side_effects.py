@@ -44,6 +44,7 @@ class Effects:
         gone: objects that the second result lacks.
         changed: number of other objects that have moved or have another class.
         known: whether there is a ground truth.
+        doubtful: number of doubtful objects that the second result has more. Ground truth makes it 0.
     """
 
     made: tuple[Effect, ...] = ()
@@ -51,6 +52,7 @@ class Effects:
     gone: tuple[Effect, ...] = ()
     changed: int = 0
     known: bool = False
+    doubtful: int = 0
 
     @property
     def fixed(self) -> tuple[str, ...]:
@@ -79,14 +81,19 @@ class Effects:
 
     @property
     def good(self) -> int:
-        """Number of objects that get better: new right ones, and false ones that are gone."""
-        invented = sum(effect.truth < 0 for effect in self.gone) if self.known else 0
+        """Number of objects that get better: new right ones, and false or doubtful ones that are gone."""
+        invented = sum(effect.truth < 0 for effect in self.gone) if self.known else max(-self.doubtful, 0)
         return len(self.made) + invented
 
     @property
     def harm(self) -> int:
-        """Number of objects that get worse, 0 without a ground truth."""
-        return len(self.false) + len(self.right)
+        """Number of objects that get worse. Without ground truth: new doubtful ones, and those that are gone.
+
+        The objects that are gone then count without the doubtful ones among them.
+        """
+        if self.known:
+            return len(self.false) + len(self.right)
+        return max(self.doubtful, 0) + max(len(self.gone) + min(self.doubtful, 0), 0)
 
     @property
     def text(self) -> str:
@@ -94,6 +101,7 @@ class Effects:
         texts = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
         texts += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
         texts += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
+        texts += [f"adds {count(self.doubtful, 'doubtful object')}"] if self.doubtful > 0 else []
         texts += [f"changes {count(self.changed, 'other')}"] if self.changed else []
         return ", ".join(texts)
 
@@ -104,6 +112,7 @@ def effects(
     truth: Sequence[Subject],
     asked: int = -1,
     own: int = -1,
+    doubtful: int = 0,
 ) -> Effects:
     """Compare the objects of two results of the same frame.
 
@@ -113,6 +122,7 @@ def effects(
         truth: objects of the ground truth; empty: unknown.
         asked: row of the ground truth object in question, -1: none.
         own: row in ``after`` of the object in question, -1: unknown.
+        doubtful: number of doubtful objects that ``after`` has more.
     """
     a, b = _seen(before), _seen(after)
     truth_before, truth_after = _truth_of(before, truth), _truth_of(after, truth)
@@ -143,6 +153,7 @@ def effects(
         tuple(gone),
         changed,
         bool(truth),
+        0 if truth else doubtful,
     )
 
 
