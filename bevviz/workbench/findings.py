@@ -25,6 +25,24 @@ REACH = 2.5  # metres that an object may have moved since the last frame with th
 GAP = 5  # frames without the finding after which a new group begins
 SAME_BOX = 0.3  # IoU of the image boxes of one detection in two frames
 
+DIFFERENCES = {  # kind -> remark
+    "fixed": "The tried values report it.",
+    "broken": "The tried values lose it, without them it is right.",
+    "new false": "The tried values make it, without them it is not there.",
+    "false gone": "The tried values remove it.",
+    "new": "The tried values make it.",
+    "gone": "The tried values lose it.",
+}
+_SENSOR = "Nothing was tried: no parameter of a stage mends"
+ANOMALIES = {  # kind -> remark
+    "sensor": f"{_SENSOR} a sensor.",
+    "sync": f"{_SENSOR} the clocks of two sensors.",
+    "tf": f"{_SENSOR} a transform.",
+    "stage": "Nothing was tried: a stage fails or is slow.",
+    "one_sensor": "Nothing was tried: it lasts several frames, click an object of it to ask.",
+    "jump": "Nothing was tried: it lasts several frames, click the object to ask.",
+    "flicker": "Nothing was tried: it lasts several frames, click the object to ask.",
+}
 
 Position = tuple[float, float, float]
 
@@ -145,6 +163,7 @@ class FindingFrame:
         pick: text of the selection that asks about it. Empty: there is nothing to ask.
         tried: whether the tried side shows it, rather than the drive as it was opened.
         text: reason in this frame.
+        remark: one sentence where no hint can be searched.
     """
 
     frame: int
@@ -153,11 +172,12 @@ class FindingFrame:
     pick: str
     tried: bool = False
     text: str = ""
+    remark: str = ""
 
     def as_list(self) -> list[Any]:
         """Return the values for the page. The stamp is text: JavaScript numbers cannot hold it."""
         distance = None if math.isnan(self.distance) else round(self.distance, 1)
-        return [self.frame, str(self.stamp), distance, self.pick, self.tried, self.text]
+        return [self.frame, str(self.stamp), distance, self.pick, self.tried, self.text, self.remark]
 
 
 @dataclass(slots=True)
@@ -194,7 +214,15 @@ class FindingList:
                 group.position, group.box = finding.position, finding.box
                 pick = str(finding.selection)
                 group.frames.append(
-                    FindingFrame(finding.frame, finding.stamp, finding.distance, pick, tried, finding.reason)
+                    FindingFrame(
+                        finding.frame,
+                        finding.stamp,
+                        finding.distance,
+                        pick,
+                        tried,
+                        finding.reason,
+                        DIFFERENCES.get(finding.what, ""),
+                    )
                 )
 
     def _same(self, finding: Finding, taken_groups: set[int]) -> FindingGroup | None:
@@ -220,7 +248,9 @@ class FindingList:
         with self._lock:
             for anomaly in anomalies:
                 kind = anomaly.kind.replace("_", " ")
-                finding_frame = FindingFrame(frame, stamp, math.nan, "", text=anomaly.text)
+                finding_frame = FindingFrame(
+                    frame, stamp, math.nan, "", text=anomaly.text, remark=ANOMALIES[anomaly.kind]
+                )
                 self._new("anomaly", kind).frames.append(finding_frame)
 
     def replace(self, kinds: Sequence[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -44,10 +45,13 @@ class PageConnection:
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._newest = 0
+        self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
+        self._remarking = False
         self._handlers = {
             "ask": self._ask,
             "try": self._try,
             "settle": self._settle,
+            "remarks": self._remark_rows,
             "shown": self._shown,
             "drive": self._drive,
             "cancel": self._cancel,
@@ -131,7 +135,8 @@ class PageConnection:
         try:
             message = json.loads(text)
             number = message.get("id")
-            self._newest = max(self._newest, int(number))
+            if message["type"] != "remarks":  # It makes no question idle.
+                self._newest = max(self._newest, int(number))
             if command := self._source.commands.get(message["type"]):
                 await self._send(await asyncio.to_thread(self._reply, command, message))
             else:
@@ -213,6 +218,31 @@ class PageConnection:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
         frame = await self._frame(message)
         await self._at_desk(number, lambda: self._source.look(frame, _settings(message)), idle=True)
+
+    async def _remark_rows(self, number: int, message: Message) -> None:
+        """Send the remarks on the first rows of the page's list, one by one, behind all questions."""
+        self._rows = [(int(frame), str(pick)) for frame, pick in message["rows"]]
+        if self._remarking:
+            return
+        self._remarking = True
+        try:
+            while self._rows:
+                frame, pick = self._rows.pop(0)
+                text = await asyncio.to_thread(self._remark, frame, pick)
+                await self._send({"type": "remark", "frame": frame, "pick": pick, "text": text})
+        finally:
+            self._remarking = False
+
+    def _remark(self, frame: int, pick: str) -> str:
+        """Return the remark on a row. The next one waits as long as this one took."""
+        self._source.wait_for_quiet()
+        start = time.monotonic()
+        try:
+            text = self._source.remark(frame, pick)
+        except UserError:  # The list has changed meanwhile.
+            text = ""
+        time.sleep(min(time.monotonic() - start, 1.0))
+        return text
 
     async def _drive(self, number: int, message: Message) -> None:
         """Run the drive with other values."""

@@ -35,11 +35,8 @@ def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
 
 
 def hints_dict(answer: Answer) -> dict[str, Any]:
-    """Return the hints of an answer with hints, and one sentence where no change helps."""
-    text = answer.tried_text(named=1)
-    if not text and not answer.hints and not answer.verdict.reported:
-        text = "no change that helps is known"
-    return {"hints": answer.as_dict()["hints"], "tried": f"{text[:1].upper()}{text[1:]}." if text else ""}
+    """Return the hints of an answer with hints, and the sentence about them."""
+    return {"hints": answer.as_dict()["hints"], "remark": answer.remark}
 
 
 def note_dict(note: Note) -> dict[str, Any]:

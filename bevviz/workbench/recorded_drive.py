@@ -340,6 +340,14 @@ class RecordedDrive(Source, Observer[FrameResult]):
             self._results.move_to_end(key)
             return self._results[key]
 
+    def look_aside(self, number: int) -> FrameResult:
+        """Return the result of a frame as opened. A question waits at most until the frame is read."""
+        with self._looking:
+            if (known := self._results.get((number, ()))) is not None:
+                return known
+            frame = self.drive.raw(number)
+        return self.pipeline.run_single(frame)
+
     def configured(self, settings: Settings) -> Config:
         """Return the configuration with other values.
 

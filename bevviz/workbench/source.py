@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -43,6 +44,9 @@ class Source(Closable):
         self.scans = 0
         self.findings, self.news = FindingList(), News()
         self.opening: int | None = None
+        self._remarks: dict[tuple[int, str], str] = {}  # by frame and text of the selection
+        self._remarking = threading.Lock()
+        self._aside: FrameExplainer | None = None
         self.commands: Mapping[str, Callable[[Message], dict[str, Any]]] = {}
 
     def truth(self, frame: Frame) -> Truth | None:
@@ -62,6 +66,27 @@ class Source(Closable):
     def quiet(self) -> AbstractContextManager[None]:
         """Return a context in which background work pauses, if it can."""
         return nullcontext()
+
+    def wait_for_quiet(self) -> None:
+        """Wait until no question is being answered, if background work can wait."""
+
+    def look_aside(self, number: int) -> FrameResult:
+        """Return the result of a frame for background work, without keeping a question from its own."""
+        return self.look(number)
+
+    def remark(self, number: int, pick: str) -> str:
+        """Return the sentence about the hints for a finding. Each is searched once.
+
+        Raises:
+            UserError: there is no such frame or object.
+        """
+        with self._remarking:
+            if (number, pick) not in self._remarks:
+                if self._aside is None or self._aside.traces.result.frame.index != number:
+                    self._aside = self.explainer(self.look_aside(number))
+                answer = self._aside.about(Selection.parse(pick))
+                self._remarks[number, pick] = self._aside.with_hints(answer).remark
+            return self._remarks[number, pick]
 
     @abstractmethod
     def progress(self) -> dict[str, Any]:

@@ -24,13 +24,11 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
-from bevviz.workbench.findings import Finding, finding_of
+from bevviz.workbench.findings import DIFFERENCES, Finding, finding_of
 
 if TYPE_CHECKING:
     from bevviz.workbench.recorded_drive import RecordedDrive
     from bevviz.workbench.source import Settings
-
-DIFFERENCES = ("fixed", "broken", "new false", "false gone", "new", "gone")  # kinds of findings
 
 
 @dataclass(slots=True)
@@ -110,7 +108,7 @@ class TrialRunner:
         session = Session(config, loader=drive.pipeline.loader)
         self.end()
         trial = self.trial = Trial(settings, drive.again.total, known=drive.truth_of is not None)
-        drive.findings.replace(DIFFERENCES)
+        drive.findings.replace(tuple(DIFFERENCES))
         self._thread = threading.Thread(target=self._run, args=(trial, session), name="trial", daemon=True)
         self._thread.start()
         drive.news.tell()

@@ -4,6 +4,7 @@ import { $, element, remember, seconds, state } from "./page_state.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
+const REMARKED = 10; // rows whose hint is searched without a click
 const PAUSE = 200; // ms between two updates of the page
 const KINDS = ["missed", "lost", "contradicted", "unmatched", "doubtful", "broken", "new false", "fixed", "false gone", "new", "gone",
   "unnamed", "false", "anomaly", "note"];
@@ -52,7 +53,7 @@ export function notes(message) {
   draw();
 }
 
-// Show in the row of an object that no tried change helps it. A sight keeps the sentence after its own text.
+// Show a hint, or that no tried change helps, in the row of an object. A sight keeps the sentence after its own text.
 export function explain(frame, pick, tried, sentence) {
   for (const { sights } of entries.values()) {
     const one = sights.find((sight) => sight[0] === frame && sight[3] === pick && sight[4] === tried);
@@ -82,6 +83,19 @@ function redraw() {
   $("found-title").textContent = `Worth a look: ${rows.length}`;
   filters(shown);
   $("found").replaceChildren(...rows.slice(0, SHOWN).map(drawn));
+  requestRemarks();
+}
+
+// Ask for the sentences that the first rows lack. The server answers when it has nothing else to do.
+let requested = "";
+let bare = () => {};
+export const onBare = (send) => { bare = send; };
+function requestRemarks() {
+  const lacking = rows.slice(0, REMARKED).map((entry) => entry.sights[entry.best])
+    .filter((one) => one[3] && !one[4] && !one[6] && one[0] !== null).map((one) => [one[0], one[3]]);
+  if (!lacking.length || JSON.stringify(lacking) === requested) return;
+  requested = JSON.stringify(lacking);
+  bare(lacking);
 }
 
 function filters(shown) {

@@ -75,9 +75,9 @@ function hints(message) {
     button.onclick = () => change(hint.settings);
     return button;
   }));
-  if (!message.tried) return;
-  $("hints").textContent = message.tried;
-  list.explain(message.frame, state.pick, askedTried, message.tried);
+  if (!message.remark) return;
+  if (!message.hints.length) $("hints").textContent = message.remark;
+  list.explain(message.frame, state.pick, askedTried, message.remark);
 }
 
 // Describe the effects of other values on a frame. Hints and tried values use the same words.
@@ -238,7 +238,7 @@ function welcome(message) {
 
 on({
   welcome, controls: offer, answer, nothing, hints, tried, opening: open, error: failed, progress: jobs.progress,
-  entries: list.update, notes: list.notes, noted: jobs.noted,
+  entries: list.update, remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text), notes: list.notes, noted: jobs.noted,
 });
 onViewer({
   clicked: ask,
@@ -291,6 +291,7 @@ window.addEventListener("keydown", (event) => {
 
 if (kind === "live") Object.assign(actions, (await import("./robot.js")).actions);
 list.start(ask, tryOut);
+if (kind !== "live") list.onBare((rows) => send({ type: "remarks", rows }));
 list.onRemove((note) => send({ type: "unnote", stamp: note.stamp, text: note.text }));
 jobs.start();
 connect();
