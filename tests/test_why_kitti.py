@@ -18,6 +18,7 @@ from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.frame_index import Fate
 from bevviz.workbench.findings import find_findings
 
 NAMES = {"Car": "car", "Van": "car", "Truck": "truck", "Tram": "train"}  # any other label is a person
@@ -208,6 +209,30 @@ def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None
                 assert sorted(false) == sorted(answer.subject.row for answer in frame.false)
             rows += len(listed)
     assert rows > 200
+
+
+def test_clicks_on_road_and_sky_are_no_alarm(asked: dict[str, Asked]) -> None:
+    """Without ground truth, weak detections whose boxes cover the road or the sky are not the answer."""
+    road, sky = 0, 0
+    for name in ("kitti/0/network", "kitti/10/network", "kitti_more/3/network", "kitti_more/9/network"):
+        result = asked[name].result
+        explainer = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)))
+        camera, traces = result.cameras[0], explainer.traces
+        assert camera.detections is not None
+        boxes, uv = camera.detections.xyxy[camera.detections.kept], traces.uv(camera)
+        on_image = np.isfinite(uv).all(axis=1) & (uv > 10).all(axis=1) & (uv < [1200, 360]).all(axis=1)
+        others = uv[on_image & (traces.fate != Fate.GROUND)]
+        pixels = uv[on_image & (traces.fate == Fate.GROUND)][::150].tolist()
+        pixels += [(u, 15.0) for u in range(20, 1200, 60)]
+        for u, v in pixels:
+            in_box = ((boxes[:, :2] - 10 < (u, v)) & (boxes[:, 2:] + 10 > (u, v))).all(axis=1).any()
+            if in_box or (np.abs(others - (u, v)).max(axis=1) < 12).any():
+                continue
+            answer = explainer.ask(Selection(box=(u, v)))[0]
+            assert answer.verdict.text.startswith("There is "), (name, answer.verdict.text)
+            assert answer.empty and not explainer.with_hints(answer).remark, answer.verdict.text
+            road, sky = road + (v != 15), sky + (v == 15)
+    assert road > 50 and sky > 20
 
 
 def test_a_change_with_the_objects_own_detection_is_a_hint(asked: dict[str, Asked]) -> None:

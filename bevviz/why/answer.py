@@ -25,6 +25,7 @@ from bevviz.why.steps import Step, steps_of
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import FALSE, HOPELESS, Verdict, find_reason
 
+KERB = 0.3  # metres above the ground's level up to which ground at a place is nothing else
 NAMED = 3  # tried changes of the same result that a sentence names
 
 
@@ -79,6 +80,13 @@ class Answer:
     def false(self) -> bool:
         """Whether the subject is an object that no ground truth explains, or that looks doubtful."""
         return self.subject.kind == "object" and self.verdict.kind in FALSE
+
+    @property
+    def empty(self) -> bool:
+        """Whether a place has nothing that concerns detections: no points, or ground as low as a kerb."""
+        kind, reason = self.verdict.kind, self.verdict.reason
+        low = kind is ReasonKind.GROUND and not reason["highest"] > KERB
+        return self.subject.is_place and (low or kind is ReasonKind.NO_POINTS)
 
     @property
     def folded(self) -> bool:
@@ -140,6 +148,7 @@ class Answer:
             "verdict": verdict.text,
             "folded": self.folded,
             "false": self.false,
+            "empty": self.empty,
             "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
             "hints": [_hint_dict(hint) for hint in self.hints],
             "remark": self.remark,
@@ -261,6 +270,8 @@ class FrameExplainer:
 
     def with_hints(self, answer: Answer) -> Answer:
         """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
+        if answer.empty:
+            return answer
         search, verdict = self.search(answer), answer.verdict
         answer = replace(answer, hints=search.hints, tried=search.tried)
         if search.hints:

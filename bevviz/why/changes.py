@@ -15,6 +15,7 @@ from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
+from bevviz.why.subject import NOISE
 
 Change = Mapping[str, Any]  # dotted key -> value
 
@@ -164,7 +165,7 @@ def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Ite
     """Yield changes that may help a subject that has a detection."""
     if kind is ReasonKind.BELOW_THRESHOLD:
         # A threshold that lets noise pass is no advice.
-        if best.score >= 0.05:
+        if best.score >= NOISE:
             passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
             yield passes
             if config.fusion.method == "frustum" and config.fusion.split:

@@ -15,9 +15,9 @@ from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
 from bevviz.why.belonging import OVERLAP
 from bevviz.why.false_objects import false_reasons
-from bevviz.why.frame_index import FEW, FrameIndex, detection_subject
+from bevviz.why.frame_index import CORE, FEW, Fate, FrameIndex, detection_subject
 from bevviz.why.selection import Selection
-from bevviz.why.subject import IN_VIEW, LINK, Subject, projected_box, single_box
+from bevviz.why.subject import IN_VIEW, LINK, NOISE, Subject, projected_box, single_box
 
 PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
 SPACING = 1.0  # pixels; subjects whose points are this much farther from the pixel may still show there
@@ -324,6 +324,9 @@ def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subjec
     for row, fit in _detections_at_box(camera, image_box, pixel):
         if camera.detections is not None and traces.owners(camera)[row] not in rows:
             subject = detection_subject(traces.result, camera, row)
+            is_weak = not camera.detections.kept[row]
+            if pixel and is_weak and not _shows_at(traces, camera, subject, image_box):
+                continue
             if camera.fusion is not None and camera.fusion.detection_decision[row] == Decision.MATCHED:
                 covered.add(int(camera.fusion.detection_cluster[row]))
             things.append((subject, fit))
@@ -335,6 +338,23 @@ def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subjec
         return
     best = max((fit for _, fit in things), default=0.0)
     yield from ((subject, fit >= AS_GOOD * best) for subject, fit in things)
+
+
+def _shows_at(traces: FrameIndex, camera: CameraResult, subject: Subject, image_box: F32) -> bool:
+    """Return whether a weak detection shows at a pixel, and not the road or the sky in its box.
+
+    An obstacle of it has to be there or, without any point there, the middle of its box.
+    """
+    assert subject.xyxy is not None and camera.detections is not None
+    if camera.detections.score[subject.row] < NOISE:
+        return False
+    middle, size = (subject.xyxy[:2] + subject.xyxy[2:]) / 2, subject.xyxy[2:] - subject.xyxy[:2]
+    points = traces.place(Subject("pixel", "", camera=camera.camera.name, xyxy=image_box))
+    if not len(points):
+        pixel = (image_box[:2] + image_box[2:]) / 2
+        return bool((np.abs(pixel - middle) < CORE * size / 2).all())
+    obstacles = points[traces.fate[points] != Fate.GROUND]
+    return bool(np.isin(obstacles, traces.place(subject)).any())
 
 
 def _nearest_first(

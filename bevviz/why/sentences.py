@@ -130,10 +130,10 @@ def _hidden(reason: Reason, _: Subject) -> str:
     return f"it is hidden: {count(reason['points'], 'point')} on it, and {returns} end in front of it{front}"
 
 
-def _no_points(reason: Reason, _: Subject) -> str:
+def _no_points(reason: Reason, subject: Subject) -> str:
     points = f"the LiDAR has {count(reason['points'], 'point')}"
     if reason["radius"] is None:
-        return f"{points} there"
+        return f"{_ONLY[0]}: {points} there" if subject.is_place else f"{points} there"
     text = f"{_ONLY[0]}: {points} within {reason['radius']:g} m"
     nearest = reason["nearest"]
     return f"{text}, the nearest is {nearest:.1f} m away" if np.isfinite(nearest) else text

@@ -12,6 +12,7 @@ from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
 from bevviz.stages.visibility import image_boxes
 
 LINK = 0.3  # IoU from which an image box belongs to a projected object
+NOISE = 0.05  # score below which a detection is as good as none
 IN_VIEW = 0.1  # least share of a box inside the image for an object in view
 MARGIN = 0.02  # metres around a ground truth box that still belong to it, because of sensor noise
 FOOT = 0.03  # metres above the bottom of a box that belong to the road, because of sensor noise

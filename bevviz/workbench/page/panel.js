@@ -32,7 +32,7 @@ function answer(message) {
   state.place = message.position ? `point//${message.position.join(",")}` : "";
   remember();
   // An object that a camera contradicts is no success, although it was reported.
-  $("answer").className = message.reported && message.reason !== "contradicted" ? "reported" : "missed";
+  $("answer").className = message.empty ? "" : message.reported && message.reason !== "contradicted" ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
   $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // without the time that the viewer took
   $("verdict").textContent = message.verdict;
@@ -48,7 +48,7 @@ function answer(message) {
   }));
   $("beside-title").hidden = !message.beside.length;
   $("hints").replaceChildren();
-  if (!message.reported) $("hints").textContent = "Trying what would change it ...";
+  if (!message.reported && !message.empty) $("hints").textContent = "Trying what would change it ...";
 }
 
 function nothing(message) {
