@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.evaluate import judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.model.reasons import ReasonKind
@@ -151,6 +152,7 @@ class Rule:
         self.obstacle_object = voxel_object[~self.ground]
         self.ground_object = voxel_object[self.ground]
         self.owner = self._owners()
+        self.partner = judge(self.objects, truth_of(shot.frame, shot.frame.truth)).partner
 
     def _owners(self) -> I64:
         """(D,) row of the truth that each detection is of, whatever its class; -1: none.
@@ -189,16 +191,25 @@ class Rule:
     # --- the rule ------------------------------------------------------------------------------
 
     def cause(self, row: int) -> Cause:
-        """Of one row of the truth."""
+        """Of one row of the truth. It is reported if ``evaluate`` counts an object for it."""
+        for j in np.flatnonzero(self.partner == row).tolist():
+            return Cause(self._flaw(row, j, int(self.objects.cluster[j])), True)
         for name_matters in (True, False):
             for j, k in enumerate(self.objects.cluster.tolist()):
                 right = self.objects.names[j] == self.labels[row]
                 if right == name_matters and self._is_in(row, k) and self._stands_for(row, j, k):
                     if right:
-                        return Cause(self._flaw(row, j, k), True)
+                        return Cause(self._not_counted(row, j, k), False)
                     if not self._own(row, DetectionState.KEPT):
                         return Cause(ReasonKind.MISNAMED, False)
         return Cause(self._loss(row), False)
+
+    def _not_counted(self, row: int, j: int, k: int) -> ReasonKind:
+        """Return why object j, which stands for this one, is not counted for it."""
+        flaw = self._flaw(row, j, k)
+        if self.partner[j] >= 0:
+            return ReasonKind.MERGED if flaw is ReasonKind.MERGED else ReasonKind.BORROWED
+        return flaw if flaw in (ReasonKind.MERGED, ReasonKind.SPLIT) else ReasonKind.MISPLACED
 
     def _stands_for(self, row: int, j: int, k: int) -> bool:
         """Whether object j, made of cluster k, is this one and not another that is in the same cluster."""
