@@ -14,6 +14,7 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.collect import collect_evidence
+from bevviz.why.confidence import LIMIT, confidence_of, likely
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
@@ -45,6 +46,7 @@ class Answer:
         tried: changes that were run and did not help.
         remark: one sentence about the search for hints: the best one, or what was tried, or why nothing could
             be. Empty: none was searched, or there is nothing to mend.
+        confidence: probability that the reason is right, where ground truth does not tell; None: unknown.
     """
 
     subject: Subject
@@ -57,6 +59,23 @@ class Answer:
     evidence: Evidence = field(repr=False)
     tried: tuple[TriedChange, ...] = ()
     remark: str = ""
+    confidence: float | None = None
+
+    @property
+    def likely(self) -> tuple[ReasonKind, ...]:
+        """The two most likely reasons where it cannot tell the reason; else empty."""
+        unsure = self.confidence is not None and self.confidence < LIMIT
+        return likely(self.verdict.kind) if unsure else ()
+
+    @property
+    def text(self) -> str:
+        """The sentence, with its confidence where ground truth does not tell the reason."""
+        if self.confidence is None:
+            return self.verdict.text
+        if self.likely:
+            reasons = " or ".join(kind.value for kind in self.likely)
+            return f"Cannot tell ({self.confidence:.0%} sure): {reasons}. {self.verdict.text}"
+        return f"{self.verdict.text} ({self.confidence:.0%} sure)"
 
     @property
     def near(self) -> bool:
@@ -71,10 +90,8 @@ class Answer:
     @property
     def weak(self) -> bool:
         """Whether the subject is a weak detection without an object of the ground truth."""
-        kind, best = self.verdict.kind, self.evidence.best
-        low = kind in (ReasonKind.BELOW_THRESHOLD, ReasonKind.SUPPRESSED)
-        low |= kind is ReasonKind.NOT_AMONG and best is not None and not best.kept
-        return self.subject.kind == "detection" and low
+        best = self.evidence.best
+        return self.subject.kind == "detection" and best is not None and not best.kept
 
     @property
     def false(self) -> bool:
@@ -145,7 +162,9 @@ class Answer:
             "points": self.points,
             "reported": verdict.reported,
             "reason": verdict.kind.value,
-            "verdict": verdict.text,
+            "verdict": self.text,
+            "confidence": None if self.confidence is None else round(self.confidence, 3),
+            "likely": [kind.value for kind in self.likely],
             "folded": self.folded,
             "false": self.false,
             "empty": self.empty,
@@ -294,7 +313,19 @@ class FrameExplainer:
         reason, reported = find_reason(subject, evidence, self.traces)
         verdict = make_verdict(subject, reason, reported)
         steps = tuple(steps_of(subject, evidence, self.traces))
-        answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
+        confidence = confidence_of(subject, evidence, reason.kind, self.traces)
+        answer = Answer(
+            subject,
+            verdict,
+            steps,
+            (),
+            evidence.fate,
+            evidence.distance,
+            evidence.raw,
+            evidence,
+            (),
+            confidence,
+        )
         if not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer

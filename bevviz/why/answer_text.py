@@ -22,21 +22,21 @@ def plain_text(answers: Sequence[Answer], chains: int, beside: Sequence[Answer] 
 def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
     """Yield the lines of the verdicts and steps."""
     for answer in answers[:chains]:
-        yield answer.verdict.text
+        yield answer.text
         yield ""
         for step in answer.steps:
             yield f"  {step.stage:<12} {step.text}"
         yield ""
     if len(answers) > chains:
         yield f"{len(answers) - chains} more, without their chains (--limit):"
-        yield from (f"- {answer.verdict.text}" for answer in answers[chains:])
+        yield from (f"- {answer.text}" for answer in answers[chains:])
 
 
 def _listed(others: Sequence[Answer]) -> Iterator[str]:
     """Yield the lines of the other subjects at the place."""
     if others:
         yield "also there:"
-        yield from (f"- {answer.verdict.text}" for answer in others[:LISTED])
+        yield from (f"- {answer.text}" for answer in others[:LISTED])
     if len(others) > LISTED:
         yield f"- and {len(others) - LISTED} more"
 
@@ -80,14 +80,14 @@ def _page(answers: Sequence[Answer], chains: int) -> Iterator[str]:
     for answer in answers[:chains]:
         yield f"### {answer.verdict.kind.value}"
         yield ""
-        yield f"**{markdown(answer.verdict.text)}**"
+        yield f"**{markdown(answer.text)}**"
         yield ""
         yield from (f"- *{step.stage}*: {markdown(step.text)}" for step in answer.steps)
         yield ""
     if len(answers) > chains:
         yield "### more"
         yield ""
-        yield from (f"- {markdown(answer.verdict.text)}" for answer in answers[chains:])
+        yield from (f"- {markdown(answer.text)}" for answer in answers[chains:])
         yield ""
     yield (
         "Points: brown ground, red noise, orange set aside, yellow in a cluster without a name, "

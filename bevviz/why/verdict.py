@@ -243,8 +243,11 @@ class _Decider:
         evidence, best = self.evidence, self.evidence.best
         if best is None:
             return ReasonKind.NOT_DETECTED
-        if not best.kept:
-            return self._weakness(best)
+        most_points = max((part.points for part in evidence.parts if part.kept), default=0)
+        lost = evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles)
+        if not best.kept:  # Without labels, an earlier stage that lost the points is blamed first.
+            blind = self.result.frame.truth is None and self.result.clusters is not None
+            return self._unclustered() if lost and blind else self._weakness(best)
         _, fusion = camera_and_fusion(self.result, best.camera)
         if fusion is None:
             return ReasonKind.NOT_FUSED
@@ -252,8 +255,7 @@ class _Decider:
             return ReasonKind.NO_POINTS if evidence.raw < FEW else self._unclustered()
         if best.decision is Decision.MATCHED:  # a detection of another camera named the object
             return ReasonKind.TAKEN
-        most_points = max((part.points for part in evidence.parts if part.kept), default=0)
-        if evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles):
+        if lost:
             return self._unclustered()
         is_merged = best.decision is Decision.TAKEN and evidence.mates
         return ReasonKind.MERGED if is_merged else _REFUSED[best.decision]
