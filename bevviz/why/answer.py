@@ -314,18 +314,8 @@ class FrameExplainer:
         verdict = make_verdict(subject, reason, reported)
         steps = tuple(steps_of(subject, evidence, self.traces))
         confidence = confidence_of(subject, evidence, reason.kind, self.traces)
-        answer = Answer(
-            subject,
-            verdict,
-            steps,
-            (),
-            evidence.fate,
-            evidence.distance,
-            evidence.raw,
-            evidence,
-            (),
-            confidence,
-        )
+        answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
+        answer = replace(answer, confidence=confidence)
         if not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer
