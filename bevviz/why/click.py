@@ -14,6 +14,9 @@ from bevviz.recording.labels import box_row
 from bevviz.recording.opinions import MISSED, opinion_outlines_in_bev, opinion_outlines_in_image
 from bevviz.recording.primitives import CORNER
 from bevviz.why.selection import Selection
+from bevviz.why.subject import points_in_box, single_box
+
+NEAR_BOX = 0.1  # metres from a box that a click on its edge may be off
 
 
 def select_click(
@@ -36,7 +39,7 @@ def select_click(
             return hit
     if path == entities.BEV or path.startswith(f"{entities.BEV}/"):
         return _cell(result, position) if len(position) >= 2 else None
-    return _in_space(result, tracks, path, row) or _place_at(result, position)
+    return _in_space(result, tracks, path, row) or _box_at(result, position) or _place_at(result, position)
 
 
 def _object_with_opinion(result: FrameResult, path: str, row: int) -> Selection | None:
@@ -101,6 +104,10 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
     if path == entities.FUSED and (objects := result.objects) is not None:
         row = box_row(row, len(objects))
         return Selection(object=row) if row < len(objects) else None
+    if path == entities.MEASURED and (objects := result.objects) is not None and objects.measured is not None:
+        drawn = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
+        row = box_row(row, len(drawn))
+        return Selection(object=int(drawn[row])) if row < len(drawn) else None
     if path == entities.FUSION:
         return _fused_detection(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
@@ -122,6 +129,23 @@ def _track(result: FrameResult, tracks: Tracks, row: int) -> Selection | None:
         return Selection(cluster=int(tracks.cluster[row]))
     center = tracks.boxes.center[row]
     return _place_at(result, center.tolist()) if tracks.absolute else _point(center)
+
+
+def _box_at(result: FrameResult, position: Sequence[float]) -> Selection | None:
+    """Return the object, or else the cluster, whose box holds a position in the fixed frame."""
+    place = _place_at(result, position)
+    if place is None:
+        return None
+    point, objects, clusters = np.array([place.point], np.float32), result.objects, result.clusters
+    for kind, boxes in (
+        ("object", None if objects is None else objects.boxes),
+        ("object", None if objects is None else objects.measured),
+        ("cluster", None if clusters is None else clusters.boxes(result.config.clustering)),
+    ):
+        for row in range(0 if boxes is None else len(boxes)):
+            if boxes is not None and points_in_box(single_box(boxes, row), point, NEAR_BOX).any():
+                return Selection.of(kind, row)
+    return None
 
 
 def _place_at(result: FrameResult, position: Sequence[float]) -> Selection | None:

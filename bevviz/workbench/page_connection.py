@@ -18,6 +18,7 @@ from bevviz.support.loggers import logger
 if TYPE_CHECKING:
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, Selection
+    from bevviz.why.identity import Identity
     from bevviz.workbench.buffers import News
     from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.source import Message, Settings
@@ -44,7 +45,8 @@ class PageConnection:
         self._socket, self._desk, self._run = socket, desk, run
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._newest = 0
+        self._newest = 0  # of all messages
+        self._asked = 0  # of the questions
         self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
         self._remarking = False
         self._handlers = {
@@ -67,7 +69,10 @@ class PageConnection:
             sender = asyncio.ensure_future(self._tell(news))
             try:
                 while True:
-                    self._take(await self._socket.receive_text())
+                    message = await self._socket.receive()
+                    if message["type"] == "websocket.disconnect":
+                        break
+                    self._take(message.get("text") or "")
             finally:
                 sender.cancel()
                 for task in self._tasks:
@@ -94,12 +99,18 @@ class PageConnection:
     async def _tell(self, news: asyncio.Event) -> None:
         """Send news of the run whenever there are any."""
         sent_counts: dict[int, int] = {}
+        sent_times: set[tuple[int, int]] = set()
         opening_sent, notes_version, workbench, source = False, -1, self._workbench, self._source
         while True:
             news.clear()
             if not opening_sent and source.opening is not None:
                 opening_sent = True
-                await self._send({"type": "opening", "stamp": str(source.opening)})
+                await self._send(
+                    {"type": "opening", "stamp": str(source.opening), "first": str(source.first)}
+                )
+            if times := sorted(set(source.frame_times()) - sent_times):
+                sent_times.update(times)
+                await self._send({"type": "frames", "frames": [[str(at), number] for at, number in times]})
             for message in source.findings.news(sent_counts):
                 await self._send(message)
             if notes_version != workbench.notes_version:
@@ -157,7 +168,7 @@ class PageConnection:
         """Run ``work`` on the desk thread. Idle work is skipped once the page has sent a newer message."""
 
         def job() -> Any:
-            if idle and number != self._newest:
+            if idle and number not in (self._asked, self._newest):
                 return None
             with self._source.quiet():
                 return work()
@@ -165,32 +176,50 @@ class PageConnection:
         return await asyncio.get_running_loop().run_in_executor(self._desk, job)
 
     async def _ask(self, number: int, message: Message) -> None:
-        """Answer a question and mark the object. Then send hints, unless a newer message came."""
+        """Answer a question and mark the object. Then send hints, unless a newer question came."""
         from bevviz.workbench.page_messages import hints_dict, other_answers
 
+        self._asked = number
         workbench, frame = self._workbench, await self._frame(message)
         settings = self._source.asked_settings(_settings(message), again="pick" in message)
-        head = {"id": number, "frame": frame}
+        head = {"id": number, "frame": frame, "set": list(_settings(message))}
+        origin = message.get("from")
+        asked_in = frame if origin is None else await self._frame(origin)
 
-        def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | None:
-            selection = self._selected(message, frame, settings)
+        def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | dict[str, Any]:
+            identity, found = _identity(message), ""
+            selection = None if identity else self._selected(message, frame, settings)
+            if identity is None and selection is None:
+                return {"type": "nothing", "entity": str(message.get("entity", ""))}
+            if selection is not None and origin is not None:
+                asked_settings = self._source.asked_settings(_settings(origin), again=True)
+                if (asked_in, asked_settings) != (frame, settings):
+                    answer = workbench.ask(asked_in, asked_settings, selection)[0]
+                    identity = workbench.identity(asked_in, asked_settings, selection, answer, None)
+            if identity is not None:
+                selection, found = workbench.follow(identity, frame, settings)
             if selection is None:
-                return None
+                assert identity is not None
+                values = " with these values" if settings and frame == identity.frame else ""
+                name = identity.name[:1].upper() + identity.name[1:]
+                text = f"{name} of frame {identity.frame} is not in frame {frame}{values}: {found}."
+                return {"type": "absent", "text": text, "pick": str(identity)}
             answer, *others = workbench.ask(frame, settings, selection)
-            pick, beside = str(selection), list(other_answers(others))
-            tree = {"pick": pick, **answer.as_dict(), "beside": beside}
+            pick = str(workbench.identity(frame, settings, selection, answer, identity))
+            tree = {"pick": pick, "found": found, **answer.as_dict(), "beside": list(other_answers(others))}
             return selection, self._source.look(frame, settings), answer, tree
 
         answered = await self._at_desk(number, work)
-        if answered is None:
-            await self._send({"type": "nothing", **head, "entity": str(message.get("entity", ""))})
+        if isinstance(answered, dict):
+            await self._send({**answered, **head})
             return
         selection, result, answer, tree = answered
         await self._send({"type": "answer", **head, **tree})
         await self._at_desk(number, lambda: self._source.mark(result, answer))
         hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, selection), idle=True)
         if hints is not None:
-            await self._send({"type": "hints", **head, **hints_dict(hints)})
+            asked = str(message.get("pick", tree["pick"]))
+            await self._send({"type": "hints", **head, "row_pick": asked, **hints_dict(hints)})
 
     def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""
@@ -206,9 +235,18 @@ class PageConnection:
     async def _try(self, number: int, message: Message) -> None:
         from bevviz.workbench.page_messages import controls
 
-        frame, settings, selection = await self._frame(message), _settings(message), _selection(message)
-        effects = await self._at_desk(number, lambda: self._workbench.try_values(frame, settings, selection))
-        await self._send({"type": "tried", "id": number, "frame": frame, **effects})
+        frame, settings, identity = await self._frame(message), _settings(message), _identity(message)
+        effects = await self._at_desk(number, lambda: self._workbench.try_values(frame, settings, identity))
+        await self._send(
+            {
+                "type": "tried",
+                "id": number,
+                "frame": frame,
+                "set": list(settings),
+                "pieces": self._source.desk_pieces,
+                **effects,
+            }
+        )
         new_controls = controls(self._source.configured(settings), self._opened)
         if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
             self._controls = new_controls
@@ -262,9 +300,10 @@ class PageConnection:
 
     async def _note(self, number: int, message: Message) -> None:
         file = self._workbench.tools.notes.path.name
-        frame, text, selection = await self._frame(message), str(message["text"]), _selection(message)
-        await self._at_desk(number, lambda: self._workbench.note(frame, text, selection))
-        await self._send({"type": "noted", "id": number, "file": file})
+        frame, text, identity = await self._frame(message), str(message["text"]), _identity(message)
+        about = await self._at_desk(number, lambda: self._workbench.note(frame, text, identity))
+        said = f"Noted about {about} in frame {frame}."
+        await self._send({"type": "noted", "id": number, "file": file, "text": said})
 
     async def _unnote(self, number: int, message: Message) -> None:
         stamp, text = int(message["stamp"]), str(message["text"])
@@ -290,11 +329,12 @@ def _settings(message: Message) -> Settings:
     return tuple(str(setting) for setting in message.get("set") or ())
 
 
-def _selection(message: Message) -> Selection | None:
-    """Return the selection that a message names, if it names one."""
-    from bevviz.why.selection import Selection
+def _identity(message: Message) -> Identity | None:
+    """Return the identity that a message names, if it names one."""
+    from bevviz.why.identity import Identity
 
-    return Selection.parse(str(message["pick"])) if message.get("pick") else None
+    pick = str(message.get("pick", ""))
+    return Identity.parse(pick) if pick.startswith("{") else None
 
 
 @contextlib.contextmanager

@@ -148,6 +148,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def _run(self) -> None:
         try:
             first = self.look(self._first)
+            self.first = self._stamp_of(0)
             self.show(first, find_findings(self.explainer(first)))
             self._go.wait(FIRST)
             run(self.again, self.drive.new_session(), [self], stop=self._stop)
@@ -320,6 +321,19 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """Return the stamp of a frame, or its log time if the frame cannot be read."""
         frame = self.drive.frames.frame(number)
         return int(self.drive.frames.scans[number]) if frame is None else frame.stamp
+
+    def tracks(self, number: int) -> Tracks | None:
+        """Return the tracks that the run found in a frame. None: it has not reached the frame."""
+        return self._tracks.get(number)
+
+    @property
+    def desk_pieces(self) -> int:
+        """Number of pieces in ``desk``."""
+        return len(self.desk)
+
+    def frame_times(self) -> list[tuple[int, int]]:
+        """Return stamp and number of each recorded frame."""
+        return list(self._stamps)
 
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
         """Return the result of a frame, with other values if ``settings`` names some.

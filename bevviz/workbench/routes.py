@@ -175,7 +175,10 @@ async def _listen(socket: WebSocket, state: PageState, event: asyncio.Event) -> 
     """Update the state of a page with its messages, and set the event at each of them."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         while True:
-            state.take(await socket.receive_text())
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                break
+            state.take(message.get("text") or "")
             event.set()
     state.gone = True
     event.set()

@@ -16,7 +16,7 @@ from bevviz.evaluate import Truth, truth_of
 from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live
 from bevviz.model.frame import Frame
-from bevviz.model.results import FrameResult
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Variants
 from bevviz.recording import entities
@@ -169,6 +169,14 @@ class RunningRobot(Source):
             while len(self._tried_results) > TRIED:
                 self._tried_results.popitem(last=False)
         return self._tried_results[key]
+
+    def tracks(self, number: int) -> Tracks | None:
+        """Return the tracks in a frame."""
+        return self.look(number).tracks
+
+    def frame_times(self) -> list[tuple[int, int]]:
+        """Return stamp and number of each frame in memory."""
+        return [(result.frame.stamp, result.frame.index) for result in self._held()]
 
     # --- questions -----------------------------------------------------------------------------
 

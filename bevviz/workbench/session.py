@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bevviz.errors import UserError
 from bevviz.pipeline.notes import Note, Notes
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.frame_index import FrameIndex
+from bevviz.why.identity import Identity, find, identify
+from bevviz.why.resolve import select_subjects
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
@@ -106,6 +109,38 @@ class WorkbenchSession(Closable):
         self._keep(number, settings, selection, answer)
         return [answer, *(other for other in candidates if other.subject.key != answer.subject.key)]
 
+    def identity(
+        self, number: int, settings: Settings, selection: Selection, answer: Answer, known: Identity | None
+    ) -> Identity:
+        """Return the identity of an answer's subject.
+
+        Args:
+            number: number of the frame.
+            settings: settings of the answer.
+            selection: the selection that was asked about.
+            answer: the answer.
+            known: identity by which the subject was found. It gets the new place.
+        """
+        source = self.source
+        result, opened, tracks = source.look(number, settings), source.look(number), source.tracks(number)
+        identity = identify(answer.subject, selection, result, tracks if result is opened else None)
+        if result is not opened and identity.kind != "truth" and not identity.place:
+            same, _ = find(identity, opened, opened, None)
+            if same is not None and not same.is_place:
+                (subject,) = select_subjects(FrameIndex(opened), same)
+                identity = replace(identity, track=identify(subject, same, opened, tracks).track)
+        if known is None or identity.place:
+            return known or identity
+        track = identity.track if identity.track >= 0 else known.track
+        return replace(known, frame=number, at=identity.at or known.at, box=identity.box, track=track)
+
+    def follow(
+        self, identity: Identity, number: int, settings: Settings = ()
+    ) -> tuple[Selection | None, str]:
+        """Find the object of an identity in a frame, see ``bevviz.why.identity.find``."""
+        source = self.source
+        return find(identity, source.look(number, settings), source.look(number), source.tracks(number))
+
     def hints(self, number: int, settings: Settings, selection: Selection) -> Answer:
         """Answer with hints: parameter changes that would change the verdict. This takes longer than ``ask``.
 
@@ -144,20 +179,19 @@ class WorkbenchSession(Closable):
             if asked_settings == settings and low <= received <= high
         ]
 
-    def try_values(
-        self, number: int, settings: Settings, selection: Selection | None = None
-    ) -> dict[str, Any]:
+    def try_values(self, number: int, settings: Settings, identity: Identity | None = None) -> dict[str, Any]:
         """Show a frame with other values, and return their effects.
 
         Args:
             number: number of the frame.
             settings: the other values.
-            selection: the object that the values are tried for. Its effect comes first.
+            identity: the object that the values are tried for. Its effect comes first.
 
         Raises:
             UserError: a parameter is unknown, or a value is wrong.
         """
         before, after = self.source.try_values(number, settings)
+        selection = None if identity is None else self.follow(identity, number)[0]
         asked_row = None if selection is None else selection.truth
         return trial_effects(
             before, after, self.source.truth(after.frame), -1 if asked_row is None else asked_row
@@ -165,20 +199,25 @@ class WorkbenchSession(Closable):
 
     # --- notes ---------------------------------------------------------------------------------
 
-    def note(self, number: int, text: str, selection: Selection | None) -> None:
-        """Save a note about a frame, or about an object in it.
+    def note(self, number: int, text: str, identity: Identity | None) -> str:
+        """Save a note about an object, or about the frame if the object is not in it. Return its subject.
 
         Raises:
-            UserError: the note cannot be written, or there is no such object.
+            UserError: the note cannot be written.
         """
         result, about, pick = self.source.look(number), "", ""
+        selection = None if identity is None else self.follow(identity, number)[0]
         if selection is not None:
             answer = self.ask(number, (), selection)[0]
             self.source.mark(result, answer)
-            about, pick = answer.subject.name.removeprefix("the "), str(selection)
+            about, pick = (
+                answer.subject.name.removeprefix("the "),
+                str(self.identity(number, (), selection, answer, identity)),
+            )
         frame = result.frame
         self.tools.notes.add(Note(frame.stamp, frame.received, text.strip(), about, pick))
         self._tell_notes()
+        return f"the {about}" if about else "the frame"
 
     def remove_note(self, stamp: int, text: str) -> None:
         """Remove a note.

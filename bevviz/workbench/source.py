@@ -12,7 +12,7 @@ from bevviz.config import Config
 from bevviz.evaluate import Truth
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Frame
-from bevviz.model.results import FrameResult
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.session import Session
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
@@ -35,6 +35,7 @@ class Source(Closable):
         scans: number of scans. 0 for a robot.
         findings: findings, grouped over frames.
         news: tells of each new frame and of all other news for the page.
+        first: stamp that the page counts seconds from.
         opening: stamp of the frame that a page opens at. None: no frame is shown yet, or the newest one.
         commands: further messages of the page by type, each with the function that returns the reply.
     """
@@ -47,6 +48,7 @@ class Source(Closable):
         self._remarks: dict[tuple[int, str], str] = {}  # by frame and text of the selection
         self._remarking = threading.Lock()
         self._aside: FrameExplainer | None = None
+        self.first = 0
         self.commands: Mapping[str, Callable[[Message], dict[str, Any]]] = {}
 
     def truth(self, frame: Frame) -> Truth | None:
@@ -117,6 +119,19 @@ class Source(Closable):
         Raises:
             UserError: there is no such frame, a parameter is unknown, or a value is wrong.
         """
+
+    @abstractmethod
+    def tracks(self, number: int) -> Tracks | None:
+        """Return the tracks of the run in a frame. None: the run has not reached it."""
+
+    @abstractmethod
+    def frame_times(self) -> list[tuple[int, int]]:
+        """Return stamp and number of each frame that a page can show."""
+
+    @property
+    def desk_pieces(self) -> int:
+        """Number of pieces with answers and tried results that a page gets beside the run."""
+        return 0
 
     def asked_settings(self, settings: Settings, again: bool) -> Settings:
         """Return the settings that a question is about.

@@ -9,6 +9,7 @@ const RETRY = 1500; // ms between attempts to reach the server
 let questions = null; // socket of the questions and answers
 let number = 0; // of the newest question
 const handlers = {};
+const failures = new Map(); // what to do with the error of a message, by its number
 export const on = (more) => Object.assign(handlers, more);
 
 const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
@@ -31,6 +32,8 @@ function receive(lane) {
     if (!pieces.film) performance.mark("piece");
     pieces[lane] += 1;
     toViewer({ type: "rrd" }, [new DataView(data)]);
+    for (const one of awaited.filter(([, count]) => pieces.desk >= count)) one[0]();
+    awaited = awaited.filter(([, count]) => pieces.desk < count);
     if (recordings.length === 1 && kind !== "live") recordings.push(receive("desk")); // The layout has to arrive first.
     if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
@@ -55,10 +58,12 @@ export function connect() {
       handlers.welcome(message);
       viewerReady.then(() => { recordings = [receive("film")]; });
     } else if (message.type === "failed") alarm(message.text);
+    else if (message.type === "error") (failures.get(message.id) ?? handlers.error)(message);
     else handlers[message.type]?.(message);
   };
   questions.onclose = () => {
     for (const socket of recordings) socket.close();
+    handlers.gone?.();
     if (!$("gone").textContent) alarm("The server is gone: nothing is answered until it is back. Looking for it ...");
     setTimeout(async () => {
       try {
@@ -75,10 +80,19 @@ function alarm(text) {
   $("gone").hidden = !text;
 }
 
-export function send(message) {
+// Send a message. An error in reply to it goes to `failed`, which names the thing that it is about.
+export function send(message, failed) {
   number += 1;
+  if (failed) failures.set(number, failed);
+  failures.delete(number - 100);
   if (questions.readyState === WebSocket.OPEN) questions.send(JSON.stringify({ id: number, ...message }));
   return number;
 }
 
-export const newest = () => number;
+
+// Call a function once the viewer has so many pieces of the desk.
+let awaited = [];
+export function withPieces(count, then) {
+  if (pieces.desk >= count) then();
+  else awaited.push([then, count]);
+}

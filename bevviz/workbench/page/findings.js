@@ -18,8 +18,10 @@ let current = null; // key of the chosen finding
 let sight = 0; // index of the chosen frame of the finding
 let ask = () => {};
 let tryOut = () => {};
+let forget = () => {};
 
-export function start(asking, trying) {
+export function start(asking, trying, forgetting) {
+  forget = forgetting;
   ask = asking;
   tryOut = trying;
   $("next").onclick = () => step(1);
@@ -166,9 +168,11 @@ function choose(entry, which) {
   }
   $("found").children[rows.indexOf(entry)]?.scrollIntoView({ block: "nearest" });
   if (tried || entry.what.endsWith("gone")) tryOut(tried);
+  const from = { time: Number(stamp), set: tried ? tryOut.settings() : [] }; // The pick is valid there.
   seek(stamp);
   showSide();
-  state.pick = pick;
+  state.pick = "";
   remember();
-  if (pick) ask({ pick });
+  if (pick) ask({ pick, from });
+  else forget();
 }

@@ -9,15 +9,16 @@ let trial = null; // the newest trial, from the server
 export const settings = () => trial?.settings ?? null;
 
 export function start() {
-  $("drive").onclick = () => send({ type: "drive", set: state.set });
+  const say = (id) => ({ text }) => { $(id).textContent = text; $(id).className = "alarm"; };
+  $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
   $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
   $("report").onclick = () => {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
     const set = isTried() ? state.set : []; // settings of the shown side
-    send({ type: "report", time: Number(state.time), set, text: $("words").value, ...range });
+    send({ type: "report", time: Number(state.time), set, text: $("words").value, ...range }, say("noted"));
   };
-  $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value });
+  $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value }, say("noted"));
   $("strip").onclick = (event) => {
     if (!trial?.strip.length) return;
     const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
@@ -25,7 +26,11 @@ export function start() {
   };
 }
 
-export const noted = () => { $("words").value = ""; };
+export function noted({ text }) {
+  $("words").value = "";
+  $("noted").textContent = text;
+  $("noted").className = "faint";
+}
 
 export function progress(message) {
   $("bar").max = message.total || 1;

@@ -3,10 +3,20 @@
 export const $ = (id) => document.getElementById(id);
 
 export const state = {
-  bag: "", run: "", time: null, pick: "", place: "", set: [], undo: [], flipped: false,
+  bag: "", run: "", time: null, pick: "", set: [], undo: [], flipped: false,
   opening: null, // stamp of the frame that is shown first
   first: 0, // stamp that seconds are counted from
+  answer: null, // frame and settings of the shown answer
 };
+const frames = []; // stamp and number of each frame that the server has, sorted
+export function addFrames(message) {
+  frames.push(...message.frames.map(([stamp, number]) => [Number(stamp), number, stamp]));
+  frames.sort((a, b) => a[0] - b[0] || a[1] - b[1]);
+}
+const rowAt = (time) => frames.findLastIndex(([stamp]) => stamp <= Number(time) + 1000);
+export const shownFrame = () => frames[rowAt(state.time)]?.[1] ?? null; // number
+export const neighbour = (by) => frames[rowAt(state.time) + by]?.[2] ?? null; // stamp
+
 // Times in ms: the pointer was released, the newest question began for the user, and it was sent.
 export const asked = { released: 0, at: 0, sent: 0 };
 export const stated = new URLSearchParams(location.hash.slice(1));

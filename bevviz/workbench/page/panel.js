@@ -1,9 +1,9 @@
 // The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
-import { connect, newest, on, send, want } from "./connection.js";
+import { connect, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
-import { $, asked, element, remember, state, stated } from "./page_state.js";
+import { $, addFrames, asked, element, neighbour, remember, seconds, shownFrame, state, stated } from "./page_state.js";
 import { drawnThen, isTried, kind, onViewer, seek, showSide } from "./viewer.js";
 
 let controls = [];
@@ -11,60 +11,111 @@ let opened = []; // controls of the configuration that the drive was opened with
 
 // --- questions and answers ----------------------------------------------------------------------
 
-let asking = 0;
+let asking = 0; // number of the newest question
+let askedFor = ""; // frame and settings of the newest question
 let askedTried = false; // the newest question is about the tried side
+
+const shownSet = () => (isTried() ? state.set : []);
+const shownKey = () => [shownFrame() ?? state.time, ...shownSet()].join();
+const withValues = (set) => (set.length ? ` with ${set.join(", ")}` : "");
+
 function ask(what) {
   if (state.time === null) return;
   asked.at = "entity" in what ? asked.released : performance.now();
   asked.sent = performance.now();
   $("answer").classList.add("busy");
   askedTried = isTried();
-  asking = send({ type: "ask", time: Number(state.time), set: askedTried ? state.set : [], ...what });
+  askedFor = shownKey();
+  asking = send({ type: "ask", time: Number(state.time), set: shownSet(), ...what }, ({ id, text }) => {
+    if (id !== asking) return;
+    if (state.answer?.id === id) $("hints").textContent = text;
+    else clear("missed", text);
+  });
 }
 
-// Row numbers differ between results, only those of the ground truth stay. So ask about the object's position.
-const askAgain = () => ask({ pick: state.pick.startsWith("truth/") ? state.pick : state.place || state.pick });
+// Row numbers differ between frames and values. The address of an answer's object is valid in all of them.
+const askAgain = () => { if (state.pick) ask({ pick: state.pick }); };
+
+// Show a sentence in place of an answer. Nothing of the former answer stays.
+function clear(className, text, where = "") {
+  state.answer = null;
+  $("answer").className = className;
+  $("verdict").textContent = text;
+  $("where").textContent = where;
+  for (const id of ["chain", "beside", "hints"]) $(id).replaceChildren();
+  $("beside-title").hidden = true;
+  freshness();
+}
+
+function forget() {
+  asking = 0;
+  state.pick = "";
+  clear("", "Click a box, a point, a pixel: it answers why it is what it is.");
+}
+
+// Tell which frame is shown, and mark an answer or an effect of another frame or of other values.
+function freshness() {
+  const frame = shownFrame();
+  $("shown").textContent = frame === null ? seconds(state.time) : `Frame ${frame} at ${seconds(state.time)}`;
+  const { answer } = state;
+  const isOld = answer !== null && (answer.frame !== frame || answer.set.join() !== shownSet().join());
+  $("answer").classList.toggle("old", isOld);
+  $("of").hidden = !isOld;
+  $("of").textContent = isOld
+    ? `This is about frame ${answer.frame}${withValues(answer.set)}; frame ${frame}${withValues(shownSet())} is shown.` : "";
+  for (const button of $("hints").querySelectorAll("button")) button.disabled = isOld;
+  $("effect").classList.toggle("old", $("effect").dataset.frame !== String(frame));
+}
 
 function answer(message) {
   if (message.id !== asking) return;
   const took = performance.now() - asked.at;
   state.pick = message.pick;
-  state.place = message.position ? `point//${message.position.join(",")}` : "";
+  state.answer = { id: message.id, frame: message.frame, set: message.set };
   remember();
   // An object that a camera contradicts is no success, although it was reported.
   $("answer").className = message.empty ? "" : message.reported && message.reason !== "contradicted" ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
   $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // without the time that the viewer took
+  $("answer").dataset.subject = message.pick;
   $("verdict").textContent = message.verdict;
   const parts = [message.name, `frame ${message.frame}`];
   if (message.distance !== null) parts.push(`${message.distance} m away`);
+  if (message.found) parts.push(`found ${message.found}`);
   $("where").textContent = `${parts.join(" · ")} · answered in ${(took / 1000).toFixed(2)} s`;
   $("chain").replaceChildren(...message.chain.map((step) => (
     element("li", "", "", element("b", "", `${step.stage}: `), step.text))));
+  const from = { time: Number(state.time), set: message.set };
   $("beside").replaceChildren(...message.beside.map((other) => {
     const button = element("button", other.reported ? "" : "missed", `${other.name}: ${other.reason}`);
-    button.onclick = () => ask({ pick: other.pick });
+    button.onclick = () => ask({ pick: other.pick, from });
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
-  $("hints").replaceChildren();
-  if (!message.reported && !message.empty) $("hints").textContent = "Trying what would change it ...";
+  $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
+  freshness();
 }
 
 function nothing(message) {
   if (message.id !== asking) return;
-  $("answer").className = "";
-  $("verdict").textContent = `Nothing can be asked about ${message.entity}.`;
+  state.pick = "";
+  remember();
+  clear("", `Nothing can be asked about ${message.entity}.`);
+}
+
+// The object is in another frame only. It stays the subject, and is found again where it is.
+function absent(message) {
+  if (message.id !== asking) return;
+  state.pick = message.pick;
+  remember();
+  clear("", message.text, `frame ${message.frame}${withValues(message.set)}`);
+  state.answer = { id: message.id, frame: message.frame, set: message.set };
+  freshness();
 }
 
 function failed(message) {
-  if (message.id === trying) {
-    $("effect").textContent = message.text;
-    return;
-  }
-  if (message.id !== newest() && message.id !== asking) return;
-  $("answer").className = "missed";
-  $("verdict").textContent = message.text;
+  $("noted").textContent = message.text;
+  $("noted").className = "alarm";
 }
 
 function hints(message) {
@@ -75,9 +126,10 @@ function hints(message) {
     button.onclick = () => change(hint.settings);
     return button;
   }));
+  freshness();
   if (!message.remark) return;
   if (!message.hints.length) $("hints").textContent = message.remark;
-  list.explain(message.frame, state.pick, askedTried, message.remark);
+  list.explain(message.frame, message.row_pick, askedTried, message.remark);
 }
 
 // Describe the effects of other values on a frame. Hints and tried values use the same words.
@@ -114,33 +166,60 @@ function changed() {
   attempt();
 }
 
-let trying = 0;
+let trying = 0; // number of the newest trial
 let tryingSince = 0;
+let triedFor = ""; // frame and settings of the newest trial
+let valid = []; // the last settings that the server has accepted
 function attempt() {
   if (state.time === null) return;
   tryingSince = performance.now();
   showSide();
-  if (state.set.length || kind === "live") { // A robot needs empty settings, too.
-    $("effect").textContent = "Running the stages ...";
-    trying = send({ type: "try", time: Number(state.time), set: state.set, pick: state.pick });
-  } else {
+  $("effect").className = "";
+  if (state.set.length || kind === "live") tryHere(); // A robot needs empty settings, too.
+  else {
+    trying = 0;
+    triedFor = "";
+    valid = [];
     $("effect").textContent = "As it was opened.";
+    $("effect").dataset.frame = shownFrame();
     offer({ controls: opened });
   }
-  if (state.pick) askAgain();
+  askAgain();
+}
+
+function tryHere() {
+  const frame = shownFrame();
+  triedFor = shownKey();
+  $("effect").textContent = `Frame ${frame}: running the stages ...`;
+  $("effect").dataset.frame = frame;
+  const set = state.set;
+  trying = send({ type: "try", time: Number(state.time), set, pick: state.pick }, ({ id, text }) => {
+    if (id !== trying) return;
+    if (valid.join() !== set.join()) { // Invalid settings are in force nowhere.
+      state.set = valid;
+      if (state.undo.at(-1)?.join() === valid.join()) state.undo.pop();
+      changed();
+    }
+    $("effect").textContent = text;
+    $("effect").className = "alarm";
+    trying = 0;
+  });
 }
 
 function tried(message) {
   if (message.id !== trying) return;
+  valid = message.set;
   const since = tryingSince;
   const took = () => (performance.now() - since).toFixed(0);
   $("effect").dataset.took = took();
-  drawnThen(() => { $("effect").dataset.drawn = took(); });
+  $("effect").dataset.frame = message.frame;
+  withPieces(message.pieces, () => drawnThen(() => { $("effect").dataset.drawn = took(); }));
   const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${both.map((one) => one ?? "–").join(" → ")}`);
   const parts = [[effects(message.effects), ...opinions].filter(Boolean).join("; ") || "changes nothing that is reported"];
   if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
   parts.push(...message.failures);
-  $("effect").textContent = `${parts.join("; ")}.`;
+  $("effect").textContent = `Frame ${message.frame}: ${parts.join("; ")}.`;
+  freshness();
 }
 
 // Switch between the frame as opened and as tried.
@@ -151,7 +230,8 @@ function flip() {
   $("side").textContent = state.flipped ? "shown: before" : "shown: after";
   remember();
   showSide();
-  if (state.pick) askAgain();
+  freshness();
+  askAgain();
 }
 
 // Show the side of a listed finding: with the settings of the newest trial, or as opened.
@@ -209,10 +289,10 @@ function control(one, changes) {
 
 // --- session state from the server --------------------------------------------------------------
 
-function open({ stamp }) {
+function open({ stamp, first }) {
   if (state.opening !== null) return;
   const same = stated.get("bag") === state.bag;
-  state.first = stamp;
+  state.first = first;
   state.opening = (same && stated.get("at")) || stamp;
   seek(state.opening);
   if (!same) return;
@@ -222,7 +302,7 @@ function open({ stamp }) {
     state.undo.push([]);
     changed();
     if (stated.get("side") === "before") flip();
-  } else if (state.pick) ask({ pick: state.pick });
+  } else askAgain();
 }
 
 function welcome(message) {
@@ -232,31 +312,30 @@ function welcome(message) {
   $("bag").textContent = message.bag;
   controls = opened = message.controls;
   list.restart();
-  if (!message.detector) $("run").title = "no detector: give --model";
+  $("detector").hidden = message.detector;
+  if (kind === "live") $("changed-title").textContent = "In force on the robot, from the next frame on";
   showControls();
 }
 
 on({
-  welcome, controls: offer, answer, nothing, hints, tried, opening: open, error: failed, progress: jobs.progress,
-  entries: list.update, remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text), notes: list.notes, noted: jobs.noted,
+  welcome, controls: offer, answer, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
+  tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, notes: list.notes, noted: jobs.noted,
+  remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text),
 });
 onViewer({
   clicked: ask,
+  moved: freshness,
   settled: () => {
     remember();
     want(state.time);
-    if (isTried()) attemptThere();
-    else if (kind !== "live") send({ type: "settle", time: Number(state.time), set: [] });
+    if (isTried() && triedFor !== shownKey()) tryHere();
+    if (state.pick && askedFor !== shownKey()) askAgain();
+    else if (kind !== "live") send({ type: "settle", time: Number(state.time), set: shownSet() });
     if ($("here").checked) list.draw();
   },
   shown: () => send({ type: "shown" }),
   sought: want,
 });
-
-function attemptThere() {
-  $("effect").textContent = "Running the stages ...";
-  trying = send({ type: "try", time: Number(state.time), set: state.set });
-}
 
 // --- keys and buttons ---------------------------------------------------------------------------
 
@@ -266,7 +345,14 @@ function undo() {
   changed();
 }
 
+function stepFrame(by) {
+  const stamp = neighbour(by);
+  if (stamp !== null) seek(stamp);
+}
+
 const actions = {
+  ",": () => stepFrame(-1),
+  ".": () => stepFrame(1),
   n: () => list.step(1),
   p: () => list.step(-1),
   u: undo,
@@ -290,7 +376,8 @@ window.addEventListener("keydown", (event) => {
 }, true);
 
 if (kind === "live") Object.assign(actions, (await import("./robot.js")).actions);
-list.start(ask, tryOut);
+tryOut.settings = () => jobs.settings() ?? [];
+list.start(ask, tryOut, forget);
 if (kind !== "live") list.onBare((rows) => send({ type: "remarks", rows }));
 list.onRemove((note) => send({ type: "unnote", stamp: note.stamp, text: note.text }));
 jobs.start();

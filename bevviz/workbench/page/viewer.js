@@ -19,7 +19,7 @@ const settings = {
   _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
   _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
 };
-const callbacks = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {} }; // for its events
+const callbacks = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {}, moved: () => {} }; // for its events
 export const viewerReady = new Promise((ready) => {
   widget.render({
     model: {
@@ -75,6 +75,7 @@ export function seek(stamp) {
   state.time = target;
   callbacks.sought(target);
   move(target);
+  settle();
 }
 
 // Go to a stamp once. The user may move on from it, or the viewer plays from it.
@@ -118,6 +119,11 @@ function moved(event) {
   }
   if (event.type !== "time_update" || (state.time !== null && Number(state.time) === event.time)) return;
   state.time = String(BigInt(Math.round(event.time)));
+  settle();
+}
+
+function settle() {
+  callbacks.moved();
   clearTimeout(settling);
   settling = setTimeout(callbacks.settled, SETTLED);
 }
