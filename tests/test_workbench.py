@@ -116,6 +116,12 @@ def events(page: Page, kind: str) -> list[dict[str, Any]]:
     return [event for event in found if event["type"] == kind]
 
 
+def subject(page: Page) -> dict[str, Any]:
+    """Return the identity of the object that the page's address holds."""
+    identity: dict[str, Any] = json.loads(state(page)["pick"][0])
+    return identity
+
+
 def new_verdict(page: Page, before: str) -> str:
     """Wait for the next verdict and return it."""
     until(lambda: verdict(page) not in ("", before))
@@ -143,17 +149,17 @@ def test_a_click_is_answered(browser: Browser, address: str, bag: Path) -> None:
         at = answered_at(316, 110)["position"]
         width = page.evaluate("document.getElementById('viewer').clientWidth / 2")
         scale = width / 640
-        assert state(page)["pick"][0].startswith("pixel/")
+        assert subject(page)
         missed = answered_at(316 + scale * (u - at[0]), 110 + scale * (v - at[1]))
         assert missed["entity_path"] == f"{image}/missed"
-        assert state(page)["pick"] == [pick]
+        assert subject(page)["id"] == pick
         for x, y in ((150, 300), (450, 430)):
             answered_at(x, y)
-            assert state(page)["pick"] != [pick]
+            assert subject(page).get("id") != pick
 
 
 def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
-    """Pick of what was missed in the first frame, a pixel of the line around it, the entity of the image."""
+    """Id of what was missed in the first frame, a pixel of the line around it, the entity of the image."""
     with bevviz.open(bag, model="demo") as drive:
         result = drive.at(frame=0)
     assert result.frame.truth is not None
@@ -170,7 +176,8 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     others = [u for box in around.values() for u in (box[0], box[2])]
     pick = max(inside, key=lambda one: sorted(abs(around[one][0] - u) for u in others)[1])
     left, top, _, bottom = around[pick]
-    return pick, (left, (top + bottom) / 2), entities.image(camera.name)
+    id_ = result.frame.truth.ids[Selection.parse(pick).row]
+    return id_, (left, (top + bottom) / 2), entities.image(camera.name)
 
 
 def test_missed_objects_are_listed_and_opened(browser: Browser, address: str) -> None:
@@ -192,7 +199,7 @@ def test_missed_objects_are_listed_and_opened(browser: Browser, address: str) ->
         assert "was not reported" in text or "shares" in text or "cluster" in text
         until(lambda: len(events(page, "time_update")) > shown)
         held, url = state(page), page.url
-        assert held["pick"][0].startswith("truth/")
+        assert subject(page)["kind"] == "truth"
         chain = page.inner_text("#chain")
     with opened(browser, url) as again:
         until(lambda: again.inner_text("#chain") == chain)
@@ -394,6 +401,36 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
     assert again["name"] == other["name"]
 
 
+def test_the_subject_is_followed_over_frames(talk: Talk) -> None:
+    """An object is asked by its row in one frame, and found by its id in each other one."""
+    _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
+    first = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
+    identity = json.loads(first["pick"])
+    for frame in range(FRAMES):
+        time_ = int(stamp) + (frame - first["frame"]) * 100_000_000
+        values = ["clustering.eps=0.9"] if frame % 2 else []
+        message = talk.asked("answer", type="ask", time=time_, set=values, pick=first["pick"])
+        assert (message["frame"], message["set"]) == (frame, values)
+        assert json.loads(message["pick"])["id"] == identity["id"]
+        assert message["label"].lower() == identity["label"]
+    gone = json.dumps({**identity, "id": "nobody"})
+    absent = talk.asked("absent", type="ask", time=int(stamp), set=[], pick=gone)
+    assert f"is not in frame {first['frame']}: the ground truth has no" in absent["text"]
+
+
+def test_rows_are_valid_in_their_own_frame_only(talk: Talk) -> None:
+    """A row of the list that is asked with tried values is the object of the list."""
+    for entry in talk.of("false"):
+        frame, stamp, _, pick, *_ = entry["sights"][0]
+        origin = {"time": int(stamp), "set": []}
+        opened = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
+        wanted = {"type": "ask", "time": int(stamp), "pick": pick, "from": origin}
+        tried = talk.asked("answer", **wanted, set=["detector.conf_threshold=0.5"])
+        assert tried["frame"] == frame
+        assert tried["kind"] in ("point", "cluster", "truth") or tried["label"] == opened["label"]
+        assert tried["position"][:2] == pytest.approx(opened["position"][:2], abs=1.5)
+
+
 def test_a_hint_has_the_promised_effect(talk: Talk) -> None:
     """What it was said to do to the frame is what the panel says when it is pressed, name by name."""
     stamp, pick, hint = helped(talk)
@@ -441,6 +478,7 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:
 
 def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
     _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
+    pick = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)["pick"]
     talk.say(type="note", time=int(stamp), pick=pick, text=" look here ")
     (note,) = talk.until("notes", lambda message: message["notes"])["notes"]
     assert (note["stamp"], note["pick"], note["text"]) == (stamp, pick, "look here")
@@ -707,6 +745,13 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     in_space = select_click(result, None, entities.obstacles(lidar), None, tuple(fixed))
     assert in_space is not None
     assert in_space.place == pytest.approx(point, abs=1e-4)
+    measured = result.objects.measured
+    assert measured is not None
+    drawn = [row for row, one in enumerate(measured.size != result.objects.boxes.size) if one.any()]
+    last = len(drawn) - 1
+    assert select_click(result, None, entities.MEASURED, last, ()) == Selection(object=drawn[last])
+    center = (result.frame.pose @ [*result.objects.boxes.center[0], 1])[:3]
+    assert select_click(result, None, "/world/anything", None, tuple(center)) == Selection(object=0)
     assert select_click(result, None, entities.FUSED, 10_000, ()) is None
     assert select_click(result, None, "/health/time_ms/total", None, ()) is None
 
