@@ -31,6 +31,7 @@ on({
     goTo(message.stamp, false);
   },
   said: (message) => say(message.text, message.wrong),
+  gone: () => say("No connection to the robot: the last frame that came is shown.", true),
 });
 
 // What the keys of these buttons do.
