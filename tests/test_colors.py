@@ -43,7 +43,7 @@ def distance(a: Color, b: Color, sight: str) -> float:
         colour.XYZ_to_Lab(colour.RGB_to_XYZ(np.clip(SEEN[sight] @ linear(color), 0, 1), "sRGB"))
         for color in (a, b)
     ]
-    return float(colour.delta_E(*labs, method="CIE 2000"))
+    return float(colour.delta_E(labs[0], labs[1], method="CIE 2000"))
 
 
 @pytest.mark.parametrize("sight", ["all", "Deuteranomaly"])
