@@ -143,12 +143,12 @@ def find(
         if boxes is None and opened.clusters is not None:
             boxes, object_row = opened.clusters.aabb, cluster
         at = () if boxes is None else _fixed(opened, boxes.chosen(np.array([object_row])))
-        return _find_at(at, identity, result, near=True)[0], how
+        return _find_at(at, identity, result)[0], how
     if abs(number - identity.frame) > GAP:
         return None, f"without a track it cannot be followed from frame {identity.frame}"
     if identity.kind == "detection" and identity.box and (row := _find_detection(identity, result)) >= 0:
         return Selection(detection=row, camera=identity.camera), "by its box in the image"
-    return _find_at(identity.at, identity, result, near=number == identity.frame)
+    return _find_at(identity.at, identity, result)
 
 
 def _find_truth(identity: Identity, result: FrameResult) -> tuple[Selection | None, str]:
@@ -183,13 +183,8 @@ def _find_detection(identity: Identity, result: FrameResult) -> int:
     return -1
 
 
-def _find_at(
-    at: tuple[float, ...], identity: Identity, result: FrameResult, near: bool
-) -> tuple[Selection | None, str]:
-    """Find an object of the same class at a place of the fixed frame, else the cluster there.
-
-    With ``near`` an empty place is returned as a place: other values may have removed the object from it.
-    """
+def _find_at(at: tuple[float, ...], identity: Identity, result: FrameResult) -> tuple[Selection | None, str]:
+    """Find an object of the same class at a place of the fixed frame, else the cluster there."""
     objects, clusters = result.objects, result.clusters
     if at and objects is not None and identity.kind != "cluster":
         named = [row for row, name in enumerate(objects.names) if name.lower() == identity.label]
@@ -197,9 +192,6 @@ def _find_at(
             return Selection(object=row), "by its place"
     if at and clusters is not None and (row := _nearest(at, result, clusters.aabb)) >= 0:
         return Selection(cluster=row), "by its place"
-    if at and near:
-        x, y, z = geometry.apply(geometry.inverse(result.frame.pose), np.array([at]))[0].tolist()
-        return Selection(point=(x, y, z)), "by its place"
     return None, "nothing of its kind is at its place"
 
 
