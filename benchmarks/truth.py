@@ -191,7 +191,7 @@ class Rule:
     # --- the rule ------------------------------------------------------------------------------
 
     def cause(self, row: int) -> Cause:
-        """Of one row of the truth. It is reported if ``evaluate`` counts an object for it."""
+        """Judge one row of the ground truth. It is reported if ``evaluate`` counts an object for it."""
         for j in np.flatnonzero(self.partner == row).tolist():
             return Cause(self._flaw(row, j, int(self.objects.cluster[j])), True)
         for name_matters in (True, False):
