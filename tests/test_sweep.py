@@ -262,7 +262,7 @@ def test_a_grid_is_a_heat_map(drive: str) -> None:
     assert [text.partition(" at ")[2] for text in said] == [
         f"{eps}, {points}" for eps in ("0.4", "0.6") for points in ("1", "3", "5")
     ]
-    assert static["/sweep/clusters/mark_0/word"]["Points2D:labels"] == ["best: 0.4, 1"]
+    assert static["/sweep/clusters/mark_0/word"]["Points2D:labels"] == ["best: 0.6, 1"]
     assert static["/sweep/clusters/mark_1/word"]["Points2D:labels"] == ["now: 0.5, 3"]
     # Between the two columns, in the row of its own.
     frame = np.array(static["/sweep/clusters/mark_1"]["LineStrips2D:strips"][0])
