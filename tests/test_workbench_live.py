@@ -144,9 +144,9 @@ class Shown:
 def nearest_missed(talk: Channel, frame: int) -> str:
     """Return the pick of the nearest missed object in the next list, which is of one frame only."""
     entries: list[dict[str, Any]] = []
-    while not entries:  # those of the frame that was held before may go first
+    # Lists of the frame that was held before may come first.
+    while {sight[0] for entry in entries for sight in entry["sights"]} != {frame}:
         entries = talk.entries.popleft() if talk.entries else talk.until("entries")["entries"]
-    assert {sight[0] for entry in entries for sight in entry["sights"]} == {frame}
     missed = [entry["sights"][0] for entry in entries if entry["what"] == "missed"]
     return str(min(missed, key=lambda sight: sight[2])[3])
 
@@ -185,7 +185,7 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     number = talk.send(type="ask", time=int(later["stamp"]), pick=near, set=[])
     assert "min_cluster_points" in json.dumps(talk.until("answer", number))
     number = talk.send(type="try", time=int(later["stamp"]), set=[])  # undone
-    assert talk.until("tried", number)["effects"]["added"]
+    assert talk.until("tried", number)["effects"]["fixed"]
     number = talk.send(type="try", time=stamp, set=["clustering.eps=-1"])
     assert "must be greater than 0" in talk.until("tried", number)["text"]
     number = talk.send(type="report", time=stamp, text="", before=1, after=1)
