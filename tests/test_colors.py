@@ -31,6 +31,7 @@ SEEN = {
     },
 }
 TELLS_APART = 20.0  # CIEDE2000 of two states; 1 is just noticeable side by side
+CLASS_FROM_STATE = 10.0  # of a class and a state: both may outline one object
 CLASSES_APART = 8.0  # of classes and fates, which are named beside their colours
 
 
@@ -65,10 +66,20 @@ def test_classes_and_fates_differ(sight: str) -> None:
         assert not {pair: round(away, 1) for pair, away in near.items() if away < CLASSES_APART}
 
 
+@pytest.mark.parametrize("sight", ["all", "Deuteranomaly"])
+def test_no_class_looks_like_a_state(sight: str) -> None:
+    near = {
+        (name, state.name): distance(color, state.value, sight)
+        for name, color in CLASS_COLORS.items()
+        for state in StateColor
+    }
+    assert not {pair: round(away, 1) for pair, away in near.items() if away < CLASS_FROM_STATE}
+
+
 def test_context_is_grey_and_contrasts() -> None:
     for color in (GROUND, UNNAMED, CONTEXT):
         assert max(color) - min(color) < 20
-    assert not set(CLASS_COLORS.values()) & {*SIDE_COLORS.values(), *(state.value for state in StateColor)}
+    assert not set(CLASS_COLORS.values()) & set(SIDE_COLORS.values())
 
 
 def test_states_contrast_with_the_dark_background() -> None:

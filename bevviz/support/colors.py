@@ -1,7 +1,8 @@
 """The palette of all layouts, recordings and pages, and the meaning of each colour.
 
 Context is grey: ground, points, clusters without a name, tracks. A class has one hue. Any two
-states differ by at least 20 (CIEDE2000), also for people without green cones.
+states differ by at least 20 (CIEDE2000), a class and a state by at least 10, also for people without green
+cones.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ U8: TypeAlias = NDArray[np.uint8]
 
 Color: TypeAlias = tuple[int, int, int]
 
-# Colour-blind people can tell these apart (after Okabe & Ito 2008), on dark and on light backgrounds. A test
-# checks it.
+# Colour-blind people can tell these apart, and from the states (after Okabe & Ito 2008), on dark and on light
+# backgrounds. A test checks it.
 CLASS_COLORS: dict[str, Color] = {
-    "person": (230, 110, 30),
-    "pedestrian": (230, 110, 30),
-    "rider": (240, 228, 66),
-    "cyclist": (240, 228, 66),
-    "bicycle": (240, 228, 66),
+    "person": (235, 120, 15),
+    "pedestrian": (235, 120, 15),
+    "rider": (30, 240, 165),
+    "cyclist": (30, 240, 165),
+    "bicycle": (30, 240, 165),
     "motorcycle": (225, 140, 190),
     "car": (86, 180, 233),
     "van": (190, 235, 250),
