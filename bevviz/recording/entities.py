@@ -234,6 +234,11 @@ def judged(outcome: str) -> str:
     return f"{EVALUATE}/objects/{outcome}"
 
 
+def image_judged(camera: str, outcome: str) -> str:
+    """Return the entity of objects that are false or missed, drawn over a camera's image."""
+    return f"{image(camera)}/judged/{outcome}"
+
+
 def judged_count(outcome: str) -> str:
     """Return the entity of the number of true, false or missed objects."""
     return f"{EVALUATE}/count/{outcome}"
