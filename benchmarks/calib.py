@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.calib import AXES, Axis, AxisFinding, Calibration
-from bevviz.calib.offsets import SCALES, TIME
+from bevviz.calib.result import SCALES, TIME
 from bevviz.model.frame import F64
 from tests.support.miscalibrated_drives import EVERY, Drive, Kitti
 

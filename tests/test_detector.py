@@ -451,6 +451,21 @@ def test_rtdetr_and_dfine_of_their_repositories_are_read(tmp_path: Path) -> None
     assert detector(model, names="coco")(IMAGE).names == ("person", "bicycle", "car")
 
 
+def test_lists_without_a_batch_are_read(tmp_path: Path) -> None:
+    """DEIMv2 answers with labels [300], boxes [300, 4] and scores [300]."""
+    boxes = ((BOXES + 0.5) / [200, 120, 200, 120] * [W, H, W, H]).astype(np.float32)
+    lists = {"labels": CLASSES, "boxes": boxes, "scores": SCORES.astype(np.float32)}
+    inputs = (image_input("N", 3, H, W), ("orig_target_sizes", ("N", 2), INT64))
+    found = detector(onnx_networks.answer(tmp_path / "m.onnx", lists, inputs), names="coco")
+    assert str(found.layout) == "DEIM"
+    result = found(np.zeros((120, 200, 3), np.uint8))
+    expect(result)
+    assert result.names == ("person", "bicycle", "car")
+    mixed = {**lists, "scores": lists["scores"][None]}
+    with pytest.raises(UserError, match=r"do not fit; its outputs: .*--model module:function \(docs/models"):
+        detector(onnx_networks.answer(tmp_path / "m.onnx", mixed, inputs))
+
+
 def test_rtdetr_of_its_repository_resamples_like_torchvision(tmp_path: Path) -> None:
     """From all pixels that a new one covers: stripes of one pixel become grey."""
     stripes = np.zeros((H, 3 * W, 3), np.uint8)
@@ -631,7 +646,7 @@ def test_an_angle_column_is_not_read_as_a_class(tmp_path: Path) -> None:
             detector(model)
         assert detector(model, names=str(names)).names == ("a", "b", "c", "d")
     with pytest.raises(
-        UserError, match=r"a model for the task 'obb': export one for detect, segment or pose$"
+        UserError, match=r"a model for the task 'obb': export one for detect, segment or pose; or wrap it"
     ):
         detector(constant(tmp_path / "m.onnx", output, metadata={**ULTRALYTICS, "task": "obb"}))
 
@@ -641,6 +656,11 @@ def test_an_angle_column_is_not_read_as_a_class(tmp_path: Path) -> None:
     [
         (("logits", "pred_boxes"), ((1, 100, 92), (1, 100, 4)), "a DETR of Hugging Face"),
         (("dets", "labels"), ((1, 100, 5), (1, 100)), "a model of MMDeploy"),
+        (
+            ("cls", "reg"),
+            ((1, H * W // 64 * 21 // 16, 80), (1, H * W // 64 * 21 // 16, 32)),
+            "module:function",
+        ),
         (("num_dets", "det_boxes"), ((1, 1), (1, 100, 4)), "export without --end2end"),
         (("a", "b", "c"), ((1, 3, 8, 12, 8), (1, 3, 4, 6, 8), (1, 3, 2, 3, 8)), "YOLOv7: --grid"),
     ],

@@ -119,7 +119,7 @@ def test_info_names_kinds_and_roles(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_boxes_may_be_the_truth(tmp_path: Path) -> None:
     path = write(tmp_path / "drive.mcap")
-    assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet"]) == 0
+    assert main(["evaluate", str(path), "--truth", "/markers/annotations", "--quiet", "--model", "demo"]) == 0
 
 
 def test_an_early_transform_still_holds_later_in_the_drive(tmp_path: Path) -> None:

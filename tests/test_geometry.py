@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D, Intrinsics
 
 K = np.array([[320.0, 0, 310], [0, 330, 170], [0, 0, 1]])
@@ -280,7 +281,7 @@ def test_points_in_many_boxes_are_those_in_each(seed: int, count: int, number: i
         rng.uniform(-np.pi, np.pi, number).astype(np.float32),
     )
     points = np.concatenate([points, geometry.corners(boxes)[:, 0]])  # on the edge, too
-    found = dict(geometry.inside_each(points, boxes))
+    found = dict(inside_each(points, boxes))
     for k in range(number):
         rows = np.flatnonzero(geometry.inside(points, boxes, k))
         np.testing.assert_array_equal(np.sort(found.get(k, rows[:0])), rows)

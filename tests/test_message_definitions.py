@@ -25,7 +25,7 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
 from bevviz.live.live_message import LiveMessage
-from bevviz.messages.decoding import MessageError, stamp_ns
+from bevviz.messages.decoders import MessageError, stamp_ns
 from bevviz.messages.definitions import typestore
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import find_roles

@@ -29,7 +29,7 @@ from bevviz.messages import (
     images,
     transforms,
 )
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.guard import guard
 from bevviz.model import geometry
 

@@ -93,7 +93,7 @@ def test_a_private_message_is_mapped_by_its_fields(tmp_path: Path) -> None:
 def test_mapped_boxes_serve_as_ground_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     m = made("my_msgs", PRIVATE)
     path = str(bag(tmp_path, m, "my_msgs/msg/Things", private(m)))
-    assert main(["evaluate", path, "--truth", "/my/objects", "--set", MAPPED % ""]) == 0
+    assert main(["evaluate", path, "--truth", "/my/objects", "--set", MAPPED % "", "--model", "demo"]) == 0
     assert "1 frame" in capsys.readouterr().out
 
 

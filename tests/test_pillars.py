@@ -28,7 +28,7 @@ from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import anchor_boxes, decode_boxes
-from bevviz.stages.pillars.nms import survivors
+from bevviz.stages.rotated_boxes import survivors
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.page_messages import controls
 from tests.support.onnx_networks import FLOAT, node, save
@@ -240,7 +240,7 @@ def test_the_page_and_the_command_explain_its_parameters() -> None:
     slider = shown["objects.params.score_threshold"]
     assert (slider["kind"], slider["low"], slider["high"], slider["value"]) == ("number", 0, 1, 0.1)
     assert shown["objects.params.nms"]["choices"] == ["all", "group", "class"]
-    assert shown["objects.params.point_range"]["kind"] == "text"
+    assert shown["objects.params.point_range"]["kind"] == "list"
     text = describe_parameters("objects.params.nms_iou", config)
     assert "at least 0, at most 1" in text and "'objects: {params: {nms_iou: VALUE}}'" in text
 

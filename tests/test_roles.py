@@ -256,7 +256,7 @@ def test_a_derived_cloud_plays_where_there_is_no_other() -> None:
         ("rslidar_msgs/msg/RslidarScan", "play them through its driver and record its PointCloud2"),
         ("ouster_sensor_msgs/msg/PacketMsg", "play them through its driver"),
         ("nebula_msgs/msg/NebulaPackets", "play them through its driver"),
-        ("sensor_msgs/msg/LaserScan", "laserscan_to_pointcloud makes a PointCloud2 of it"),
+        ("sensor_msgs/msg/MultiEchoLaserScan", "laser_proc makes a LaserScan of it"),
         ("sensor_msgs/PointCloud", "point_cloud_converter makes a PointCloud2 of it"),
     ],
 )
@@ -269,7 +269,7 @@ def test_points_in_another_form_have_a_remedy_that_works(kind: str, helps: str) 
         "no LiDAR: none of 2 topics is a sensor_msgs/PointCloud2; /points holds "
     )
     assert helps in roles.no_lidar and helps in roles.notes["/points"]
-    with pytest.raises(UserError, match="but must be PointCloud2; it holds ") as error:
+    with pytest.raises(UserError, match="but must be PointCloud2 or LaserScan; it holds ") as error:
         find_roles(topics, SourceConfig(lidar_topics=("/points",)))
     assert helps in str(error.value)
 
@@ -353,7 +353,7 @@ def test_an_unknown_stated_topic_is_reported(stated: dict[str, object], sentence
 
 
 def test_a_stated_topic_of_another_type_is_reported() -> None:
-    with pytest.raises(UserError, match="there is no topic /points; there is no PointCloud2 topic"):
+    with pytest.raises(UserError, match="no topic /points; there is no PointCloud2 or LaserScan topic"):
         find_roles([], SourceConfig(lidar_topics=("/points",)))
 
 

@@ -12,7 +12,7 @@ import pytest
 import rerun as rr
 
 from bevviz.config import SourceConfig, load
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_cloud, encode_image
 from bevviz.messages.robot_description import mesh_file

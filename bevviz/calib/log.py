@@ -8,9 +8,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.calib.offsets import AXES, TIME, error_pose
-from bevviz.calib.result import AxisFinding, Calibration
-from bevviz.calib.samples import Shot
+from bevviz.calib.result import AXES, TIME, AxisFinding, Calibration, error_pose
+from bevviz.calib.score import Shot
 from bevviz.config import LoggingConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Bool, Intrinsics

@@ -8,10 +8,20 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bevviz.calib.offsets import AXES, FLOOR, PRIOR, SCALES, TIME, Axis, error_pose
-from bevviz.calib.result import AxisFinding, AxisResult, Calibration, frames_text
-from bevviz.calib.samples import REACH, Shot, Shots
-from bevviz.calib.score import Scorer
+from bevviz.calib.result import (
+    AXES,
+    FLOOR,
+    PRIOR,
+    SCALES,
+    TIME,
+    Axis,
+    AxisFinding,
+    AxisResult,
+    Calibration,
+    error_pose,
+    frames_text,
+)
+from bevviz.calib.score import REACH, Scorer, Shot, Shots
 from bevviz.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
 from bevviz.errors import UserError
 from bevviz.model import geometry

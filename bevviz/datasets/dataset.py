@@ -1,4 +1,4 @@
-"""Base class of data set loaders. A loader presents one drive as topics whose messages are made on demand."""
+"""Base class of data set loaders, and their reader. One drive becomes topics with messages made on demand."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import os
 import re
 import struct
 from array import array
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.datasets.cloud_files import (
     SAMPLE_BYTES,
@@ -23,6 +24,7 @@ from bevviz.datasets.cloud_files import (
     read_bytes,
 )
 from bevviz.errors import UserError, first_line
+from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_compressed_image, encode_intrinsics, encode_transforms
 from bevviz.model.frame import F64, I64, Intrinsics
 from bevviz.support.files import LFS_HINT, TABLE_LIMIT, read_lines
@@ -45,7 +47,7 @@ UNREAD = {
     **dict.fromkeys((".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".raw"), AS_IMAGES),
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov"), "save their images as PNG or JPEG"),
     **dict.fromkeys((".gz", ".zip", ".zst"), "unpack them"),
-    ".pcap": "play them through their driver and record its topics",
+    ".pcap": "give the file itself",
     ".tfrecord": "convert them, for instance to KITTI's layout",
 }
 MAX_LISTED_FILES = 10_000  # files examined in each folder
@@ -92,6 +94,7 @@ class Dataset:
         any_folder: the loader takes folders that no other loader recognises.
         streams: topics. Of messages with the same stamp, those of the earlier stream come first.
         warnings: missing or damaged data met so far, one sentence each.
+        sample_stamps: stamp of each sample by the token that the data set gives it.
 
     Args:
         path: folder.
@@ -111,11 +114,17 @@ class Dataset:
         self.path, self.sequence = path, sequence
         self.streams: Sequence[Stream] = ()
         self.warnings: list[str] = []
+        self.sample_stamps: dict[str, int] = {}
 
     @classmethod
     def fits(cls, path: Path) -> bool:
         """Tell whether a folder looks like this data set. The check opens at most one small file."""
         raise NotImplementedError
+
+    @classmethod
+    def states(cls, path: Path) -> bool:
+        """Tell whether a file says that a folder is this data set, so that drives below it do not matter."""
+        return False
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
@@ -269,6 +278,12 @@ def files_in(
     return [folder / name for name in sorted(names) if not HIDDEN.match(name)]
 
 
+def subfolders(path: Path) -> list[Path]:
+    """Return the folders in a folder by name, without hidden ones and those that may not be read."""
+    folders = sorted(child for child in path.iterdir() if child.is_dir() and not HIDDEN.match(child.name))
+    return [folder for folder in folders if os.access(folder, os.R_OK | os.X_OK)]
+
+
 def read_table(path: Path, columns: int, names: str = "") -> F64:
     """Read a (N, columns) table of numbers from a text file with one row per line. A comment begins with #.
 
@@ -309,3 +324,95 @@ def describe_unread(folder: Path) -> str:
         return ""
     kind, count = counts.most_common(1)[0]
     return f"{count} {kind} file{'s are' if count > 1 else ' is'} not read: {UNREAD[kind]}"
+
+
+LAST_TIME = 2**63 - 1  # nanoseconds
+
+
+class DatasetReader:
+    """Messages of one drive in order of stamp. The stamp is also the log time."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+        self._streams = [stream for stream in dataset.streams if len(stream.times)]
+        self.connections = tuple(
+            make_connection(number, stream.topic, stream.type, len(stream.times))
+            for number, stream in enumerate(self._streams)
+        )
+        self.compression = ""
+        # By stream: reason for each row without a message, and for each row with a part of its points.
+        self._lost, self._cut = defaultdict[int, dict[int, str]](dict), defaultdict[int, dict[int, str]](dict)
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log time of the first message, and log time of the last message plus one nanosecond."""
+        if not self._streams:
+            return 0, 0
+        return (
+            min(int(stream.times[0]) for stream in self._streams),
+            max(int(stream.times[-1]) for stream in self._streams) + 1,
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings of the data set, unreadable files and cut files."""
+        sentences = [*self._dataset.warnings]
+        for reasons, description in ((self._lost, "cannot be read"), (self._cut, "are cut")):
+            for number, rows in reasons.items():
+                stream, first = self._streams[number], rows[min(rows)]
+                several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {description}; the first: "
+                sentences.append(f"{several if len(rows) > 1 else ''}{first}")
+        return list(dict.fromkeys(sentences))
+
+    def messages(
+        self, ids: Collection[int], start: int, stop: int
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
+        """Yield messages as ``bevviz.bags.reader.Reader`` does.
+
+        An unreadable file gives an empty message and a line in ``warnings``.
+        """
+        times, numbers, rows = list[I64](), list[I64](), list[I64]()
+        for number in sorted(ids):
+            first, last = np.searchsorted(self._streams[number].times, [start, stop])
+            times.append(self._streams[number].times[first:last])
+            numbers.append(np.full(last - first, number, np.int64))
+            rows.append(np.arange(first, last, dtype=np.int64))
+        stamps, stream_of, row_of = (np.concatenate(parts) for parts in (times, numbers, rows))
+        for i in np.lexsort((row_of, stream_of, stamps)).tolist():
+            stream, at_row = self._streams[int(stream_of[i])], int(row_of[i])
+            data: bytes | memoryview = b""
+            try:
+                message = stream.make(at_row)
+                data = typestore().serialize_cdr(message, stream.type)
+            except UserError as error:
+                self._lost[int(stream_of[i])][at_row] = str(error)
+            except NOT_AS_DOCUMENTED as error:
+                self._dataset.warn(
+                    f"{stream.topic}: not as {self._dataset.about} is documented ({describe_error(error)})"
+                )
+            else:
+                if stream.files and (whole_points := len(message.data) // message.point_step) < message.width:
+                    self._cut[int(stream_of[i])][at_row] = (
+                        f"{stream.files[at_row]}: is cut: {whole_points} of {message.width} points are there"
+                    )
+            yield self.connections[int(stream_of[i])], int(stamps[i]), data
+
+    def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
+        """Return the sorted log times of the connections ``ids`` with start <= time < stop."""
+        times = np.sort(np.concatenate([self._streams[number].times for number in ids]))
+        return times[(times >= start) & (times < stop)]
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+    @property
+    def aside(self) -> dict[str, str]:
+        """Reason by topic why it gets no role by default."""
+        return {stream.topic: stream.aside for stream in self._streams if stream.aside}
+
+
+def make_connection(number: int, topic: str, kind: str, count: int) -> Connection:
+    """Return the connection of messages that a reader makes."""
+    text, digest = typestore().generate_msgdef(kind, ros_version=2)
+    definition = MessageDefinition(MessageDefinitionFormat.MSG, text)
+    return Connection(number, topic, kind, definition, digest, count, ConnectionExtRosbag2("cdr", []), None)

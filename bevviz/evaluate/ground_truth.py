@@ -14,6 +14,7 @@ from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.stages.robot_results import in_points_frame
@@ -139,9 +140,8 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     """
     boxes = in_points_frame(frame, labelled)
     must = (boxes.distance <= RANGE) & _in_view(frame, boxes)
-    must[must] = [
-        geometry.inside(frame.points, boxes, k).sum() >= MIN_HITS for k in np.flatnonzero(must).tolist()
-    ]
+    rows = np.flatnonzero(must)
+    must[rows] = [len(hits) >= MIN_HITS for _, hits in inside_each(frame.points, boxes.chosen(rows))]
     flat = [
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.messages.decoding import MessageError, either
+from bevviz.messages.decoders import MessageError, either
 from bevviz.model.frame import F64, Intrinsics
 
 _DISTORTION = {

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
+from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
 from bevviz.model.frame import F32, Cloud
 
 MOST_POINTS = 100_000_000  # largest cloud
@@ -69,6 +69,38 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         topic=topic,
         received=received,
         dropped=announced - len(xyz),
+    )
+
+
+def decode_laser_scan(msg: Any, topic: str, received: int) -> Cloud:
+    """Decode the points of a sensor_msgs/LaserScan, all in the plane z = 0.
+
+    Ranges that are not within the limits of the message are dropped. ``time`` is in seconds after the stamp.
+
+    Raises:
+        MessageError: the message has more than ``MOST_POINTS`` ranges.
+    """
+    ranges = np.asarray(msg.ranges, np.float32)
+    if len(ranges) > MOST_POINTS:
+        raise MessageError(f"{topic}: a scan of {len(ranges)} ranges is not taken: {MOST_POINTS} at most")
+    kept = np.flatnonzero((ranges >= msg.range_min) & (ranges <= msg.range_max) & (ranges < FARTHEST))
+    angles = msg.angle_min + msg.angle_increment * kept
+    xyz = np.zeros((len(kept), 3), np.float32)
+    xyz[:, 0], xyz[:, 1] = ranges[kept] * np.cos(angles), ranges[kept] * np.sin(angles)
+    fields: dict[str, NDArray[Any]] = {}
+    intensities = np.asarray(msg.intensities, np.float32)
+    if len(intensities) == len(ranges):
+        fields["intensity"] = intensities[kept]
+    if msg.time_increment:
+        fields["time"] = (msg.time_increment * kept).astype(np.float32)
+    return Cloud(
+        stamp=stamp_ns(msg.header.stamp),
+        frame_id=frame_name(msg.header.frame_id),
+        xyz=xyz,
+        fields=fields,
+        topic=topic,
+        received=received,
+        dropped=len(ranges) - len(kept),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.messages.decoding import either, frame_name, stamp_ns
+from bevviz.messages.decoders import either, frame_name, stamp_ns
 from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d, decode_objects
 from bevviz.model.frame import (
     Bool,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.messages.decoding import frame_name, stamp_ns
+from bevviz.messages.decoders import frame_name, stamp_ns
 from bevviz.messages.guard import describe_kind, field_names
 from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes3D
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.messages.decoders import Decoder
-from bevviz.messages.decoding import nanoseconds
+from bevviz.messages.decoders import Decoder, nanoseconds
 from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make
 from bevviz.model import geometry
 from bevviz.model.frame import F64, U8

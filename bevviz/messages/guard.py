@@ -11,8 +11,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from bevviz.errors import UserError, first_line
-from bevviz.messages.decoders import Bytes, Serialization, find_decoder
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import Bytes, MessageError, Serialization, find_decoder
 from bevviz.messages.definitions import typestore
 from bevviz.support.loggers import logger
 

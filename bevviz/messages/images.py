@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
+from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
 from bevviz.messages.topics import VIDEO
 from bevviz.model.frame import U8, Image
 

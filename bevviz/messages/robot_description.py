@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, MeshFile, PlacedShape, SolidShapes
 

@@ -203,7 +203,9 @@ def find_roles(
     for key, topic in staged.items():
         notes[topic.name] = f"the robot's own result, taken for the stage {key.partition('.')[0]}"
     around = [
-        (t.name, kind, t.kind) for t in topics if (kind := surroundings_kind(t.name, t.kind)) is not None
+        (t.name, kind, t.kind)
+        for t in topics
+        if t not in lidars and (kind := surroundings_kind(t.name, t.kind)) is not None
     ]
     if results:
         unused = [t for t in topics if t not in (*lidars, *images, *staged.values()) and t.kind in RESULTS]

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import MessageError, stamp_ns, text_of
+from bevviz.messages.clouds import decode_cloud, decode_laser_scan
+from bevviz.messages.decoders import MessageError, stamp_ns, text_of
 from bevviz.messages.images import decode_image
 from bevviz.messages.robot_description import parse_links
 from bevviz.model import geometry
@@ -80,12 +80,7 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[PlacedShape]:
         surface = decode_grid_map(msg, _pose(msg.info.pose), topic)
         return [] if surface is None else [PlacedShape(*about, surface=surface)]
     if short == "LaserScan":
-        ranges = np.asarray(msg.ranges, np.float32)
-        angles = msg.angle_min + msg.angle_increment * np.arange(len(ranges))
-        within = (ranges >= msg.range_min) & (ranges <= msg.range_max)
-        directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(ranges))], axis=1)
-        points = directions[within] * ranges[within, None]
-        return [PlacedShape(*about, points=points.astype(np.float32))]
+        return [PlacedShape(*about, points=decode_laser_scan(msg, topic, 0).xyz)]
     if short == "Path":
         positions = np.array([[*_xyz(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
         return [PlacedShape(*about, strips=(positions,))] if len(positions) else []

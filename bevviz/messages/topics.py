@@ -13,6 +13,7 @@ from bevviz.errors import UserError
 from bevviz.messages.decoders import declared_decoder, find_decoder
 from bevviz.messages.foreign_boxes import holds_boxes
 
+CLOUDS = ("PointCloud2", "LaserScan")  # what may be a LiDAR's; scans of one plane where there is no cloud
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 NOT_LIDAR = "packets of an Ouster's IMU"  # Topic.aside of packets that belong to no scan
@@ -81,8 +82,8 @@ _FOREIGN = (  # sensor, type, and what would help: points or pixels in forms tha
     ),
     (
         "LiDAR",
-        re.compile(r"sensor_msgs/(msg/)?(Multi)?(Echo)?LaserScan$"),
-        "one plane: pointcloud_to_laserscan's laserscan_to_pointcloud makes a PointCloud2 of it, record that",
+        re.compile(r"sensor_msgs/(msg/)?MultiEchoLaserScan$"),
+        "several echoes of one plane: laser_proc makes a LaserScan of it, record that",
     ),
     (
         "LiDAR",
@@ -239,7 +240,7 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
     """
     clouds = of_kind(topics, "PointCloud2")
     if config.lidar_topics:
-        chosen = [stated_topic(t, topics, "source.lidar_topics", "PointCloud2") for t in config.lidar_topics]
+        chosen = [stated_topic(t, topics, "source.lidar_topics", *CLOUDS) for t in config.lidar_topics]
         set_note(notes, clouds, "not used: not in source.lidar_topics")
         set_note(notes, chosen, "LiDAR, by source.lidar_topics")
         return chosen
@@ -252,6 +253,10 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
     set_note(notes, moved, "not used: in the robot's own frame, to which points of others were moved")
     set_note(notes, [t for t in clouds if t.count == 0], "not used: without messages")
     candidates = sorted((t for t in clouds if tiers[t] == best), key=lambda t: (len(t.name), t.name))
+    if all(t.count == 0 for t in clouds):
+        planes = [t for t in of_kind(topics, "LaserScan") if t.count != 0]
+        planes.sort(key=lambda t: (bool(_DERIVED_CLOUD.search(t.name.lower())), len(t.name), t.name))
+        candidates = planes or candidates
     if best in (2, 3):
         candidates = candidates[:1]  # results are not merged like sensors
     chosen = _one_per_sensor(candidates, lambda t: t.frame_id or t.name, notes, "LiDAR, by type and name")

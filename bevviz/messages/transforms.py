@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
+from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
 from bevviz.model import geometry
 from bevviz.model.frame import F64
 

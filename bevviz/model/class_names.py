@@ -35,6 +35,14 @@ VIEW_OF_DELFT = {  # Palffy et al. 2022, classes that COCO lacks
     "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
     "motor": frozenset({"motor", "motorcycle"}),
 }
+ARGOVERSE_CLASSES = {  # category of Argoverse 2 (Wilson et al. 2021) -> class; others in small letters
+    "REGULAR_VEHICLE": "car",
+    **dict.fromkeys(("LARGE_VEHICLE", "BOX_TRUCK", "TRUCK", "TRUCK_CAB"), "truck"),
+    **dict.fromkeys(("BUS", "SCHOOL_BUS", "ARTICULATED_BUS"), "bus"),
+    "VEHICULAR_TRAILER": "trailer",
+    **dict.fromkeys(("PEDESTRIAN", "OFFICIAL_SIGNALER"), "pedestrian"),
+    "CONSTRUCTION_CONE": "traffic_cone",
+}
 NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which omits the other categories
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from bevviz.model.frame import F32, F64, I64, Bool, Boxes3D, Intrinsics
+from bevviz.model.frame import F32, F64, Bool, Boxes3D, Intrinsics
 
 FloatArray = NDArray[Any]
 
@@ -45,6 +45,15 @@ def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) ->
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
+
+
+def rotations(axis: int, angles: FloatArray) -> F64:
+    """Return (N, 3, 3) rotations by (N,) angles in radians about x (0), y (1) or z (2)."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    turns = np.tile(np.eye(3), (len(angles), 1, 1))
+    turns[:, a, a] = turns[:, b, b] = np.cos(angles)
+    turns[:, b, a], turns[:, a, b] = np.sin(angles), -np.sin(angles)
+    return turns
 
 
 def inverse(a_from_b: F64) -> F64:
@@ -283,18 +292,6 @@ def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     local = np.column_stack([c * x + s * y, c * y - s * x, z])
     is_inside[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
     return is_inside
-
-
-def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
-    """Iterate over the boxes that may contain points, with the rows of the points inside."""
-    order = np.argsort(points[:, 0])
-    points = points.take(order, axis=0)
-    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 + np.float32(1e-3)  # for rounding errors
-    first = np.searchsorted(points[:, 0], boxes.center[:, 0] - reach)
-    last = np.searchsorted(points[:, 0], boxes.center[:, 0] + reach)
-    for k in np.flatnonzero(last > first).tolist():
-        near = slice(first[k], last[k])
-        yield k, order[near][inside(points[near], boxes, k)]
 
 
 def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:

@@ -91,10 +91,8 @@ def range_image(points: F32) -> F32:
         points: (N, 3) from the sensor, z up. Rows go up from 40 degrees below the horizon. Columns go around,
             starting behind the sensor.
     """
-    x, y, z = np.ascontiguousarray(points.T)
-    flat = np.sqrt(x * x + y * y)
-    away = np.sqrt(flat * flat + z * z)
-    # This is outside the loop, because NumPy's vectorised arctan2 is four times as fast.
+    x, y, z, flat, away = _distances(points)
+    # This is outside the loops, because NumPy's vectorised arctan2 is four times as fast.
     elevation, azimuth = np.arctan2(z, flat), np.arctan2(y, x)
     shape = round(float((MAX_ELEVATION - MIN_ELEVATION) / CELL_ANGLE)), round(2 * np.pi / float(CELL_ANGLE))
     image = np.full(shape, np.inf, np.float32)
@@ -133,13 +131,29 @@ def visible(image: F32, boxes: Boxes3D) -> F32:
 
 
 @kernel
+def _distances(points: F32) -> F32:
+    """Return (5, N) x, y and z of each point, its horizontal distance and its distance."""
+    columns = np.empty((5, len(points)), np.float32)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        flat = np.sqrt(x * x + y * y)
+        columns[0, i], columns[1, i], columns[2, i] = x, y, z
+        columns[3, i], columns[4, i] = flat, np.sqrt(flat * flat + z * z)
+    return columns
+
+
+@kernel
 def _keep_nearest(image: F32, elevation: F32, azimuth: F32, away: F32) -> None:
     """Write the nearest distance of each cell."""
     rows, columns = image.shape
     for i in range(len(away)):
         row = int(np.floor((elevation[i] - MIN_ELEVATION) / CELL_ANGLE))
         if 0 <= row < rows:
-            column = int(np.floor((azimuth[i] + np.pi) / CELL_ANGLE)) % columns
+            column = int(np.floor((azimuth[i] + np.pi) / CELL_ANGLE))
+            if column >= columns:  # A remainder would take most of the time.
+                column -= columns
+            elif column < 0:
+                column += columns
             if away[i] < image[row, column]:
                 image[row, column] = away[i]
 

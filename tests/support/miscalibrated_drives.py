@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.calib import Calibration, calibrate, gather
-from bevviz.calib.offsets import TIME, error_pose
+from bevviz.calib.result import TIME, error_pose
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.synthetic import SyntheticSource

@@ -212,7 +212,19 @@ def _rtdetr_scores(facts: ModelFacts, name: str, table: Any) -> LayoutMatch | st
 def _rtdetr_repository(facts: ModelFacts) -> LayoutMatch | str | None:
     """Find an RT-DETR or D-FINE of the authors' repositories."""
     names = facts.named("boxes", "scores", "labels")
-    return LayoutMatch(names) if names and "orig_target_sizes" in facts.inputs else None
+    if not names or "orig_target_sizes" not in facts.inputs:
+        return None
+    ranks = tuple(facts.outputs[name].ndim for name in names)
+    return LayoutMatch(names) if ranks == (3, 2, 2) else None
+
+
+def _deim(facts: ModelFacts) -> LayoutMatch | str | None:
+    """Find a DEIM, whose outputs are those of RT-DETR without the axis of the batch."""
+    names = facts.named("boxes", "scores", "labels")
+    if not names or "orig_target_sizes" not in facts.inputs:
+        return None
+    ranks = tuple(facts.outputs[name].ndim for name in names)
+    return LayoutMatch(names) if ranks == (2, 1, 1) else "its lists of boxes, scores and labels do not fit"
 
 
 def _rfdetr(facts: ModelFacts) -> LayoutMatch | str | None:
@@ -286,6 +298,8 @@ def _with_objectness(facts: ModelFacts, name: str, table: Any, anchors: int) -> 
     pyramids = [count for count, strides in read.cells(facts.size).items() if {8, 16, 32} <= set(strides)]
     if rows % anchors or rows // anchors not in pyramids or columns < 6:
         return None
+    if any(len(other) == rows for key, other in facts.tables.items() if key != name):
+        return None  # Scores and boxes are in tables of their own, as NanoDet and PicoDet have them.
     if facts.ultralytics or (columns == 6 and table[:, 5].any() and _are_whole_numbers(table[:, 5])):
         return None  # no head of Ultralytics has an objectness, and whole numbers are the classes of a list
     return _match((name,), facts.classes(columns - 5))
@@ -350,6 +364,7 @@ LAYOUTS = (
     Layout("RT-DETR", _rtdetr_list, read.one_list(0, 4, 5), BoxFormat.FRACTIONS, SQUARE),
     Layout("RT-DETR", _rtdetr_scores, read.rows, BoxFormat.FRACTIONS, SQUARE),
     Layout("RT-DETR or D-FINE", _rtdetr_repository, read.three_lists, BoxFormat.CORNERS, DETR),
+    Layout("DEIM", _deim, read.three_lists, BoxFormat.CORNERS, DETR, batch=False),
     Layout("RF-DETR", _rfdetr, read.queries, BoxFormat.FRACTIONS, ROBOFLOW),
     Layout("YOLO-NAS", NAS_LISTS, read.three_lists, BoxFormat.CORNERS, DECI),
     Layout("YOLO-NAS", NAS_LIST, read.one_list(1, 5, 6), BoxFormat.CORNERS, DECI, batch=False),
@@ -367,6 +382,7 @@ LAYOUTS = (
     Layout("YOLOX decoded", _yolox_decoded, read.rows_with_objectness, BoxFormat.CENTRE, MEGVII, 0.0),
     Layout("end-to-end", _end_to_end, read.one_list(0, 4, 5), BoxFormat.CORNERS, LETTERBOX),
 )
+ADAPTER = "; or wrap it in a function of your own: --model module:function (docs/models.md#any-other-network)"
 SUPPORTED = ", ".join(dict.fromkeys(map(str, LAYOUTS)))
 
 
@@ -378,7 +394,7 @@ def find_head(facts: ModelFacts) -> Head:
     """
     unsupported = _unsupported_family(facts)
     if unsupported:
-        raise ValueError(unsupported)
+        raise ValueError(f"{unsupported}{ADAPTER}")
     reason = "no detector that is known here"
     for layout in LAYOUTS:
         match = layout.find(facts)
@@ -393,7 +409,7 @@ def find_head(facts: ModelFacts) -> Head:
             reason = match
             break
     shapes = list_tensors((name, np.shape(output)) for name, output in facts.outputs.items())
-    raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}")
+    raise ValueError(f"{reason}; its outputs: {shapes}; supported: {SUPPORTED}{ADAPTER}")
 
 
 def _prototypes(layout: Layout, match: LayoutMatch, facts: ModelFacts) -> str:

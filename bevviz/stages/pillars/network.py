@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from bevviz.stages.detector.providers import open_session, say_once
 from bevviz.stages.detector.session import NetworkSession, clip, list_tensors, reading_answer
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import find_head
-from bevviz.stages.pillars.nms import survivors
+from bevviz.stages.rotated_boxes import survivors
 
 FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}
@@ -194,6 +194,11 @@ class PillarNetwork:
         return inputs[0]
 
 
+def run_directly(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a function."""
+    return function(*arguments)
+
+
 class ObjectNetwork:
     """Decoder of a pillar network's outputs to boxes.
 
@@ -217,12 +222,15 @@ class ObjectNetwork:
         """Class names of the network."""
         return self._params.classes
 
-    def __call__(self, points: F32, intensity: F32 | None = None) -> tuple[Boxes3D, F32, list[str]]:
+    def __call__(
+        self, points: F32, intensity: F32 | None = None, call: Callable[..., Any] = run_directly
+    ) -> tuple[Boxes3D, F32, list[str]]:
         """Detect objects in a cloud.
 
         Args:
             points: (N, 3) float32, upright, in metres.
             intensity: (N,) of the points, or None.
+            call: function that calls another one with arguments, or knows the result already.
 
         Returns:
             Boxes in the frame of the points, best first, their scores, and their class names.
@@ -230,7 +238,7 @@ class ObjectNetwork:
         Raises:
             UserError: the network fails or returns impossible numbers.
         """
-        return self.interpret(self.network.infer(points, intensity))
+        return self.interpret(call(self.network.infer, points, intensity))
 
     def interpret(self, output: NetworkOutput) -> tuple[Boxes3D, F32, list[str]]:
         """Apply the thresholds to the network's output. The result is that of ``__call__``."""
