@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Tests count what a network does: no result of an earlier test or run may answer. The tests of the store
+# state a folder of their own.
+os.environ["BEVVIZ_STORE"] = ""
+
 # Failed assertions in helpers show their values, too.
 pytest.register_assert_rewrite("tests.support")
 
@@ -26,7 +30,13 @@ REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_snap")
 
 # The longest files, so that no worker is left alone with one at the end; a browser not beside a robot.
 FIRST = (
-    *("test_workbench", "test_calib", "test_example_notebooks", "test_torture_benchmark"),
+    *(
+        "test_workbench",
+        "test_workbench_triage",
+        "test_calib",
+        "test_example_notebooks",
+        "test_torture_benchmark",
+    ),
     *("test_damaged_bags", "test_live_ros", "test_live"),
     *("test_workbench_live", "test_benchmarks", "test_batch", "test_why"),
 )

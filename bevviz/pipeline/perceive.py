@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevviz.config import Config, FusionConfig
 from bevviz.config.plugins import TOPIC
@@ -27,6 +29,7 @@ from bevviz.model.results import (
     Splits,
     Voxels,
 )
+from bevviz.pipeline.result_store import StoredObjectNetwork
 from bevviz.pipeline.stage_loader import Stages
 from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages import robot_results, user_stages
@@ -34,13 +37,15 @@ from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
 from bevviz.stages.frustum import claim_clusters
 from bevviz.stages.fusion import fuse, merge
-from bevviz.stages.ground import segment_ground
+from bevviz.stages.ground import no_ground, segment_ground
 from bevviz.stages.opinions import opinions
 from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
 from bevviz.support.kernel import common_clock, thread_clock
+
+LEAST_SCORE = 0.01  # of candidates that are decoded, so that configurations and runs can share them
 
 
 def perceive(
@@ -90,6 +95,7 @@ def perceive(
         detections = futures[i].result() if network is not None else detect(camera)
         cameras.append(CameraResult(camera, detections, None, uv, depth))
     splits: Splits | None = None
+    first_labels = None if clusters is None else clusters.labels
     claims: Sequence[Claims | None] = [None] * len(cameras)
     if obstacles is not None and clusters is not None and _splits(config):
         height = None if ground is None else ground.height.compress(~ground.mask)
@@ -132,6 +138,7 @@ def perceive(
         timings=log.timings,
         failures=tuple(log.failures),
         opinions=result_opinions,
+        first_labels=first_labels,
         ranges=ranges,
     )
 
@@ -180,12 +187,34 @@ def add_explanations(result: FrameResult, *, seen: bool = True) -> FrameResult:
     )
 
 
+def run_networks(frame: Frame, config: Config, stages: Stages) -> None:
+    """Run the networks alone on a frame, for the store of results that they keep theirs in.
+
+    Args:
+        frame: the frame.
+        config: configuration of the networks.
+        stages: the networks, from ``StageLoader.load_networks``.
+    """
+    log, objects = StageLog(), stages.objects
+    for camera in frame.cameras:
+        _detect(log, frame, camera, config, stages)
+    if isinstance(objects, StoredObjectNetwork) and len(frame.points):
+        log.guard("objects", lambda: objects(frame.points, frame.fields.get("intensity"), log.call))
+
+
 # --- stages by the configured method -----------------------------------------------------------
 
 
 def _topic(method: str) -> str:
     """Return the robot's topic that replaces a stage, or an empty string."""
     return method.removeprefix(TOPIC) if method.startswith(TOPIC) else ""
+
+
+def _call(
+    log: StageLog, function: UserStage, array: NDArray[Any], frame: Frame, sensor: str | None = None
+) -> Any:
+    """Call a user's function, by default with the name of the LiDAR as its sensor."""
+    return log.call(function, array, frame.stamp, frame.index, frame.lidar if sensor is None else sensor)
 
 
 def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages: Stages) -> Ground | None:
@@ -195,8 +224,11 @@ def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages:
         return log.run("ground", robot_results.segment, points, frame, topic, config.voxel.size)
     if (function := stages.ground) is not None:
         return log.guard(
-            "ground", lambda: user_stages.ground_of(points, log.call(function, points), function.name)
+            "ground",
+            lambda: user_stages.ground_of(points, _call(log, function, points, frame), function.name),
         )
+    if frame.is_planar:
+        return log.run("ground", no_ground, len(points))
     return log.run("ground", segment_ground, points, config.ground)
 
 
@@ -213,7 +245,9 @@ def _clusters(log: StageLog, frame: Frame, points: F32, config: Config, stages: 
     if (function := stages.clustering) is not None:
         return log.guard(
             "clustering",
-            lambda: user_stages.clusters_of(points, section, log.call(function, points), function.name),
+            lambda: user_stages.clusters_of(
+                points, section, _call(log, function, points, frame), function.name
+            ),
         )
     return log.run("clustering", cluster, points, section)
 
@@ -233,11 +267,12 @@ def _detect(log: StageLog, frame: Frame, camera: Camera, config: Config, stages:
         return log.guard(
             "detector",
             lambda: user_stages.detections_of(
-                section.conf_threshold, log.call(network, image.bgr), network.name
+                section.conf_threshold, _call(log, network, image.bgr, frame, camera.name), network.name
             ),
         )
     assert detector is not None
-    return log.guard("detector", lambda: detector.interpret(log.call(network.infer, image.bgr)))
+    least = min(section.explain_threshold, LEAST_SCORE)
+    return log.guard("detector", lambda: detector.interpret(log.call(network.infer, image.bgr, least)))
 
 
 def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
@@ -288,12 +323,10 @@ def _objects(
         return log.guard("objects", lambda: robot_results.find_objects(frame, topic, obstacles, clusters))
     if len(frame.points) == 0 and stages.objects is not None:
         return None
-    if isinstance(network := stages.objects, ObjectNetwork):
-        intensity = frame.fields.get("intensity")
+    if isinstance(network := stages.objects, ObjectNetwork | StoredObjectNetwork):
 
         def detect() -> Objects:
-            answer = log.call(network.network.infer, frame.points, intensity)
-            boxes, score, names = network.interpret(answer)
+            boxes, score, names = network(frame.points, frame.fields.get("intensity"), log.call)
             return user_stages.make_objects(boxes, names, score, obstacles, clusters)
 
         return log.guard("objects", detect)
@@ -301,7 +334,9 @@ def _objects(
         cloud = user_stages.with_intensity(frame.points, frame.fields.get("intensity"))
         return log.guard(
             "objects",
-            lambda: user_stages.objects_of(log.call(function, cloud), function.name, obstacles, clusters),
+            lambda: user_stages.objects_of(
+                _call(log, function, cloud, frame), function.name, obstacles, clusters
+            ),
         )
     return None if clusters is None else log.run("fusion", merge, clusters, cameras, config.clustering)
 

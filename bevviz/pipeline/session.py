@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -16,6 +17,7 @@ from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader, Stages
 from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages.fusion import clusters_in_view
+from bevviz.stages.odometry import Odometry, place
 from bevviz.stages.tracking import Tracker
 
 
@@ -30,10 +32,13 @@ class Session:
         detect: function that replaces the detector's model.
         loader: loader shared by sessions that share networks.
         memo: results shared by sessions that run on the same frames. The maker of the frames clears it.
+        odometry: estimator of the motion, shared by sessions that run on the same frames.
 
     Raises:
         UserError: the detector's model or a user-defined function cannot be used.
     """
+
+    estimates_motion = True  # whether the robot's motion may be estimated from the scans
 
     def __init__(
         self,
@@ -42,10 +47,12 @@ class Session:
         *,
         loader: StageLoader | None = None,
         memo: Memo | None = None,
+        odometry: Odometry | None = None,
     ) -> None:
         self.loader = loader or StageLoader()
         self._detect, self._memo = detect, memo
         self._in_force = config, self.loader.load(config, detect)  # Both are read and replaced together.
+        self._odometry = odometry or Odometry()
         self._tracker = Tracker()
         self._anomalies = AnomalyDetector()
 
@@ -84,9 +91,11 @@ class Session:
         return add_explanations(self.perceive(frame), seen=False)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
-        """Run the stages on the next frame, and update the tracks."""
+        """Estimate the motion to the next frame, run the stages on it, and update the tracks."""
         config, stages = self._in_force
-        return self.add_tracks(perceive(frame, config, stages, self._memo, network=network))
+        log = StageLog()
+        frame = self._placed(frame, config, log)
+        return self._add_tracks(perceive(frame, config, stages, self._memo, network=network), log)
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
@@ -96,17 +105,29 @@ class Session:
         """Add the anomalies of the drive to the next result."""
         return replace(result, anomalies=self._anomalies.update(result, result.config.anomalies))
 
-    def add_tracks(self, result: FrameResult) -> FrameResult:
-        """Add the tracks of the drive to the next result."""
-        clusters, config = result.clusters, result.config.tracking
-        if clusters is None or config.method == "none":
-            return result
-        log = StageLog()
-        is_in_view = clusters_in_view(result.cameras, len(clusters))
-        tracks = log.run(
-            "tracking", self._tracker.update, result.frame, clusters, is_in_view, result.objects, config
-        )
-        total = result.timings["total"] + log.timings["tracking"]
+    def _placed(self, frame: Frame, config: Config, log: StageLog) -> Frame:
+        """Return the frame at its estimated pose, if the motion is to be estimated.
+
+        A fixed frame that has no transform at this time is an error in the transforms, which stays visible.
+        """
+        method = config.odometry.method
+        stated = frame.world_from_points is not None or frame.world_frame != frame.points_frame
+        if not (self.estimates_motion and frame.lidar) or method == "none" or (method == "auto" and stated):
+            return frame
+        log.run("odometry", self._odometry.estimate, frame.points, frame.stamp)
+        pose = self._odometry.poses.get(frame.stamp)
+        self.estimates_motion = pose is not None  # else the estimator is not installed, which is told once
+        return frame if pose is None else place(frame, pose)
+
+    def _add_tracks(self, result: FrameResult, log: StageLog) -> FrameResult:
+        """Add the tracks of the drive to the next result, and the times and failures of the log."""
+        clusters, config, tracks = result.clusters, result.config.tracking, None
+        if clusters is not None and config.method != "none":
+            is_in_view = clusters_in_view(result.cameras, len(clusters))
+            tracks = log.run(
+                "tracking", self._tracker.update, result.frame, clusters, is_in_view, result.objects, config
+            )
+        total = result.timings["total"] + sum(log.timings.values())
         return replace(
             result,
             tracks=tracks,
@@ -128,9 +149,10 @@ class Variants:
     """
 
     def __init__(self, loader: StageLoader | None = None) -> None:
-        self._memo, self._loader = Memo(), loader or StageLoader()
+        self._memo, self._loader, self._odometry = Memo(), loader or StageLoader(), Odometry()
         self._frame: Frame | None = None
         self._still: Frame | None = None
+        self._lock = threading.Lock()  # guards _frame and _still
 
     def session(self, config: Config) -> Session:
         """Return a new session with its own tracks and anomalies.
@@ -138,7 +160,7 @@ class Variants:
         Raises:
             UserError: the detector's model or a user-defined function cannot be used.
         """
-        return Session(config, loader=self._loader, memo=self._memo)
+        return Session(config, loader=self._loader, memo=self._memo, odometry=self._odometry)
 
     def check(self, config: Config) -> None:
         """Check that the stages of a configuration can be loaded.
@@ -150,13 +172,14 @@ class Variants:
 
     def frame(self, frame: Frame, config: Config) -> Frame:
         """Return the frame as a configuration wants it made. A new frame clears the shared results."""
-        if frame is not self._frame:
-            self._memo.clear()
-            self._frame, self._still = frame, None
-        if config.sync.motion_compensation:
-            return frame
-        self._still = self._still or without_motion_compensation(frame)
-        return self._still
+        with self._lock:
+            if frame is not self._frame:
+                self._memo.clear()
+                self._frame, self._still = frame, None
+            if config.sync.motion_compensation:
+                return frame
+            self._still = self._still or without_motion_compensation(frame)
+            return self._still
 
     def perceive(self, frame: Frame, config: Config, network: Executor | None = None) -> FrameResult:
         """Run the stages that need no other frame on one frame.

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from bevviz.config import Config, DetectorConfig, object_network_params
 from bevviz.config.pillars import INPUT_PARAMS
-from bevviz.config.plugins import TOPIC
+from bevviz.config.plugins import TOPIC, is_user_function
 from bevviz.model.frame import Camera
 from bevviz.model.results import Detections
+from bevviz.pipeline.result_store import ResultStore, StoredDetector, StoredObjectNetwork, open_store
 from bevviz.stages import user_stages
 from bevviz.stages.detector import Detector
 from bevviz.stages.pillars import ObjectNetwork, PillarNetwork
@@ -34,8 +35,8 @@ class Stages:
 
     ground: UserStage | None = None
     clustering: UserStage | None = None
-    objects: UserStage | ObjectNetwork | None = None
-    network: Detector | UserStage | None = None
+    objects: UserStage | ObjectNetwork | StoredObjectNetwork | None = None
+    network: Detector | StoredDetector | UserStage | None = None
     detector: Detector | None = None
     detect: DetectFunction | None = None
 
@@ -49,14 +50,21 @@ class Stages:
         """Provider of the networks, the detector's first. Empty: bevviz runs none."""
         if self.detector is not None:
             return self.detector.provider
-        return self.objects.network.provider if isinstance(self.objects, ObjectNetwork) else ""
+        network = self.objects if isinstance(self.objects, ObjectNetwork | StoredObjectNetwork) else None
+        return "" if network is None else network.network.provider
 
 
 class StageLoader:
-    """Loader that loads each network and function once."""
+    """Loader that loads each network and function once.
 
-    def __init__(self) -> None:
+    Args:
+        store: whether the store of results may answer for networks, and keep what they answer.
+    """
+
+    def __init__(self, *, store: bool = True) -> None:
+        self._uses_store = store
         self._networks: dict[tuple[str, str, str, int], Detector] = {}
+        self._stored: dict[tuple[Detector, ResultStore], StoredDetector] = {}
         self._foreign: dict[tuple[str, str, str], UserStage | None] = {}
         self._pillars: dict[tuple[object, ...], PillarNetwork] = {}
 
@@ -72,9 +80,23 @@ class StageLoader:
             ground=self._function(config, "ground"),
             clustering=self._function(config, "clustering"),
             objects=self._objects(config),
-            network=network or detector,
+            network=detector if network is None else self._with_store(network, config),
             detector=None if network is None else network.restated(config.detector),
             detect=detect,
+        )
+
+    def load_networks(self, config: Config) -> Stages:
+        """Return only the networks of a configuration whose results the store keeps. No function is imported.
+
+        Raises:
+            UserError: a network cannot be used.
+        """
+        names_function = is_user_function(config.detector.model)
+        network = None if names_function else self._network(config.detector)
+        return Stages(
+            objects=None if object_network_params(config) is None else self._objects(config),
+            network=None if network is None else self._with_store(network, config),
+            detector=None if network is None else network.restated(config.detector),
         )
 
     def _function(self, config: Config, section: str) -> UserStage | None:
@@ -84,7 +106,7 @@ class StageLoader:
             self._foreign[key] = user_stages.load_user_stage(config, section)
         return self._foreign[key]
 
-    def _objects(self, config: Config) -> UserStage | ObjectNetwork | None:
+    def _objects(self, config: Config) -> UserStage | ObjectNetwork | StoredObjectNetwork | None:
         """Return the 3D detector or the user-defined function that makes the objects, or None."""
         params = object_network_params(config)
         if params is None:
@@ -94,7 +116,22 @@ class StageLoader:
         key = config.objects.method, input_params, *runs_on
         if key not in self._pillars:
             self._pillars[key] = PillarNetwork(Path(config.objects.method), params, *runs_on)
-        return ObjectNetwork(self._pillars[key], params)
+        network = ObjectNetwork(self._pillars[key], params)
+        store = open_store(config.store.size) if self._uses_store else None
+        if store is None:
+            return network
+        files = [Path(config.objects.method), *([Path(params.encoder)] if params.encoder else [])]
+        return StoredObjectNetwork(network, store, files, params)
+
+    def _with_store(self, network: Detector, config: Config) -> Detector | StoredDetector:
+        """Return the detector's network with the store of results, if there is one."""
+        store = open_store(config.store.size) if self._uses_store else None
+        if store is None:
+            return network
+        key = network, store
+        if key not in self._stored:
+            self._stored[key] = StoredDetector(network, store)
+        return self._stored[key]
 
     def _network(self, config: DetectorConfig) -> Detector | None:
         """Return the detector's network, or None."""

@@ -11,7 +11,7 @@ from typing import Any, TypeVar, TypeVarTuple, cast
 from pydantic import BaseModel
 
 from bevviz.config import Config
-from bevviz.errors import StageError, UserError, interrupt_in
+from bevviz.errors import FunctionError, StageError, UserError, interrupt_in
 from bevviz.model.results import Failure
 from bevviz.support.kernel import thread_clock
 from bevviz.support.loggers import logger
@@ -26,7 +26,7 @@ class Memo:
     """Results of stages on one frame, shared by configurations that run on the same frame.
 
     A stage with the same arrays and equal parameters does not run again. The cache must be cleared before the
-    next frame.
+    next frame. Several threads may use it.
 
     Args:
         size: most results that are kept. The least recently used one goes first.
@@ -35,7 +35,7 @@ class Memo:
     def __init__(self, size: int = 200) -> None:
         self._size = size
         self._results: OrderedDict[tuple[object, ...], tuple[tuple[object, ...], Any, float]] = OrderedDict()
-        self._local = threading.local()
+        self._local, self._lock = threading.local(), threading.Lock()
 
     @property
     def seconds_saved(self) -> float:
@@ -44,23 +44,28 @@ class Memo:
 
     def clear(self) -> None:
         """Forget all results."""
-        self._results.clear()
+        with self._lock:
+            self._results.clear()
 
     def call(self, function: Callable[[*Ts], T], *args: *Ts) -> T:
         """Return the function's result, from the cache if possible. The function may use the cache itself."""
         key = (function, *map(_identity, args))
-        if key in self._results:
-            _, result_before, seconds = self._results[key]
-            self._results.move_to_end(key)
+        with self._lock:
+            known = self._results.get(key)
+            if known is not None:
+                self._results.move_to_end(key)
+        if known is not None:
+            _, result_before, seconds = known
             self._local.seconds_saved = self.seconds_saved + seconds
             return cast(T, result_before)
         start, before = thread_clock(), self.seconds_saved
         result = function(*args)
         seconds = thread_clock() - start + self.seconds_saved - before
         # Keeping the arguments prevents other objects from getting their ids.
-        self._results[key] = args, result, seconds
-        if len(self._results) > self._size:
-            self._results.popitem(last=False)
+        with self._lock:
+            self._results[key] = args, result, seconds
+            if len(self._results) > self._size:
+                self._results.popitem(last=False)
         return result
 
 
@@ -116,7 +121,8 @@ class StageLog:
 
     def _failed(self, stage: str, reason: str, error: Exception) -> None:
         """Record and log a failure."""
-        is_unexpected = not isinstance(error, UserError | StageError)
-        details = "".join(traceback.format_exception(error)) if is_unexpected else ""
-        _log.warning("stage %s failed: %s", stage, reason, exc_info=error if is_unexpected else None)
+        cause = error.__cause__ if isinstance(error, FunctionError) else error
+        is_unexpected = not isinstance(cause, UserError | StageError)
+        details = "".join(traceback.format_exception(cause)) if is_unexpected else ""
+        _log.warning("stage %s failed: %s", stage, reason, exc_info=cause if is_unexpected else None)
         self.failures.append(Failure(stage, reason, details))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,18 @@ import onnxruntime as ort
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
-from bevviz.model.frame import I32, U8
-from bevviz.model.results import Detections, DetectionState
+from bevviz.model.frame import F32, I32, I64, U8
+from bevviz.model.results import Detections, DetectionState, Masks
 from bevviz.stages.detector.image import Placement
-from bevviz.stages.detector.layouts import ModelFacts, find_head
+from bevviz.stages.detector.layouts import ADAPTER, ModelFacts, find_head
 from bevviz.stages.detector.masks import masks as make_masks
-from bevviz.stages.detector.metadata import DEFAULT_STRIDE, stated_size, stated_stride
-from bevviz.stages.detector.names import metadata_names, read_names
+from bevviz.stages.detector.names import (
+    DEFAULT_STRIDE,
+    metadata_names,
+    read_names,
+    stated_size,
+    stated_stride,
+)
 from bevviz.stages.detector.providers import open_session
 from bevviz.stages.detector.session import NetworkSession, list_tensors, reading_answer
 from bevviz.stages.detector.suppression import nms
@@ -34,10 +40,22 @@ TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uin
 
 @dataclass(frozen=True, slots=True)
 class Inference:
-    """Output of a network for one image, before any threshold."""
+    """Candidates of a network for one image in pixels of its input, before the thresholds of a configuration.
 
-    outputs: tuple[Any, ...]
+    Attributes:
+        xyxy: (N, 4) boxes.
+        score: (N,) scores.
+        class_id: (N,) classes.
+        where: placement of the image in the input.
+        masks: function that returns the masks of some candidates, from their rows, the detections that they
+            became, and the number of all detections. None: the network gives no masks.
+    """
+
+    xyxy: F32
+    score: F32
+    class_id: I32
     where: Placement
+    masks: Callable[[I64, I64, int], Masks] | None = None
 
 
 class Detector:
@@ -51,6 +69,7 @@ class Detector:
         config: model file, thresholds, provider and threads.
 
     Attributes:
+        path: the ONNX file.
         names: class names by class id, empty if unknown.
         layout: layout of the output.
         provider: onnxruntime execution provider in use, such as ``CPU``.
@@ -64,7 +83,7 @@ class Detector:
 
     def __init__(self, config: DetectorConfig) -> None:
         self._config = config
-        path = DEMO_MODEL if config.model == "demo" else Path(config.model)
+        self.path = path = DEMO_MODEL if config.model == "demo" else Path(config.model)
         self._where = f"detector.model {path}"
         self._session = _open(path, config)
         self.provider = self._session.provider
@@ -118,7 +137,9 @@ class Detector:
         Raises:
             UserError: the model returns impossible numbers, such as scores above 1.
         """
-        return self.interpret(self.infer(bgr)) if bgr.size else Detections.empty()
+        if not bgr.size:
+            return Detections.empty()
+        return self.interpret(self.infer(bgr, self._config.explain_threshold))
 
     def restated(self, config: DetectorConfig) -> Detector:
         """Return a detector with other thresholds or classes that shares this network.
@@ -131,35 +152,57 @@ class Detector:
         other._wanted = other._wanted_classes()
         return other
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether the network gives instance masks."""
+        return bool(self._head.prototypes)
+
+    @property
+    def identity(self) -> str:
+        """Text that differs where the same file gives other candidates: provider, layout and class names."""
+        return f"{self.provider} {self.layout} {self.input_size} {self.names}"
+
+    def place(self, bgr: U8) -> Placement:
+        """Return the placement of an image in the network's input."""
+        size = bgr.shape[0], bgr.shape[1]
+        return self.layout.feed.place(size, self.input_size, self._is_open, self._stride)
+
     def prepare(self, bgr: U8) -> tuple[Any, Placement]:
         """Return the network's input for a non-empty image, and the placement of the image in it."""
-        feed, size = self.layout.feed, (bgr.shape[0], bgr.shape[1])
-        where = feed.place(size, self.input_size, self._is_open, self._stride)
-        return feed.blob(bgr, where, self._dtype), where
+        where = self.place(bgr)
+        return self.layout.feed.blob(bgr, where, self._dtype), where
 
-    def infer(self, bgr: U8) -> Inference:
-        """Run only the network, on a non-empty image."""
-        blob, where = self.prepare(bgr)
-        return Inference(tuple(self._run(self._head.wanted, blob).values()), where)
-
-    def interpret(self, inference: Inference) -> Detections:
-        """Apply the thresholds to the network's output. The result is that of ``__call__``.
+    def infer(self, bgr: U8, least: float) -> Inference:
+        """Return the candidates of a non-empty image with a score of ``least`` or more, before the NMS.
 
         Raises:
             UserError: as in ``__call__``.
         """
-        config, where = self._config, inference.where
+        blob, where = self.prepare(bgr)
+        outputs = tuple(self._run(self._head.wanted, blob).values())
         with reading_answer(self._where):
-            xyxy, score, class_id, table_row = self._head.candidates(
-                inference.outputs, where.input_size, config.explain_threshold
-            )
-        is_valid = np.isfinite(xyxy).all(axis=1)
+            xyxy, score, class_id, row = self._head.candidates(outputs, where.input_size, least)
+            if not self.has_masks:
+                return Inference(xyxy, score, class_id, where)
+            weights = self._head.coefficients(outputs, row)
+        prototypes = outputs[-1][0]
+
+        def masks(rows: I64, kept: I64, count: int) -> Masks:
+            with reading_answer(self._where):
+                return make_masks(weights[rows], prototypes, xyxy[rows], kept, count, where)
+
+        return Inference(xyxy, score, class_id, where, masks)
+
+    def interpret(self, inference: Inference) -> Detections:
+        """Apply the thresholds to the candidates. The result is that of ``__call__``."""
+        config, where = self._config, inference.where
+        xyxy, score, class_id = inference.xyxy, inference.score, inference.class_id
+        is_valid = np.isfinite(xyxy).all(axis=1) & (score >= config.explain_threshold)
         if self._wanted is not None:
             is_valid &= np.isin(class_id, self._wanted)
         order = np.flatnonzero(is_valid)
         order = order[np.argsort(-score[order], kind="stable")[:MAX_CANDIDATES]]
         xyxy, score, class_id = xyxy[order], score[order], class_id[order]
-        input_xyxy = xyxy
 
         offset = self.layout.class_offset
         if offset is None:
@@ -178,14 +221,9 @@ class Detector:
         row = _best(np.flatnonzero(is_visible), state, config.max_candidates)
         suppressor = np.where(suppressor[row] >= 0, np.searchsorted(row, suppressor[row]), -1)
         masks = None
-        if self._head.prototypes:
+        if inference.masks is not None:
             kept = np.flatnonzero(state[row] == DetectionState.KEPT)
-            mask_rows = table_row[order[row[kept]]]
-            with reading_answer(self._where):
-                weights = self._head.coefficients(inference.outputs, mask_rows)
-                masks = make_masks(
-                    weights, inference.outputs[-1][0], input_xyxy[row[kept]], kept, len(row), where
-                )
+            masks = inference.masks(order[row[kept]], kept, len(row))
         return Detections(
             xyxy=xyxy[row] - np.float32(0.5),  # networks count pixels from the corner of the first pixel
             score=score[row],
@@ -206,6 +244,7 @@ class Detector:
         if self._rank not in (3, 4) or shape[-3] != 3 or len(sizes) > 1 or not all(sizes):
             raise UserError(
                 f"{self._where}: no detector of one colour image [1, 3, height, width]; its inputs: {inputs}"
+                f"{ADAPTER}"
             )
         if batch != 1:
             raise UserError(

@@ -1,0 +1,36 @@
+"""Command ``bevviz store``: show or empty the store of results."""
+
+from __future__ import annotations
+
+import argparse
+
+from bevviz.cli.options import Commands
+from bevviz.errors import UserError
+
+
+def add(commands: Commands) -> None:
+    """Add the command ``store``."""
+    store = commands.add_parser(
+        "store",
+        help="the results that are kept on disk, so that no command makes them twice",
+        description="Print where detections of images and boxes of 3D networks are kept, how many there are, "
+        "and what they take. --set store.size=0 makes a command do without them.",
+    )
+    store.add_argument("--clear", action="store_true", help="delete all results")
+    store.set_defaults(run=_store)
+
+
+def _store(options: argparse.Namespace) -> int:
+    from bevviz.config import load
+    from bevviz.pipeline.result_store import ResultStore, store_folder
+
+    limit, folder = load().store.size, store_folder()
+    if folder is None:
+        raise UserError("BEVVIZ_STORE is empty: no results are kept")
+    with ResultStore(folder, int(limit * 1e6)) as store:
+        if options.clear:
+            print(f"{store.path}: {store.clear():,} results deleted")
+            return 0
+        count, size = store.summary()
+        print(f"{store.path}: {count:,} results, {size / 1e6:,.1f} of {limit:,.0f} MB")
+    return 0
