@@ -242,3 +242,26 @@ def test_a_3d_detector_lacks_its_file_before_its_parameters(tmp_path: Path) -> N
         UserError, match=r"net\.onnx: a 3D detector needs objects\.params\.point_range, in a YAML"
     ):
         load(settings=[f"objects.method={file}"])
+
+
+@pytest.mark.parametrize(("without", "noun"), [("", "scan"), (bags.CLOUD, "image")])
+def test_lost_stamps_are_missing_and_named_by_receipt(tmp_path: Path, without: str, noun: str) -> None:
+    def stopped(item: bags.Item) -> bags.Item:
+        if item.topic.startswith("/tf"):
+            return item
+        stamp = bags.Messages().header(bags.START, "").stamp
+        return item._replace(message=replace(item.message, header=replace(item.message.header, stamp=stamp)))
+
+    items = [stopped(item) for item in bags.small_items(scans=6) if item.topic != without]
+    path = bags.write(tmp_path / "drive", items)
+    lost = f"a run drops 5 of the first 6 {noun}s, whose stamps repeat or go back: --set sync.by=received"
+    assert lost in describe_bag([path], Config()).missing
+    with BagSource([path], Config()) as source:
+        assert len(list(source)) == 1
+        noun = "cloud" if noun == "scan" else noun
+        dropped = f"5 {noun}s had the stamp of another one and were dropped; --set sync.by=received goes by"
+        assert any(text.startswith(dropped) for text in source.warnings)
+    by_receipt = load(settings=["sync.by=received"])
+    assert not any("drops" in text for text in describe_bag([path], by_receipt).missing)
+    with BagSource([path], by_receipt) as source:
+        assert len(list(source)) == 6

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.roles import Roles
 from bevviz.messages.topics import CameraRole
 from bevviz.messages.transforms import StampedTransform

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from bevviz.errors import UserError
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
+from bevviz.model.json_forms import CameraForm, InfoForm
 from bevviz.pipeline.sensor_check import SensorCheck, first_frames
 from bevviz.recording.provenance import model_path
 from bevviz.support import table
@@ -105,7 +106,10 @@ def describe_bag(paths: Sequence[Path], config: Config, *, all_frames: bool = Fa
         source = BagSource(paths, config)
     except UserError as error:
         with Recording(paths, config.source) as recording:
-            roles = find_roles(recording.topics, config.source, stage_topics(config))
+            try:
+                roles = find_roles(recording.topics, config.source, stage_topics(config))
+            except UserError:  # A stage may need the topic of a result file, which is the first error.
+                raise error from None
             return _describe(recording, roles, config, missing=[str(error)])
     with source:
         roles = source.roles
@@ -114,7 +118,7 @@ def describe_bag(paths: Sequence[Path], config: Config, *, all_frames: bool = Fa
             frame = read if count <= TRIAL_SCAN else frame
             if not source.recording.single_frames:
                 check.add(read)
-        missing = find_missing(roles, frame, config)
+        missing = [*source.large_losses(), *find_missing(roles, frame, config)]
         return _describe(source.recording, roles, config, missing, frame, source, check.warnings)
 
 
@@ -225,7 +229,7 @@ def _topic(recording: Recording, topic: Topic, roles: Roles) -> TopicInfo:
 def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]:
     """Return the requirements of a full run that one frame does not meet, with the option that meets each."""
     if frame is None:
-        return ["no scan could be read"]
+        return [f"no {'scan' if roles.lidars else 'image'} could be read"]
     missing = []
     if roles.no_camera:
         missing.append(roles.no_camera)
@@ -255,27 +259,35 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
         missing.append("no fixed frame, so that motion is not compensated: the points state no frame_id")
     elif frame.world_from_points is None:
         missing.append(
-            f"no fixed frame above '{frame.points_frame}', so that motion is not compensated: "
+            f"no fixed frame above '{frame.points_frame}', so that {_without_motion(config)}: "
             "record nav_msgs/Odometry or the transforms above it, or name another frame that stands still: "
             "--set source.fixed_frame=name"
         )
     return [*missing, *frame.problems]
 
 
-def contents_tree(info: TopicContents) -> dict[str, Any]:
+def _without_motion(config: Config) -> str:
+    """Return what a run does where no fixed frame is known."""
+    if config.odometry.method == "none":
+        return "motion is not compensated"
+    return "runs over the drive estimate the motion from the scans (odometry.method)"
+
+
+def contents_tree(info: TopicContents) -> InfoForm:
     """Return the contents as a tree for JSON, without images and clouds."""
     values = {
         f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")
     }
-    return {
+    tree = {
         **values,
         "topics": [asdict(topic) for topic in info.topics],
         "cameras": [_camera_tree(camera) for camera in info.cameras],
         "transforms": dict(info.tree),
     }
+    return cast("InfoForm", tree)
 
 
-def _camera_tree(camera: Camera) -> dict[str, Any]:
+def _camera_tree(camera: Camera) -> CameraForm:
     """Return a camera as a tree for JSON."""
     image, model, transform = camera.image, camera.intrinsics, camera.camera_from_points
     return {

@@ -9,7 +9,7 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
 from bevviz.stages.fusion import assign
-from bevviz.stages.shared_area import shared_area
+from bevviz.stages.rotated_boxes import shared_area
 from bevviz.support.kernel import kernel
 
 SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate

@@ -14,6 +14,7 @@ from statistics import median
 APART = 0.6  # seconds; a larger difference between the lags of two topics is hardly a delay
 ENOUGH, LAST = 3, 50  # least and most messages of a topic for its lag
 TAI = 37.0  # seconds that TAI is ahead of UTC since 2017
+BY_RECEIPT = "--set sync.by=received goes by the time of receipt"
 EPOCH = 10 * 365 * 86_400.0  # seconds; a clock that is off by ten years counts from its start
 
 
@@ -40,6 +41,10 @@ class Clocks:
         """Return the median seconds from stamp to receipt; None if there are too few messages."""
         lags = self._lags.get(topic, ())
         return median(lags) * 1e-9 if len(lags) >= ENOUGH else None
+
+    def differ_from_receipt(self, topic: str) -> bool:
+        """Return whether the time of receipt tells the messages of a topic apart better than their stamps."""
+        return not self._received and len(set(self._lags.get(topic, ()))) > 1
 
     def apart(self, topic: str, other: str) -> float:
         """Return the seconds that ``topic``'s clock is behind that of ``other``; 0 if it may be a delay."""
@@ -72,7 +77,6 @@ def _clock(off: float, right: str) -> str:
 
 
 def _remedy(topic: str, off: float) -> str:
-    by_receipt = "--set sync.by=received goes by the time of receipt"
     if abs(off) > EPOCH:
-        return f"{by_receipt}; or let its driver stamp with the system's time"
-    return f"--set sync.offsets='{{{topic}: {off:.2f}}}' sets it right, {by_receipt}"
+        return f"{BY_RECEIPT}; or let its driver stamp with the system's time"
+    return f"--set sync.offsets='{{{topic}: {off:.2f}}}' sets it right, {BY_RECEIPT}"

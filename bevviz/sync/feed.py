@@ -9,8 +9,8 @@ from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar
 
 from bevviz.drivers.video import decode_packet
 from bevviz.messages.camera_info import decode_camera_info
-from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.clouds import decode_cloud, decode_laser_scan
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.detections import decode_boxes, decode_detections_2d, decode_detections_3d
 from bevviz.messages.guard import TypedMessage, guard
 from bevviz.messages.images import decode_compressed_image, decode_image
@@ -87,7 +87,8 @@ def make_handlers(
         return guard(message, decoder, decode(message), *args, **kwargs)
 
     def read_cloud(message: M) -> Cloud:
-        return read(message, decode_cloud, message.topic, message.received)
+        decoder = decode_laser_scan if message.type.endswith("LaserScan") else decode_cloud
+        return read(message, decoder, message.topic, message.received)
 
     def add_transforms(message: M, static: bool) -> None:
         for transform in read(message, decode_transforms, message.topic):

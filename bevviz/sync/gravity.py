@@ -55,6 +55,8 @@ class VerticalEstimate:
     Attributes:
         warnings: a sentence for each LiDAR frame with a doubtful vertical.
         needs_gravity: whether an Imu could improve the estimate.
+        checked: LiDAR frames whose stated vertical is not compared with the ground once more. None: none are.
+            Sources of single frames share it, because the search for the ground takes longer than the rest.
     """
 
     tf: TransformBuffer
@@ -62,6 +64,7 @@ class VerticalEstimate:
     tolerance: float
     warnings: dict[str, str] = field(default_factory=dict)
     needs_gravity: bool = True
+    checked: set[str] | None = None
     _gravity: dict[str, tuple[int, F64]] = field(default_factory=dict)  # stamp and mean acceleration by frame
     _ground: dict[str, F64] = field(default_factory=dict)  # up direction by LiDAR frame, from the ground
     _tries: dict[str, int] = field(default_factory=dict)
@@ -91,9 +94,11 @@ class VerticalEstimate:
             (base[2], f"'{self.base_frame}'") if base is not None else self._up(cloud, frame, fixed_frame)
         )
         self.needs_gravity = up is None or source.startswith("gravity")
-        ground = self._seen_ground(cloud, frame)
         if up is None:
-            return self._turn_by_ground(frame, ground)
+            return self._turn_by_ground(frame, self._seen_ground(cloud, frame))
+        ground = None if frame in (self.checked or ()) else self._seen_ground(cloud, frame)
+        if ground is not None and self.checked is not None:
+            self.checked.add(frame)
         if ground is not None and _angle(up, ground) > DISAGREEMENT:
             self.warnings[frame] = (
                 f"the ground that LiDAR frame '{frame}' sees is tilted by {_degrees(up, ground):.0f} degrees "
@@ -187,6 +192,8 @@ def ground_normal(points: F32) -> F64 | None:
         np.concatenate(pair)
         for pair in zip(*(_planes(drawn, random) for drawn in (sample, low)), strict=True)
     )
+    if not len(normals):
+        return None
     distance = sample @ normals.T + heights  # (points, planes) height above the plane
     support = (np.abs(distance) < THICKNESS).mean(axis=0)
     below = (distance < -2 * THICKNESS).mean(axis=0)

@@ -105,9 +105,15 @@ class PoseLookup:
         if not world and not self._turned:
             return reference
         if not world:
+            topic = self._config.source.odometry_topic
+            remedy = (
+                f"source.odometry_topic {topic} does not lead to it"
+                if topic
+                else "source.odometry_topic can name a nav_msgs/Odometry that does"
+            )
             self._report.problems[
-                f"no fixed frame (map, odom or the like) above '{points_frame}' in TF: motion is not "
-                f"compensated; odometry is taken from source.odometry_topic"
+                f"no fixed frame (map, odom or the like) above '{points_frame}' in TF, so motion is not "
+                f"compensated; {remedy}"
             ] += 1
             return reference
         try:

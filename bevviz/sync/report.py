@@ -12,8 +12,10 @@ from bevviz.config import Config
 from bevviz.config.plugins import TOPIC
 from bevviz.messages.roles import Roles
 from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
-from bevviz.sync.clocks import Clocks
+from bevviz.sync.clocks import BY_RECEIPT, Clocks
 from bevviz.sync.transform_tree import TransformBuffer
+
+LARGE_LOSS = 0.1  # share of messages; above it, a loss is said before a run
 
 
 class UnusableMessages:
@@ -39,6 +41,10 @@ class UnusableMessages:
         self._first.setdefault(topic, reason)
         return self._counts[topic]
 
+    def count(self, topic: str) -> int:
+        """Return the count of a topic."""
+        return self._counts[topic]
+
     @property
     def sentences(self) -> list[str]:
         """A sentence for each topic."""
@@ -53,7 +59,10 @@ class SyncReport:
     """Counts of arrived and lost messages, and oddities, so far.
 
     Attributes:
-        clouds: clouds of all LiDARs.
+        driver: topic whose messages make the frames.
+        noun: name of such a message: a cloud, or an image without a LiDAR.
+        clouds: clouds of all LiDARs, or images of the camera that drives.
+        queued: those of the driver.
         frames: frames that were delivered.
         reordered: clouds that came out of order and were put back in order.
         late: clouds that were dropped, because a newer one had been delivered.
@@ -82,7 +91,10 @@ class SyncReport:
         slowest: longest delay of such a result after its stamp, seconds, by topic.
     """
 
+    driver: str = ""
+    noun: str = "cloud"
     clouds: int = 0
+    queued: int = 0
     frames: int = 0
     reordered: int = 0
     late: int = 0
@@ -123,6 +135,15 @@ class SyncReport:
         problems.append(text)
         self.problems[re.sub(r"\d+\.\d+ s ", "", text)] += 1
 
+    @property
+    def stale(self) -> int:
+        """Messages of the driver that were dropped, because their stamps were not new."""
+        return self.late + self.duplicates
+
+    def receipt_helps(self) -> bool:
+        """Return whether the dropped messages would be frames by their time of receipt."""
+        return self.stale > LARGE_LOSS * self.queued and self.clocks.differ_from_receipt(self.driver)
+
     def doubts(self) -> tuple[str, ...]:
         """Return a sentence for each fault that may affect every frame: clocks, units, the vertical."""
         return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
@@ -138,25 +159,29 @@ class SyncReport:
 
     def warnings(self) -> tuple[str, ...]:
         """Return all sentences."""
+        remedy = f"; {BY_RECEIPT}" if self.receipt_helps() else ""
         counted = [
             (self.reordered, "{} came out of order and {} put back in order"),
-            (self.late, "{} came after a newer one had gone on and {} dropped"),
-            (self.duplicates, "{} had the stamp of another one and {} dropped"),
+            (self.late, "{} came after a newer one had gone on and {} dropped" + remedy),
+            (self.duplicates, "{} had the stamp of another one and {} dropped" + remedy),
             (self.unwaited, "{} went on early because sync.queue was full"),
         ]
         sentences = [
-            text.format("1 cloud" if n == 1 else f"{n} clouds", "was" if n == 1 else "were")
+            text.format(f"1 {self.noun}" if n == 1 else f"{n} {self.noun}s", "was" if n == 1 else "were")
             for n, text in counted
             if n
         ]
         if self.resets:
-            sentences.append(f"the stamps of the clouds jumped back {_times(self.resets)}")
+            sentences.append(f"the stamps of the {self.noun}s jumped back {_times(self.resets)}")
         if self.gaps:
             gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
-            sentences.append(f"the stamps of the clouds have {gaps}, the longest {self.longest_gap:.2f} s")
-        if self.idle:
             sentences.append(
-                f"no cloud on {self.idle}, which should drive: set source.lidar_topics, the driving one first"
+                f"the stamps of the {self.noun}s have {gaps}, the longest {self.longest_gap:.2f} s"
+            )
+        if self.idle:
+            setting = "source.lidar_topics" if self.noun == "cloud" else "source.camera_topics"
+            sentences.append(
+                f"no {self.noun} on {self.idle}, which should drive: set {setting}, the driving one first"
             )
         for topic, n in self.unstamped.items():
             sentences.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")

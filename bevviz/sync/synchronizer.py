@@ -71,25 +71,32 @@ class Synchronizer:
         config: tolerances and queues.
         beside: topics of the robot's boxes for which no frame waits. ``overtaken`` returns those that come
             too late for their frame.
+        lapse: seconds after which no frame waits for transforms that stay away; None: each frame waits.
 
     Attributes:
         report: counts and oddities.
         followed: child frame of the odometry; empty: not known yet.
-        absent: topics without a publisher, for which no frame waits.
+        absent: topics that do not deliver. No frame waits for them, and the first LiDAR that is not among
+            them drives.
         videos: video by topic.
         placing: finder of poses.
         cameras: buffer of images and calibrations.
     """
 
-    def __init__(self, roles: Roles, config: Config, beside: Collection[str] = ()) -> None:
+    def __init__(
+        self, roles: Roles, config: Config, beside: Collection[str] = (), lapse: float | None = None
+    ) -> None:
         self.report = SyncReport()
         self.followed = ""
-        self.absent: frozenset[str] = frozenset()
+        self._absent: frozenset[str] = frozenset()
+        self._lapse = math.inf if lapse is None else lapse * 1e9
+        self._unconnected: int | None = None  # time of receipt since which transforms are unknown
         self.tf = self.report.tf
         self.upright = VerticalEstimate(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
         self.around = SurroundingsBuffer()
         self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
+        self.report.driver, self.report.noun = roles.driver, "cloud" if roles.lidars else "image"
         self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
         self._config = config
@@ -102,6 +109,7 @@ class Synchronizer:
         self._index = 0
         self._last: int | None = None  # stamp of the last frame
         self._step = math.inf  # nanoseconds between the last two clouds; a gap is much longer
+        self.driver = roles.driver  # topic whose messages make the frames now
         self._partners: dict[str, TopicBuffer[Cloud]] = self._make_buffers(*roles.lidars[1:])
         self.videos: dict[str, Video] = {}
         self._lidar_frames: dict[str, str] = {}  # frame by cloud topic
@@ -128,13 +136,39 @@ class Synchronizer:
     def take_over(self, former: Synchronizer) -> None:
         """Continue with the transforms, calibrations and counts of ``former`` when the roles change."""
         clocked = self.report.clocked
-        self.report, self.absent = former.report, former.absent
-        self.report.clocked = clocked
+        driver, noun = self.report.driver, self.report.noun
+        self.report = former.report
+        self.report.clocked, self.report.driver, self.report.noun = clocked, driver, noun
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
         self.around, self.videos = former.around, former.videos
         self.placing.take_over(former.placing)
         self.cameras.take_over(former.cameras)
         self._overtaken, self._past_references = former._overtaken, former._past_references
+        self.absent = former.absent
+
+    @property
+    def absent(self) -> frozenset[str]:
+        """Topics that do not deliver."""
+        return self._absent
+
+    @absent.setter
+    def absent(self, topics: frozenset[str]) -> None:
+        self._absent = topics
+        driver = next((lidar for lidar in self._roles.lidars if lidar not in topics), self.driver)
+        if driver != self.driver:
+            self._drive(driver)
+
+    def _drive(self, lidar: str) -> None:
+        """Let another LiDAR drive. Its clouds that no frame has taken yet make frames."""
+        former: TopicBuffer[Cloud] = TopicBuffer(self._horizon)
+        for cloud in self._clouds:
+            former.add(cloud.stamp, cloud)
+        untaken = self._partners.pop(lidar)
+        self._partners[self.driver] = former
+        self.driver = lidar
+        if self._last is not None:
+            untaken.shed(self._last + self._tolerance)
+        self._clouds = untaken.shed(untaken.newest or 0)
 
     # --- what comes in -------------------------------------------------------------------------
 
@@ -144,7 +178,11 @@ class Synchronizer:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
-        self._lidar_frames[cloud.topic] = cloud.frame_id.lstrip("/")
+        frame = cloud.frame_id.lstrip("/")
+        if (former := self._lidar_frames.get(cloud.topic, frame)) != frame:
+            changed = f"{cloud.topic}: its frame_id changed from '{former}' to '{frame}'"
+            self.report.oddities.setdefault(f"{cloud.topic} frame_id", changed)
+        self._lidar_frames[cloud.topic] = frame
         self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
@@ -154,6 +192,7 @@ class Synchronizer:
 
     def _queue(self, cloud: Cloud) -> None:
         """Queue a cloud of the driving LiDAR for a frame."""
+        self.report.queued += 1
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
         row = bisect_left(stamps, cloud.stamp)
@@ -418,7 +457,7 @@ class Synchronizer:
         reference = self.placing.of(cloud)
         moving = self._roles.tf or self._roles.odometry
         if moving and not reference.world_frame:
-            return False
+            return self._has_lapsed()
         needed = [(cloud.stamp, cloud.frame_id)]
         joined: list[TopicBuffer[Any]] = [*self.cameras.images.values(), *self._partners.values()]
         for buffer in joined:
@@ -431,8 +470,15 @@ class Synchronizer:
         try:
             ends = [(self.tf.latest(anchor, frame), stamp) for stamp, frame in needed for anchor in anchors]
         except TransformError:
-            return False
-        return all(end is None or end >= stamp for end, stamp in ends)
+            return self._has_lapsed()
+        self._unconnected = None
+        return all(end is None or end >= stamp or end < stamp - self._lapse for end, stamp in ends)
+
+    def _has_lapsed(self) -> bool:
+        """Note that transforms are unknown. Return whether that is so for longer than the lapse."""
+        if self._unconnected is None:
+            self._unconnected = self._now
+        return self._now - self._unconnected > self._lapse
 
     # --- one frame -----------------------------------------------------------------------------
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D, Frame
 from bevviz.model.results import Tracks
 from bevviz.stages.fusion import assign
 from bevviz.synthetic import Snapshot, SyntheticSource
@@ -105,6 +105,24 @@ def truth_of(source: SyntheticSource, shot: Snapshot, must: Bool) -> Truth:
     velocity = (ends[:, 1] - ends[:, 0]) / (2 * step)
     center = geometry.apply(stated.world_from_boxes, stated.boxes.center)
     return Truth(center, velocity, shot.truth_object, stated.labels, must)
+
+
+def without_pose(frame: Frame) -> Frame:
+    """Return a frame of the synthetic drive as if nothing stated the robot's motion."""
+    points_from_world = geometry.inverse(frame.pose)
+    cameras = []
+    for camera in frame.cameras:
+        assert camera.world_from_camera is not None
+        cameras.append(replace(camera, world_from_camera=points_from_world @ camera.world_from_camera))
+    truth = None if frame.truth is None else replace(frame.truth, world_from_boxes=np.eye(4))
+    frame = replace(frame, world_frame=frame.points_frame, world_from_points=None)
+    return replace(frame, cameras=tuple(cameras), truth=truth)
+
+
+def moved(truth: Truth, world_from_map: F64) -> Truth:
+    """Return the truth in another world."""
+    velocity = truth.velocity @ world_from_map[:3, :3].T
+    return replace(truth, center=geometry.apply(world_from_map, truth.center), velocity=velocity)
 
 
 Tallies = defaultdict[str, TrackTally]  # by class
