@@ -130,7 +130,8 @@ class Bench:
             self.tally.hints.update(none=1)
             return
         after = again.with_settings(hints[0].settings).cause(row)
-        holds = after.reported and after.reason is ReasonKind.REPORTED
+        stated = f"'{after.reason.value}'" in hints[0].text  # a fault that the hint tells
+        holds = after.reported and (after.reason is ReasonKind.REPORTED or stated)
         self.tally.hints.update(given=1, hold=int(holds))
         if not holds:
             self.tally.wrong.append(f"{about}: {', '.join(hints[0].settings)} leaves it {_said(after)}")

@@ -23,9 +23,12 @@ from bevviz.pipeline.session import Session
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Answer, FrameExplainer, Selection, why
 from bevviz.why.answer_text import summary_line
+from bevviz.why.confidence import Outcome, features_of
+from bevviz.why.confidence_table import COEFFICIENTS, FEATURES
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import projected_box
 from tests.support import bags, documented_json
+from tests.support.commands import error_of
 from tests.support.planted_faults import at, drive, planted, run
 from tests.support.recordings import Recording
 
@@ -149,6 +152,28 @@ def test_two_people_are_explained_without_truth() -> None:
     merged = [a for a in answers if a.verdict.kind is ReasonKind.MERGED]
     assert merged and all(a.subject.kind == "detection" for a in merged)
     assert any(not a.verdict.reported and a.verdict.reason["others"] for a in merged)
+
+
+def test_without_truth_an_unsure_answer_names_two_reasons() -> None:
+    """The table has a coefficient for each feature of a box, and the probabilities make the text."""
+    result = run("merged_people", "default")
+    blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
+    detections = result.cameras[0].detections
+    assert detections is not None
+    answer = blind.ask(Selection(box=tuple(detections.xyxy[0].tolist())))[0]
+    assert tuple(features_of(answer.subject, answer.evidence, blind.traces) or ()) == FEATURES
+    assert all(len(row) == 1 + len(FEATURES) for row in COEFFICIENTS.values())
+    assert answer.confidence is not None
+    assert sum(outcome.probability for outcome in answer.outcomes) == pytest.approx(1)
+    verdict = answer.verdict.kind, answer.verdict.reported
+    other = ReasonKind.SPLIT if verdict[0] is not ReasonKind.SPLIT else ReasonKind.MERGED
+    sure = replace(answer, outcomes=(Outcome(*verdict, 0.8), Outcome(other, True, 0.2)))
+    assert (sure.likely, sure.text) == ((), f"{answer.verdict.text} (80% sure)")
+    unsure = replace(answer, outcomes=(Outcome(*verdict, 0.6), Outcome(other, True, 0.4)))
+    assert unsure.likely == (verdict[0], other)
+    assert unsure.text.startswith(f"Cannot tell (60% sure): {verdict[0]} or {other}. ")
+    known = asked("merged_people", "default", "person")
+    assert all(answer.confidence is None for answer in known), "ground truth tells"
 
 
 def test_a_box_that_names_two_clusters_is_explained() -> None:
@@ -531,11 +556,21 @@ def test_the_command_answers_and_draws(bag: Path, tmp_path: Path, capsys: Captur
     (points,) = recording.column("/explain/why/points", "Points3D:positions")
     assert len(points) > 300
     assert recording.column("/explain/why/place", "LineStrips3D:strips")
+    for entity in ("/explain/why/place", "/explain/why/points", "/explain/why/legend"):
+        assert recording.static[entity]["CoordinateFrame:frame"] == ["tf#/world/rslidar"]
+        assert not recording.column(entity, "Transform3D:translation"), "Rerun drops it at a clear"
     assert recording.column("/explain/why/zed/place", "Boxes2D:half_sizes")
     assert recording.column("/explain", "TextDocument:text"), "the frame itself is there, too"
     (lines,) = recording.column("/explain/why/legend", "Points3D:labels")
     assert lines[0] == f"{len(points)} taken for ground" and lines[1] == "the car at 10.1 m"
     assert recording.column("/bev/overlay/why", "LineStrips2D:strips")
+
+
+def test_a_class_that_the_model_lacks_is_named(bag: Path, capsys: Capture) -> None:
+    command = ("why", bag, "--at", "0", "--model", "demo", "--class")
+    for name, wanted in (("bicycle", "the model has no such class"), ("dog", "no such class")):
+        assert wanted in (said := error_of(capsys, *command, name))
+        assert all(known in said for known in ("car", "cyclist", "person"))
 
 
 def test_the_command_prints_json(bag: Path, capsys: Capture) -> None:

@@ -251,3 +251,12 @@ def test_a_change_with_the_objects_own_detection_is_a_hint(asked: dict[str, Aske
                     change.text for change in after.tried
                 ]
     assert helped >= 2
+
+
+def test_a_change_that_finds_it_is_not_called_useless(asked: dict[str, Asked]) -> None:
+    """Lower thresholds find the pedestrian, merged with something else, but they break more."""
+    frame = asked["kitti_more/3/network"]
+    answer = frame.explainer.with_hints(frame.labels[2])
+    assert answer.verdict.kind is ReasonKind.BELOW_THRESHOLD and not answer.hints
+    found = [change.text for change in answer.tried if "reported" in change.text]
+    assert {*found} == {"it is reported then, but 'merged', and it breaks as much"}

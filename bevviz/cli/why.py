@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bevviz.cli.options import (
     Commands,
@@ -14,10 +14,10 @@ from bevviz.cli.options import (
     add_bag,
     add_config,
     add_output,
+    add_subject,
     load_config,
-    number,
-    parse_real,
     positive,
+    selected_subject,
 )
 from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
 from bevviz.errors import UserError
@@ -25,7 +25,9 @@ from bevviz.support import progress
 from bevviz.support.contexts import garbage_collection_off
 
 if TYPE_CHECKING:
-    from bevviz.model.frame import Scene
+    from bevviz.bags.source import BagSource
+    from bevviz.model.frame import Frame, Scene
+    from bevviz.model.json_forms import WhyForm
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, FrameExplainer, Selection
 
@@ -34,8 +36,6 @@ EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx --class person   every person, however weakly detected
   bevviz why drive.mcap --at-frame 125 --model yolo11n.onnx --box 320,180    what is at that pixel
   bevviz why drive.mcap --at 12.5 --point 8.2,-1.5,-0.8 --serve         what is there, shown in a browser"""
-
-_metres = parse_real(lambda metres: 0 < metres < 1000, "is no length in metres")
 
 
 def add(commands: Commands) -> None:
@@ -49,59 +49,22 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(why)
     add_at(group, "the scan nearest to this time", required=True)
-    targets = why.add_argument_group("what to explain", "Nothing: what did not end as an object of its own.")
-    target = targets.add_mutually_exclusive_group()
-    target.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
-    target.add_argument(
-        "--box", type=_numbers(2, 4), default=(), metavar="U,V[,U1,V1]", help="at that pixel, or in that box"
-    )
-    target.add_argument(
-        "--point",
-        type=_numbers(3),
-        default=(),
-        metavar="X,Y,Z",
-        help="there, in metres of the points' frame",
-    )
-    target.add_argument(
-        "--cell",
-        type=_numbers(2),
-        default=(),
-        metavar="ROW,COLUMN",
-        help="what is in that cell of the bird's-eye view",
-    )
-    target.add_argument("--cluster", type=number, metavar="N", help="the cluster of that number")
-    target.add_argument("--object", type=number, metavar="N", help="the object in that row")
-    target.add_argument("--detection", type=number, metavar="N", help="the detection in that row")
-    targets.add_argument(
-        "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
-    )
-    targets.add_argument(
-        "--camera", default="", metavar="NAME", help="of pixel or detection, if there are several"
-    )
+    targets = add_subject(why, "Nothing: what did not end as an object of its own.")
     targets.add_argument(
         "--limit", type=positive, default=5, metavar="N", help="the N worst with their chain (default: 5)"
     )
     targets.add_argument(
         "--all", action="store_true", help="also what went well, and what nothing could be done about"
     )
+    targets.add_argument(
+        "--robot",
+        action="store_true",
+        help="which of the robot's own nodes lost, renamed, delayed or moved it (alone, --class or --point)",
+    )
     add_json(why)
     add_config(why)
     add_output(why, blueprint="explain").description = "None, unless one is given."
     why.set_defaults(run=_why)
-
-
-def _numbers(*counts: int) -> Callable[[str], tuple[float, ...]]:
-    def parse(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            values = ()
-        if len(values) not in counts or not all(abs(v) < 1e6 for v in values):
-            wanted = " or ".join(map(str, counts))
-            raise argparse.ArgumentTypeError(f"'{text}' is not {wanted} numbers with commas between")
-        return values
-
-    return parse
 
 
 @garbage_collection_off()
@@ -113,7 +76,7 @@ def _why(options: argparse.Namespace) -> int:
     from bevviz.why import FrameExplainer
     from bevviz.why.answer_text import plain_text
 
-    config, selection = load_config(options), _selection(options)
+    config, selection = load_config(options), selected_subject(options)
     with BagSource(options.paths, config, at=options.at) as source:
         loader = StageLoader()
         session = Session(config, loader=loader)
@@ -123,36 +86,54 @@ def _why(options: argparse.Namespace) -> int:
         if frame is None:
             option = f"--at {options.at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{option}: the scan there cannot be read")
+        if options.robot:
+            return _follow(options, source, frame, selection)
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.run_explained(frame)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
         answers = questioner.explain(selection, options.limit, bar, everything=options.all)
         neighbours = _neighbours(questioner, selection, answers)
+        unseen = _unseen(questioner, selection, answers)
         headline = _headline(questioner, selection)
         text = printable(f"frame {frame.index}, preset {config.preset}: {headline}")
         if answers:
-            text = f"{text}\n\n{plain_text(answers, options.limit, neighbours)}"
+            text = f"{text}\n\n{plain_text(answers, options.limit, neighbours, unseen)}"
         print_result(options, "why", _tree(result, answers, neighbours, headline), lambda: text)
         if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
     return 0
 
 
-def _selection(options: argparse.Namespace) -> Selection:
-    from bevviz.why import Selection
+def _follow(options: argparse.Namespace, source: BagSource, frame: Frame, selection: Selection) -> int:
+    """Say which steps of the robot's own chain lost or changed objects."""
+    from bevviz.support.text import printable
+    from bevviz.why.robot_messages import RobotQuestions
 
-    return Selection(
-        label=options.label,
-        box=options.box,
-        point=options.point,
-        radius=options.radius,
-        cell=tuple(map(int, options.cell)),
-        cluster=options.cluster,
-        detection=options.detection,
-        object=options.object,
-        camera=options.camera,
-    )
+    if selection.one and not selection.point:
+        raise UserError("--robot: give the object with --point, or all of a class with --class")
+    questions = RobotQuestions(source, frame)
+    followed = [questions.at(selection.point)] if selection.point else questions.objects()
+    if selection.label:
+        followed = [one for one in followed if one.label.lower() == selection.label.lower()]
+    changed = [one for one in followed if one.change is not None]
+    shown = followed if selection.point or options.all else changed
+    head = f"frame {frame.index}: {len(changed)} of the robot's {len(followed)} objects lost or changed"
+    lines = [head, "", *questions.lines()]
+    for number, one in enumerate(shown):
+        steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < options.limit else []
+        lines += ["", one.text, *steps] if steps else [one.text]
+    tree: WhyForm = {
+        "frame": frame.index,
+        "stamp": frame.stamp,
+        "preset": source.config.preset,
+        "summary": head,
+        "answers": [],
+        "beside": [],
+        "robot": {"chain": list(questions.lines()), "objects": [one.as_form() for one in shown]},
+    }
+    print_result(options, "why", tree, lambda: "\n".join(map(printable, lines)))
+    return 0
 
 
 def _neighbours(questioner: FrameExplainer, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
@@ -161,6 +142,28 @@ def _neighbours(questioner: FrameExplainer, selection: Selection, answers: Seque
         return []
     answered = {answer.subject.key for answer in answers}
     return [answer for answer in questioner.candidates(selection) if answer.subject.key not in answered]
+
+
+def _unseen(questioner: FrameExplainer, selection: Selection, answers: Sequence[Answer]) -> list[Answer]:
+    """Return the objects of a class that no sensor sees and that ``answers`` leave out, the nearest first.
+
+    Raises:
+        UserError: the detector does not know the class, and nothing in the frame is labelled so.
+    """
+    if not selection.label:
+        return []
+    known = questioner.traces.classes
+    answered = {answer.subject.key for answer in answers}
+    unseen = [
+        answer
+        for answer in questioner.ask(selection)
+        if answer.subject.kind == "truth" and answer.folded and answer.subject.key not in answered
+    ]
+    truth, wanted = questioner.traces.result.frame.truth, selection.label.lower()
+    names = {*known, *(answer.subject.label for answer in answers), *(truth.labels if truth else ())}
+    if known and wanted not in map(str.lower, names):
+        raise UserError(f"--class {selection.label}: the model has no such class; it has {', '.join(known)}")
+    return sorted(unseen, key=lambda answer: answer.distance)
 
 
 def _headline(questioner: FrameExplainer, selection: Selection) -> str:
@@ -184,11 +187,15 @@ def _headline(questioner: FrameExplainer, selection: Selection) -> str:
 
 def _tree(
     result: FrameResult, answers: Sequence[Answer], neighbours: Sequence[Answer], headline: str
-) -> dict[str, Any]:
-    frame = result.frame
-    head = {"frame": frame.index, "stamp": frame.stamp, "preset": result.config.preset, "summary": headline}
-    verdicts = [{"name": a.subject.name, "verdict": a.verdict.text} for a in neighbours]
-    return {**head, "answers": [a.as_dict() for a in answers], "beside": verdicts}
+) -> WhyForm:
+    return {
+        "frame": result.frame.index,
+        "stamp": result.frame.stamp,
+        "preset": result.config.preset,
+        "summary": headline,
+        "answers": [a.as_dict() for a in answers],
+        "beside": [{"name": a.subject.name, "verdict": a.verdict.text} for a in neighbours],
+    }
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:

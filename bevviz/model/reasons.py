@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,6 +83,7 @@ PARAMETERS = {  # the parameter that decides
 }
 
 
+@lru_cache(typed=True)  # members of two enumerations are equal numbers
 def kind_of(state: IntEnum) -> ReasonKind:
     """Return the kind that a state of a detection, a cluster or a pair has as a reason."""
     return ReasonKind(state.name.lower().replace("_", " "))

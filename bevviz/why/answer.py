@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from bevviz.evaluate import MIN_HITS, RANGE
 from bevviz.model.frame import U8
+from bevviz.model.json_forms import AnswerForm, HintForm, StepForm
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.collect import collect_evidence
-from bevviz.why.confidence import LIMIT, confidence_of, likely
+from bevviz.why.confidence import LIMIT, Outcome
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
@@ -46,7 +47,7 @@ class Answer:
         tried: changes that were run and did not help.
         remark: one sentence about the search for hints: the best one, or what was tried, or why nothing could
             be. Empty: none was searched, or there is nothing to mend.
-        confidence: probability that the reason is right, where ground truth does not tell; None: unknown.
+        outcomes: possible outcomes, the most probable first. Empty: ground truth tells, or they are unknown.
     """
 
     subject: Subject
@@ -59,13 +60,22 @@ class Answer:
     evidence: Evidence = field(repr=False)
     tried: tuple[TriedChange, ...] = ()
     remark: str = ""
-    confidence: float | None = None
+    outcomes: tuple[Outcome, ...] = ()
+
+    @property
+    def confidence(self) -> float | None:
+        """Probability that the verdict is right, where ground truth does not tell; None: unknown."""
+        if not self.outcomes:
+            return None
+        verdict = self.verdict.kind, self.verdict.reported
+        return next((outcome.probability for outcome in self.outcomes if outcome[:2] == verdict), 0.0)
 
     @property
     def likely(self) -> tuple[ReasonKind, ...]:
         """The two most likely reasons where it cannot tell the reason; else empty."""
-        unsure = self.confidence is not None and self.confidence < LIMIT
-        return likely(self.verdict.kind) if unsure else ()
+        if self.confidence is None or self.confidence >= LIMIT:
+            return ()
+        return tuple(dict.fromkeys(outcome.kind for outcome in self.outcomes))[:2]
 
     @property
     def text(self) -> str:
@@ -145,7 +155,7 @@ class Answer:
             return Selection(point=(x, y, z), radius=max(0.5, float(subject.box.size[0].min()) / 2))
         return None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> AnswerForm:
         """Return the answer for JSON, without the points."""
         subject, verdict = self.subject, self.verdict
         return {
@@ -168,14 +178,17 @@ class Answer:
             "folded": self.folded,
             "false": self.false,
             "empty": self.empty,
-            "chain": [{"stage": step.stage, "text": step.text, **step.numbers} for step in self.steps],
+            "chain": [
+                cast("StepForm", {"stage": step.stage, "text": step.text, **step.numbers})
+                for step in self.steps
+            ],
             "hints": [_hint_dict(hint) for hint in self.hints],
             "remark": self.remark,
             "tried": [{"settings": list(change.settings), "text": change.text} for change in self.tried],
         }
 
 
-def _hint_dict(hint: Hint) -> Mapping[str, Any]:
+def _hint_dict(hint: Hint) -> HintForm:
     """Return a hint for JSON."""
     effects = hint.effects
     return {
@@ -307,16 +320,15 @@ class FrameExplainer:
 
     def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""
-        if subject.key in self._answers:
+        if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
         evidence = collect_evidence(subject, self.traces)
-        reason, reported = find_reason(subject, evidence, self.traces)
+        reason, reported, outcomes = find_reason(subject, evidence, self.traces)
         verdict = make_verdict(subject, reason, reported)
         steps = tuple(steps_of(subject, evidence, self.traces))
-        confidence = confidence_of(subject, evidence, reason.kind, self.traces)
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
-        answer = replace(answer, confidence=confidence)
-        if not subject.is_place:  # The number of possible places has no limit.
+        answer = replace(answer, outcomes=outcomes)
+        if subject.asked is None and not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer
 

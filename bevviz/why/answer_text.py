@@ -14,9 +14,20 @@ from bevviz.why.verdict import HOPELESS
 LISTED = 5  # other subjects at the place, at most
 
 
-def plain_text(answers: Sequence[Answer], chains: int, beside: Sequence[Answer] = ()) -> str:
-    """Return the verdicts with steps for the first ``chains``, then the other subjects there."""
-    return "\n".join(map(printable, [*_plain(answers, chains), *_listed(beside)])).rstrip("\n")
+def plain_text(
+    answers: Sequence[Answer], chains: int, beside: Sequence[Answer] = (), unseen: Sequence[Answer] = ()
+) -> str:
+    """Return the verdicts with steps for the first ``chains``, then the other subjects there.
+
+    Args:
+        answers: the answers.
+        chains: number of answers with steps.
+        beside: answers about other subjects at the place.
+        unseen: answers about subjects that no sensor sees.
+    """
+    lines = [*_plain(answers, chains), *_listed("also there:", beside)]
+    lines += _listed("out of the sensors' sight (--all explains them):", unseen)
+    return "\n".join(map(printable, lines)).rstrip("\n")
 
 
 def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
@@ -32,10 +43,10 @@ def _plain(answers: Sequence[Answer], chains: int) -> Iterator[str]:
         yield from (f"- {answer.text}" for answer in answers[chains:])
 
 
-def _listed(others: Sequence[Answer]) -> Iterator[str]:
-    """Yield the lines of the other subjects at the place."""
+def _listed(heading: str, others: Sequence[Answer]) -> Iterator[str]:
+    """Yield a heading and the verdicts of the first other subjects. Nothing without any."""
     if others:
-        yield "also there:"
+        yield heading
         yield from (f"- {answer.text}" for answer in others[:LISTED])
     if len(others) > LISTED:
         yield f"- and {len(others) - LISTED} more"

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz.model import geometry
+from bevviz.model.frame import F32, Camera
 from bevviz.model.results import CameraResult, FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.boxes import confirmed_rows
+from bevviz.recording.images import camera_pose
 from bevviz.recording.labels import box_row
 from bevviz.recording.opinions import MISSED, opinion_outlines_in_bev, opinion_outlines_in_image
 from bevviz.recording.primitives import CORNER
@@ -29,7 +31,7 @@ def select_click(
         tracks: tracks of the whole run in that frame.
         path: entity that was clicked.
         instance: row of the clicked box or point; None: the whole entity.
-        position: 2 pixels in a view of an image, or 3 metres of the fixed frame in a 3D view.
+        position: 2 pixels in a view of an image, or 3 metres of ``Frame.points_frame``, which 3D views show.
     """
     row, path = -1 if instance is None else instance, entities.boxes_of(path)
     if hit := _object_with_opinion(result, path, row):
@@ -37,9 +39,18 @@ def select_click(
     for camera in result.cameras:
         if hit := _in_image(camera, path, row, position):
             return hit
+        if path == entities.sensor(camera.camera.name):
+            return None  # A line of its frustum is nowhere in the scene.
+    if tracks is not None and row >= 0 and (hit := _drawn_track(result, tracks, path, row)):
+        return hit
     if path == entities.BEV or path.startswith(f"{entities.BEV}/"):
         return _cell(result, position) if len(position) >= 2 else None
-    return _in_space(result, tracks, path, row) or _box_at(result, position) or _place_at(result, position)
+    if hit := _in_space(result, path, row):
+        return hit
+    if len(position) != 3:
+        return None
+    place = np.array(position, np.float32)
+    return _box_at(result, place) or _point(place)
 
 
 def _object_with_opinion(result: FrameResult, path: str, row: int) -> Selection | None:
@@ -80,9 +91,21 @@ def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[floa
     inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
         (f"{entities.image(name)}/", entities.why(f"{name}/"))
     )
-    if not inside or len(position) < 2:
+    if inside and len(position) == 3:  # The image also stands in front of its camera in 3D views.
+        position = _pixel(camera.camera, position)
+    if not inside or len(position) != 2:
         return None
     return Selection(box=(position[0] - CORNER, position[1] - CORNER), camera=name)
+
+
+def _pixel(camera: Camera, position: Sequence[float]) -> Sequence[float]:
+    """Return the pixel of a camera at a place in Frame.points_frame; empty: it is outside the image."""
+    if camera.camera_from_points is None or camera.intrinsics is None:
+        return ()
+    points = geometry.apply(camera.camera_from_points, np.array([position]))
+    pixel = geometry.project(points, camera.intrinsics)[0][0] + CORNER
+    inside = (pixel >= 0).all() and (pixel <= (camera.intrinsics.width, camera.intrinsics.height)).all()
+    return tuple(map(float, pixel)) if inside else ()
 
 
 def _cell(result: FrameResult, position: Sequence[float]) -> Selection | None:
@@ -94,8 +117,8 @@ def _cell(result: FrameResult, position: Sequence[float]) -> Selection | None:
     return Selection(cell=(row, column)) if 0 <= row < height and 0 <= column < width else None
 
 
-def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -> Selection | None:
-    """Return the object, cluster, track or point that was clicked in a 3D view."""
+def _in_space(result: FrameResult, path: str, row: int) -> Selection | None:
+    """Return the object, cluster or point that was clicked in a 3D view."""
     frame = result.frame
     if row < 0:
         return None
@@ -110,17 +133,42 @@ def _in_space(result: FrameResult, tracks: Tracks | None, path: str, row: int) -
         return Selection(object=int(drawn[row])) if row < len(drawn) else None
     if path == entities.FUSION:
         return _fused_detection(result, row)
+    if path == entities.FRUSTUMS:
+        return _frustum(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
         return Selection(truth=row)
-    if path in (entities.TRACKS, entities.UNSEEN) and tracks is not None:
-        rows = confirmed_rows(tracks)
-        named = tracks.object[rows] >= 0
-        listed = rows[named] if path == entities.TRACKS else rows[~named]
-        return _track(result, tracks, int(listed[row])) if row < len(listed) else None
     if path == entities.set_aside(frame.lidar) and result.clusters is not None:
         aside = np.flatnonzero(~result.clusters.kept)
         return Selection(cluster=int(aside[row])) if row < len(aside) else None
     return None
+
+
+def _frustum(result: FrameResult, row: int) -> Selection | None:
+    """Return the detection of a frustum. Those of all cameras are drawn in one entity."""
+    for camera in result.cameras:
+        detections = camera.detections
+        has_pose = camera_pose(result.frame, camera) is not None and camera.camera.intrinsics is not None
+        if detections is None or camera.fusion is None or not has_pose:
+            continue
+        kept = np.flatnonzero(detections.kept)
+        if row < len(kept):
+            return Selection(detection=int(kept[row]), camera=camera.camera.name)
+        row -= len(kept)
+    return None
+
+
+def _drawn_track(result: FrameResult, tracks: Tracks, path: str, row: int) -> Selection | None:
+    """Return the track that a box, a trail or an outline in the bird's-eye view shows."""
+    rows = confirmed_rows(tracks)
+    named = tracks.object[rows] >= 0
+    listed = {
+        entities.TRACKS: rows[named],
+        entities.UNSEEN: rows[~named],
+        entities.TRAILS: rows,
+        entities.overlay("trails"): rows,
+        entities.overlay("tracks"): rows,
+    }.get(path, rows[:0])
+    return _track(result, tracks, int(listed[row])) if row < len(listed) else None
 
 
 def _track(result: FrameResult, tracks: Tracks, row: int) -> Selection | None:
@@ -128,31 +176,23 @@ def _track(result: FrameResult, tracks: Tracks, row: int) -> Selection | None:
     if tracks.cluster[row] >= 0:
         return Selection(cluster=int(tracks.cluster[row]))
     center = tracks.boxes.center[row]
-    return _place_at(result, center.tolist()) if tracks.absolute else _point(center)
+    return _point(
+        geometry.apply(geometry.inverse(result.frame.pose), center[None])[0] if tracks.absolute else center
+    )
 
 
-def _box_at(result: FrameResult, position: Sequence[float]) -> Selection | None:
-    """Return the object, or else the cluster, whose box holds a position in the fixed frame."""
-    place = _place_at(result, position)
-    if place is None:
-        return None
-    point, objects, clusters = np.array([place.point], np.float32), result.objects, result.clusters
+def _box_at(result: FrameResult, place: F32) -> Selection | None:
+    """Return the object, or else the cluster, whose box holds a place in Frame.points_frame."""
+    objects, clusters = result.objects, result.clusters
     for kind, boxes in (
         ("object", None if objects is None else objects.boxes),
         ("object", None if objects is None else objects.measured),
         ("cluster", None if clusters is None else clusters.boxes(result.config.clustering)),
     ):
         for row in range(0 if boxes is None else len(boxes)):
-            if boxes is not None and points_in_box(single_box(boxes, row), point, NEAR_BOX).any():
+            if boxes is not None and points_in_box(single_box(boxes, row), place[None], NEAR_BOX).any():
                 return Selection.of(kind, row)
     return None
-
-
-def _place_at(result: FrameResult, position: Sequence[float]) -> Selection | None:
-    """Return the place at a position in the fixed frame."""
-    if len(position) != 3:
-        return None
-    return _point(geometry.apply(geometry.inverse(result.frame.pose), np.array([position]))[0])
 
 
 def _point(xyz: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Selection:

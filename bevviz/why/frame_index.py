@@ -11,14 +11,14 @@ import numpy as np
 
 from bevviz.evaluate import Matches, Truth, judge, truth_of
 from bevviz.model import geometry
+from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
-from bevviz.stages.clustering import dbscan
 from bevviz.stages.visibility import share_in_image
 from bevviz.why.fits import Fits, find_fits
-from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_box, single_box
+from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_boxes, single_box
 
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
@@ -73,7 +73,7 @@ class FrameIndex:
         other = FrameIndex(result, self.classes)
         other._places, other._uv, other._truth_boxes = self._places, self._uv, self._truth_boxes
         other.truth, other.shown, other.labels_in_evaluate = self.truth, self.shown, self.labels_in_evaluate
-        other.directions, other._by_x = self.directions, self._by_x
+        other.directions = self.directions
         return other
 
     def origin(self, section: str) -> StageOwner:
@@ -114,17 +114,13 @@ class FrameIndex:
         of_voxel[~ground.mask] = clusters.labels
         return of_voxel[voxels.inverse]
 
-    @cached_property
+    @property
     def first_labels(self) -> I32:
         """(M,) label that the clustering itself gave each obstacle, before detections divided clusters."""
         result = self.result
-        if result.clusters is None or result.obstacles is None:
+        if result.clusters is None or result.obstacles is None or result.first_labels is None:
             return np.zeros(0, np.int32)
-        is_divided = result.splits is not None and len(result.splits) > 0
-        if not is_divided or not self.origin("clustering").ours:
-            return result.clusters.labels
-        config = result.config.clustering
-        return dbscan(result.obstacles, config.eps, config.min_points)
+        return result.first_labels if self.origin("clustering").ours else result.clusters.labels
 
     @cached_property
     def fate(self) -> U8:
@@ -142,13 +138,6 @@ class FrameIndex:
             fate = of_cluster[self.cluster]
         fate[result.ground.mask[result.voxels.inverse]] = Fate.GROUND
         return fate
-
-    @cached_property
-    def _by_x(self) -> tuple[I64, F32]:
-        """Rows of the raw points sorted by x, and the sorted x."""
-        x = self.result.frame.points[:, 0]
-        order = np.argsort(x)
-        return order, x[order]
 
     def uv(self, camera: CameraResult) -> F32:
         """Return (N, 2) pixels of the raw points, NaN behind the camera or without its pose."""
@@ -178,20 +167,23 @@ class FrameIndex:
             return subject.points
         points, box = self.result.frame.points, subject.box
         if box is not None:
-            order, x = self._by_x
-            reach = float(np.hypot(*box.size[0, :2])) / 2 + MARGIN
-            first, last = np.searchsorted(x, [box.center[0, 0] - reach, box.center[0, 0] + reach])
-            rows = order[first:last]
+            rows = self._near_truth[subject.row] if subject.kind == "truth" else _near(points, box)[0]
             if subject.kind == "point":
                 away = np.linalg.norm(points[rows] - box.center[0], axis=1)
-                return np.sort(rows[away < box.size[0, 0] / 2])
+                return np.asarray(rows[away < box.size[0, 0] / 2])
             foot = -MARGIN if subject.kind == "cell" else FOOT
-            return np.sort(rows[points_in_box(box, points[rows], MARGIN, foot)])
+            return rows[points_in_box(box, points[rows], MARGIN, foot)]
         camera = self.camera(subject.camera)
         if camera is None or subject.xyxy is None:
             return np.zeros(0, np.int64)
         rows = self._in_frustum(camera, subject.xyxy)
         return self._foreground(camera, subject.xyxy, rows) if subject.kind == "detection" else rows
+
+    @cached_property
+    def _near_truth(self) -> Sequence[I64]:
+        """Rows of the raw points near each object of the ground truth."""
+        boxes = Boxes3D.joined([subject.box for subject in self.truth if subject.box is not None])
+        return _near(self.result.frame.points, boxes)
 
     def _in_frustum(self, camera: CameraResult, xyxy: F32) -> I64:
         """Return the rows of the raw points that project into an image box."""
@@ -316,9 +308,13 @@ class FrameIndex:
             column = [c.camera.name for c in self.result.cameras].index(name)
             whole = np.full((len(self.truth), 4), np.nan, np.float32)
             seen = whole.copy()
-            for row in np.flatnonzero(self.shown[:, column] > 0).tolist():
-                box = self.truth[row].box
-                around = projected_box(box, camera.camera) if box is not None else None
+            rows = [
+                row
+                for row in np.flatnonzero(self.shown[:, column] > 0).tolist()
+                if self.truth[row].box is not None
+            ]
+            boxes = [box for row in rows if (box := self.truth[row].box) is not None]
+            for row, around in zip(rows, projected_boxes(boxes, camera.camera), strict=True):
                 if around is None:
                     continue
                 whole[row] = around
@@ -345,6 +341,16 @@ class FrameIndex:
                     detection_subject(self.result, camera, row) for row in np.flatnonzero(kept).tolist()
                 ]
         return tuple(subjects)
+
+
+def _near(points: F32, boxes: Boxes3D) -> Sequence[I64]:
+    """Return the ascending rows of the points that may be in each box or in the margin around it."""
+    half = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2
+    reach = np.column_stack([half + np.float32(MARGIN), half + np.float32(2 * MARGIN)])
+    center = boxes.center[:, :2]
+    low, high = (center - reach).astype(np.float64), (center + reach).astype(np.float64)
+    first, rows = rows_in_rectangles(points, low, high)
+    return np.split(rows, first[1:-1])
 
 
 def truth_subjects(truth: Truth, classes: Sequence[str] = ()) -> tuple[Subject, ...]:

@@ -118,13 +118,15 @@ class HintFinder:
 
         If each helpful change makes another object worse, return those that fix more objects than they break,
         the best first. The others count as tried in vain. If none helps, combine the changes that bring the
-        subject to a later stage with the changes for the reason there.
+        subject to a later stage with the changes for the reason there. If these do not help either, a missed
+        object that is found with a fault is better than none.
         """
         is_false = reason.kind in FALSE and subject.kind == "object"
         hints: list[Hint] = []
         start = _ReachedStage(reported, reason.kind)
         reached: dict[_ReachedStage, _Step] = {}  # by the mildest change
         tried: list[TriedChange] = []
+        faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
 
         def ways() -> Iterator[Change]:
             """Yield the changes to try."""
@@ -143,7 +145,7 @@ class HintFinder:
                     break
                 continue
             then = collect_evidence(subject, after)
-            new, now_reported = find_reason(subject, then, after)
+            new, now_reported, _ = find_reason(subject, then, after)
             old_kind, new_kind = (reason.kind, reported), (new.kind, now_reported)
             text, object_row = _new_outcome(subject, old_kind, new_kind, then, after)
             if text and _is_sure(subject, change, then):
@@ -154,8 +156,17 @@ class HintFinder:
                 continue
             result = _result_text(subject, reason, new, now_reported, then)
             tried.append(TriedChange(_settings(change), result))
+            if now_reported and not reported and subject.kind == "truth" and then.named is not None:
+                faulty[tried[-1]] = self._hint(change, result, after, subject.row, then.named.row)
             if not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
                 reached.setdefault(stage, _Step(change, new, then, after))
+        if not any(hint.balance > 0 for hint in hints):
+            hints += [hint for hint in faulty.values() if hint.balance > 0][:1]
+            tried = [
+                replace(change, text=f"{change.text}, and it breaks as much") if change in faulty else change
+                for change in tried
+                if faulty.get(change) not in hints
+            ]
         best = sorted(hints, key=lambda hint: -hint.balance)
         tried += [TriedChange(hint.settings, hint.objection) for hint in best if hint.balance <= 0]
         return HintSearch(tuple(hint for hint in best if hint.balance > 0)[:OFFERED], tuple(tried))
@@ -281,7 +292,7 @@ def _result_text(subject: Subject, before: Reason, after: Reason, reported: bool
     if reported and after.kind is ReasonKind.REPORTED and subject.kind == "truth" and named is not None:
         return "it is reported by a detection that may not be its own"
     if reported:
-        return f"it is reported, but '{after.kind.value}'"
+        return f"it is reported then, but '{after.kind.value}'"
     stays = "stays" if after.kind is before.kind else "is lost as"
     return f"it {stays} '{after.kind.value}'"
 

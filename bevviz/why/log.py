@@ -37,7 +37,7 @@ NAMES = {
     Fate.IN_FRONT: "in front of it",
 }
 _SUBJECT = StateColor.SUBJECT.value
-_LINE = 0.35  # metres between the lines of the legend
+_LINE = 0.65  # metres between the lines of the legend
 _DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 
 
@@ -64,7 +64,7 @@ def log_answers(
         above: configuration of the bird's-eye view, to draw there as well.
     """
     recording.log(entities.WHY, document(markdown_page(answers, shown)))
-    pose = transform(frame.pose)
+    place_frame = _frame_of_points(frame)
     drawn = answers[:shown]
     if drawn:
         _log_legend(recording, frame, drawn[0])
@@ -76,18 +76,34 @@ def log_answers(
         colors = np.zeros((len(Fate), 3), np.uint8)
         colors[list(COLORS)] = list(COLORS.values())
         points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
-        recording.log(entities.why("points"), pose, points)
-    strips = [
-        edges(geometry.corners(answer.subject.box)[0]) for answer in drawn if answer.subject.box is not None
-    ]
-    strips += [strip for camera in frame.cameras for strip in _frustums(camera, drawn)]
+        _log(recording, "points", place_frame, points)
+    strips, widths = list[F32](), list[float]()
+    for answer in drawn:
+        box = answer.subject.box
+        lines = [] if box is None else [edges(geometry.corners(box)[0])]
+        lines += [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
+        strips += lines
+        widths += [2.0 if answer is drawn[0] else 0.5] * len(lines)
     if strips:
-        place = rr.LineStrips3D(strips, colors=[_SUBJECT], radii=rr.Radius.ui_points(2.0))
-        recording.log(entities.why("place"), pose, place)
+        place = rr.LineStrips3D(strips, colors=[_SUBJECT], radii=rr.Radius.ui_points(widths))
+        _log(recording, "place", place_frame, place)
     for camera in frame.cameras:
         _log_image(recording, camera, drawn)
     if above is not None:
         _log_above(recording, frame, drawn, above, fate)
+
+
+def _frame_of_points(frame: Frame) -> rr.AsComponents:
+    """Return the coordinate frame of the points: that of the sensor, or a pose where there is none."""
+    if not frame.lidar:
+        return transform(frame.pose)
+    return rr.CoordinateFrame(entities.space(entities.sensor(frame.lidar)))
+
+
+def _log(recording: rr.RecordingStream, name: str, place: rr.AsComponents, data: rr.AsComponents) -> None:
+    """Log data in a coordinate frame. Rerun drops a frame that is logged at the time of a recursive clear."""
+    recording.log(entities.why(name), place, static=isinstance(place, rr.CoordinateFrame))
+    recording.log(entities.why(name), data)
 
 
 def focus_point(frame: Frame, answer: Answer) -> F32 | None:
@@ -112,7 +128,7 @@ def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> 
     places = np.tile(place, (len(lines), 1))
     places[:, 2] = top + _LINE * (1 + np.arange(len(lines)))
     legend = rr.Points3D(places, labels=lines, colors=colors, radii=rr.Radius.ui_points(0), show_labels=True)
-    recording.log(entities.why("legend"), transform(frame.pose), legend)
+    _log(recording, "legend", _frame_of_points(frame), legend)
 
 
 def _log_above(
@@ -176,8 +192,5 @@ def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[
             boxes.append(box)
             names.append("" if number else subject.name)
     if boxes:
-        recording.log(
-            entities.why(f"{camera.name}/place"),
-            image_frame(camera.name),
-            boxes2d(np.array(boxes), names, colors=[_SUBJECT], draw_order=40.0),
-        )
+        image_boxes = boxes2d(np.array(boxes), names, colors=[_SUBJECT], draw_order=40.0)
+        _log(recording, f"{camera.name}/place", image_frame(camera.name), image_boxes)

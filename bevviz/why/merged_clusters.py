@@ -100,8 +100,8 @@ def separation(
     if not mates:
         gap = least_distance(points[mine], points[nearest])
     first = traces.first_labels[members]
-    joined_by = None
-    if _most_frequent(first[mine]) != _most_frequent(first[nearest]):
+    joined_by, label = None, _most_frequent(first[mine])
+    if label < 0 or label != _most_frequent(first[nearest]):  # The clustering itself left noise alone.
         joined_by = _joining_detection(traces, main)
     ours = traces.origin("clustering").ours and joined_by is None
     return gap, _separating_eps(points, mine, nearest, traces) if ours else 0.0, joined_by

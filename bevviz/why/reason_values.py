@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.model.decisions import detection_reason, mask_evidence, pair_reason
 from bevviz.model.reasons import Limit, Reason, ReasonKind, Scored, StageOwner, limit, limit_of, scored
-from bevviz.model.results import CameraResult, FrameResult
+from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.why.belonging import find_fused, opinion_on
 from bevviz.why.evidence import Evidence, camera_and_fusion
 from bevviz.why.frame_index import Fate, FrameIndex
@@ -276,6 +276,9 @@ class ReasonValues:
         best, values = self.evidence.best, self._pair()
         assert best is not None
         camera, fusion = camera_and_fusion(self.result, best.camera)
+        free = fusion is not None and fusion.cluster_decision[values["cluster"]] != Decision.MATCHED
+        if free and best.cluster >= 0:  # Nobody took its own cluster: the detection wanted another one.
+            values = self._pair(best.cluster)
         taker = -1 if fusion is None else int(fusion.cluster_detection[values["cluster"]])
         if camera.detections is None or taker in (-1, best.row):
             return {**values, "taker": None}

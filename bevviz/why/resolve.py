@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -174,7 +175,9 @@ def _pixel(traces: FrameIndex, selection: Selection) -> Subject:
     camera = camera_of(traces, selection.camera)
     image_box = _selected_box(camera, selection)
     u, v = (image_box[:2] + image_box[2:]) / 2
-    return Subject("pixel", f"what is at pixel {u:g}, {v:g}", camera=camera.camera.name, xyxy=image_box)
+    asked = image_box if len(selection.box) == len(image_box) else None
+    name = f"what is at pixel {u:g}, {v:g}"
+    return Subject("pixel", name, camera=camera.camera.name, xyxy=image_box, asked=asked)
 
 
 def _selected_box(camera: CameraResult, selection: Selection) -> F32:
@@ -337,6 +340,8 @@ def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subjec
         yield from _nearest_first(traces, camera, [subject for subject, _ in things], image_box)
         return
     best = max((fit for _, fit in things), default=0.0)
+    if traces.result.frame.truth is None:  # With labels nothing depends on the selected box.
+        things = [(replace(subject, asked=image_box), fit) for subject, fit in things]
     yield from ((subject, fit >= AS_GOOD * best) for subject, fit in things)
 
 

@@ -206,6 +206,10 @@ def _not_detected(reason: Reason, subject: Subject) -> str:
             f"the detector has no box for it alone: {fit}, but is the box of {reason['shared_owner']}{wrong}"
         )
     least = reason.limit.number
+    if subject.kind == "detection":
+        return "it is probably that of something else: the detector has no candidate for the object there"
+    if best is not None and not subject.label:
+        return f"the detector has no candidate for it: {best} there is probably that of something else"
     return f"the detector has no candidate {class_}there, not even with a score of {least}{wrong}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,6 +35,7 @@ class Subject:
         xyxy: (4,) image box of a detection or pixel.
         box: 3D box in Frame.points_frame; for a point, the cube around the sphere.
         points: rows of Frame.points of a subject such as a cluster; None: the box or frustum selects them.
+        asked: (4,) image box that the question drew around it; None: it was selected otherwise.
     """
 
     kind: Kind
@@ -45,6 +47,7 @@ class Subject:
     xyxy: F32 | None = None
     box: Boxes3D | None = None
     points: I64 | None = None
+    asked: F32 | None = None
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -95,5 +98,16 @@ def points_in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 
 
 def projected_box(box: Boxes3D, camera: Camera) -> F32 | None:
     """Return the (4,) image box of a 3D box, cut at the image's edge; None: it is out of view."""
-    image_box = image_boxes(box, camera)[0]
-    return image_box if np.isfinite(image_box).all() else None
+    return projected_boxes([box], camera)[0]
+
+
+def projected_boxes(boxes: Sequence[Boxes3D], camera: Camera) -> list[F32 | None]:
+    """Return the image box of each single 3D box, see ``projected_box``."""
+    if not boxes:
+        return []
+    center, size, yaw = (
+        np.concatenate([getattr(box, name) for box in boxes]) for name in ("center", "size", "yaw")
+    )
+    projected = image_boxes(Boxes3D(center, size, yaw), camera)
+    is_shown = np.asarray(np.isfinite(projected).all(axis=1), np.bool_).tolist()
+    return [box if shown else None for box, shown in zip(projected, is_shown, strict=True)]

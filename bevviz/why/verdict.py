@@ -16,6 +16,7 @@ from bevviz.model.results import (
     Opinion,
 )
 from bevviz.why.belonging import find_fused
+from bevviz.why.confidence import Outcome, rank_outcomes
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
@@ -63,17 +64,26 @@ class Verdict:
         return self.reason.kind
 
 
-def find_reason(subject: Subject, evidence: Evidence, traces: FrameIndex) -> tuple[Reason, bool]:
+def find_reason(
+    subject: Subject, evidence: Evidence, traces: FrameIndex
+) -> tuple[Reason, bool, tuple[Outcome, ...]]:
     """Find the first stage that lost the subject, or the fault of its reported object.
+
+    Without ground truth, the most probable outcome that the evidence allows is preferred.
 
     Returns:
         reason: that stage or fault, with its values.
         reported: whether it still is an object of a right class.
+        outcomes: the possible outcomes, the most probable first; empty where no probability is known.
     """
     if subject.kind == "object" and (false := false_reasons(traces).get(subject.row)) is not None:
-        return false, True
-    kind, reported = _Decider(subject, evidence, traces).decide()
-    return ReasonValues(subject, evidence, traces).reason(kind), reported
+        return false, True, ()
+    decider = _Decider(subject, evidence, traces)
+    kind, reported = decider.decide()
+    outcomes = rank_outcomes(subject, evidence, (kind, reported), traces)
+    if outcomes and not subject.is_place and decider.allows(outcomes[0]):
+        kind, reported, _ = outcomes[0]
+    return ReasonValues(subject, evidence, traces).reason(kind), reported, outcomes
 
 
 class _Decider:
@@ -147,6 +157,28 @@ class _Decider:
             return ReasonKind.MISNAMED
         flaw = self._flaw(named)
         return flaw if flaw in (ReasonKind.MERGED, ReasonKind.SPLIT) else ReasonKind.MISPLACED
+
+    def allows(self, outcome: Outcome) -> bool:
+        """Return whether the evidence holds the values that the sentence about an outcome states."""
+        evidence, kind = self.evidence, outcome.kind
+        named, best, part = evidence.named, evidence.best, evidence.part(evidence.main)
+        if outcome.reported != (named is not None):
+            return False
+        weak = best is not None and best.state == DetectionState.BELOW_THRESHOLD
+        rest = part is not None and part.count > part.points
+        sizes = {part.state for part in evidence.parts}
+        allowed = {
+            ReasonKind.REPORTED: True,
+            ReasonKind.MERGED: rest,
+            ReasonKind.SPLIT: sum(part.kept for part in evidence.parts) > 1,
+            ReasonKind.GROUND: len(evidence.ground) > 0,
+            ReasonKind.NOISE: evidence.noise > 0,
+            ReasonKind.TOO_SMALL: ClusterState.TOO_SMALL in sizes,
+            ReasonKind.TOO_LARGE: ClusterState.TOO_LARGE in sizes,
+            ReasonKind.NOT_DETECTED: best is None or weak,
+            ReasonKind.BELOW_THRESHOLD: weak,
+        }
+        return allowed.get(kind, False)
 
     # --- our stages ----------------------------------------------------------------------------
 
