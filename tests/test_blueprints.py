@@ -74,7 +74,7 @@ def test_the_eye_follows_the_robot_and_the_explained_object(tmp_path: Path) -> N
     assert debug["SpatialInformation:target_frame"] == ["tf#/world/lidar"]
     _, near = properties(save(blueprints.load("explain", scene), tmp_path / "explain.rbl"))["3D"]
     assert near["EyeControls3D:look_target"] == [[10, 0, -1]]
-    assert near["EyeControls3D:position"] == [[0, 2, 3]]
+    assert near["EyeControls3D:position"] == [[-3, 4, 6]]
 
 
 def test_the_view_from_above_starts_ahead_of_the_robot(tmp_path: Path) -> None:

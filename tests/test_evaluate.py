@@ -240,7 +240,7 @@ def test_the_gate_passes_and_fails_by_its_limits(drive: Path, tmp_path: Path, ca
     ],
 )
 def test_wrong_calls_are_one_line(drive: Path, arguments: list[str], message: str, capsys: Capture) -> None:
-    assert main(["evaluate", str(drive), "--frames", ":1", *arguments]) == 2
+    assert main(["evaluate", str(drive), "--model", "demo", "--frames", ":1", *arguments]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("bevviz: error: ")
     assert message in said
@@ -250,6 +250,16 @@ def test_a_bag_without_truth_is_one_line(tmp_path: Path, capsys: Capture) -> Non
     bag = bags.write(tmp_path / "small", bags.small_items())
     assert main(["evaluate", str(bag)]) == 2
     assert "no .../ground_truth in it; give --truth TOPIC" in capsys.readouterr().err
+
+
+def test_without_a_detector_nothing_is_evaluated(drive: Path, capsys: Capture) -> None:
+    """A table of zeros would look like a result."""
+    assert main(["evaluate", str(drive), "--frames", ":1"]) == 2
+    said = capsys.readouterr()
+    assert "without a detector" in said.err and "--model FILE.onnx" in said.err
+    assert not said.out
+    assert main(["evaluate", str(drive), "--frames", ":1", "--min", "ground_iou=0.9"]) == 0
+    assert "kept: ground_iou >= 0.9" in capsys.readouterr().err
 
 
 # --- KITTI's folders ---------------------------------------------------------------------------
@@ -303,7 +313,7 @@ def test_damaged_kitti_folders_are_one_line(
     made_up: Path, file: str, content: str, message: str, capsys: Capture
 ) -> None:
     (made_up / file).write_text(content)
-    assert main(["evaluate", str(made_up)]) in (0, 2)
+    assert main(["evaluate", str(made_up), "--model", "demo"]) in (0, 2)
     assert message in capsys.readouterr().err
 
 

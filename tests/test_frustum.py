@@ -133,6 +133,18 @@ def test_a_box_too_narrow_for_a_car_gets_all_of_it() -> None:
     assert abs(math.sin(float(claims.boxes.yaw[0]) - 0.1)) < 0.05
 
 
+def test_a_car_leaves_a_cyclist_beside_it_alone() -> None:
+    """Both are one cluster that fits into a car's box, and the car's own box is too narrow."""
+    rear, bike = car(14, -2.5, 0), slab(12.2, -1.5, -0.7, 0.3, 1.5, 1.0)
+    points = np.concatenate([rear, bike])
+    assert len(cluster(points, CLUSTERING)) == 1
+    boxes = [silhouette(rear), silhouette(bike)]
+    boxes[0][0] = boxes[1][2] + 1
+    after, claims, _ = outcome(points, detections_of(boxes, [0.9, 0.7], "car cyclist"))
+    assert (after.labels[len(rear) :] == claims.cluster[1]).all()
+    assert (after.labels[: len(rear)] == claims.cluster[0]).mean() > 0.85
+
+
 def test_a_post_taller_than_the_box_is_no_car() -> None:
     hidden = car(24, 0, math.pi / 2)
     sign = slab(15, 0.3, 0.2, 1.4, 3.0)  # from the ground to 1.7 m above the camera

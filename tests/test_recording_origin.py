@@ -31,7 +31,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     bag, model, rrd = folder / "demo.mcap", folder / "net.onnx", folder / "run.rrd"
     shutil.copyfile(DEMO_MODEL, model)
-    assert main(["demo", "--frames", "3", "--bag", str(bag)]) == 0
+    assert main(["demo", "--frames", "3", "-o", str(bag)]) == 0
     settings = ["--model", str(model), "--set", f"clustering.eps={EPS}"]
     assert main(["bag", str(bag), *settings, "--save", str(rrd)]) == 0
     return folder

@@ -6,7 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,15 +16,14 @@ from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, posit
 from bevviz.evaluate.metrics import base_of, ranges
 from bevviz.evaluate.tracking_score import HINT, TrackScore
 from bevviz.model.frame import Boxes3D, Frame
+from bevviz.model.json_forms import EvaluationForm, WrongFrameForm
 from bevviz.model.protocols import Observer
 from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult, Objects
+from bevviz.model.tables import Columns, Tabular
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support import table
 from bevviz.support.text import printable
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 UNUSABLE = 10  # number of unusable labels in the JSON
 WORST = 10  # number of frames in the table
@@ -49,7 +48,7 @@ class JudgedFrame:
     false: tuple[tuple[str, str, str], ...]  # name, text, cause; a name that no label accepts is not judged
 
 
-class Evaluation(Observer[FrameResult]):
+class Evaluation(Observer[FrameResult], Tabular):
     """Observer that compares every frame of a run with the ground truth.
 
     Args:
@@ -203,13 +202,13 @@ class Evaluation(Observer[FrameResult]):
         return self._frame(self.judged[-1])
 
     @property
-    def worst(self) -> list[dict[str, Any]]:
+    def worst(self) -> list[WrongFrameForm]:
         """Frames with missed or false objects, those with most of them first."""
         frames = [self._frame(frame) for frame in self.judged]
         wrong = [frame for frame in frames if frame["missed"] or frame["false"]]
         return sorted(wrong, key=lambda f: (-len(f["missed"]) - len(f["false"]), f["frame"]))
 
-    def _frame(self, frame: JudgedFrame) -> dict[str, Any]:
+    def _frame(self, frame: JudgedFrame) -> WrongFrameForm:
         return {
             "frame": frame.index,
             "stamp": frame.stamp,
@@ -241,7 +240,7 @@ class Evaluation(Observer[FrameResult]):
         """Return the evaluation for the terminal."""
         return "\n".join(map(printable, _lines(self, table.lines)))
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> EvaluationForm:
         """Return every metric, and the frames with errors, worst first, for JSON."""
         return {
             "frames": len(self.judged),
@@ -253,16 +252,14 @@ class Evaluation(Observer[FrameResult]):
             "worst": self.worst,
         }
 
-    def to_pandas(self) -> DataFrame:
+    def _columns(self) -> Columns:
         """Return a row for each metric: name, class, range and value."""
-        from bevviz.model.frame import data_frame
-
         rows = []
         for name, value in self.metrics.items():
             base = base_of(name) or name
             cls, _, range_name = name.removeprefix(base).removeprefix(".").partition("@")
             rows.append({"metric": base, "class": cls, "range": range_name, "value": value})
-        return data_frame(rows)
+        return rows
 
 
 def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:

@@ -88,7 +88,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         ),
     )
     distances = objects.boxes.distance
-    is_named = choose_named_in_3d(objects.boxes.center, is_unusual)
+    is_named = choose_named_in_3d(objects.boxes.center, is_unusual) & is_unusual
     log_box_labels(
         to,
         entities.FUSED,
@@ -106,7 +106,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             measured = boxes3d(
                 objects.measured, rows, [labels[row] for row in rows], colors=[colors[row] for row in rows]
             )
-            to.put(entities.MEASURED, transform(result.frame.pose), measured)
+            to.put(entities.MEASURED, measured)  # The entity above has the pose.
 
 
 def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:

@@ -22,6 +22,7 @@ _OBJECT_ORDER = (  # order on the page
     ReasonKind.CONFIRMED,
 )
 _MAX_LINES = 5  # log lines for contradicted objects in a frame: a network may have hundreds
+_NO_DETECTOR = "no camera has any. For a detector give `--model FILE.onnx`, or name it in bevviz.toml"
 # Clusters that are only counted and numbered.
 _COUNTED = (ReasonKind.OUT_OF_VIEW, ReasonKind.TOO_LARGE, ReasonKind.TOO_SMALL)
 
@@ -145,6 +146,9 @@ def _clusters(explanations: list[Explanation], camera: str) -> Iterator[str]:
     title = f"{camera}: clusters" if camera else "Clusters"
     detailed = [explanation for explanation in explanations if explanation.reason.kind not in _COUNTED]
     items = [*map(_item, sorted(detailed, key=_is_matched))]
+    kept = [explanation for explanation in detailed if explanation.reason.kind is ReasonKind.KEPT]
+    if kept:  # No camera has detections.
+        items = [f"{len(kept)} clusters, not compared with detections: {_NO_DETECTOR}"]
     for kind in _COUNTED:
         rows = [explanation.row for explanation in explanations if explanation.reason.kind is kind]
         if rows:

@@ -14,6 +14,7 @@ STAMP = "stamp"  # sensor time, from the header of the cloud
 TRIED = "tried"  # sensor time, for results with tried values in bevviz open
 FRAME = "frame"  # sequence number of the frame
 VERSION = "version"  # sequence number of the configuration, in bevviz tune
+REPORTED = "report"  # sequence number of the frame, up to the frame that a bug report is about
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
 TIME_TOLERANCE = 1000  # nanoseconds of tolerance for times from a viewer, which counts them in doubles
@@ -234,9 +235,14 @@ def judged(outcome: str) -> str:
     return f"{EVALUATE}/objects/{outcome}"
 
 
-def image_judged(camera: str, outcome: str) -> str:
-    """Return the entity of objects that are false or missed, drawn over a camera's image."""
-    return f"{image(camera)}/judged/{outcome}"
+def marked(state: str) -> str:
+    """Return the entity of marked objects: missed, false or unexplained."""
+    return f"{WORLD}/{state}"
+
+
+def image_mark(camera: str, state: str) -> str:
+    """Return the entity of marked objects, drawn over a camera's image."""
+    return f"{image(camera)}/{state}"
 
 
 def judged_count(outcome: str) -> str:

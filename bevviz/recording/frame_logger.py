@@ -80,8 +80,10 @@ from bevviz.recording.surroundings import (
     static_data_makers,
 )
 from bevviz.recording.writer import Writer
+from bevviz.stages.odometry import ESTIMATED
 from bevviz.support.text import fenced, markdown
 
+MOTION_NOTE = "nothing states the robot's motion: it is estimated from the scans (odometry.method)"
 LATE_RESULT_LIFETIME = 3_000_000_000  # nanoseconds that the newest late result of the robot stays visible
 
 
@@ -249,11 +251,39 @@ class FrameLogger(Writer):
             self._late_stamps[late_result.boxes.topic] = late_result.boxes.stamp
             log_late(self, late_result, self._config.bev)
         self.begin(frame.index, frame.stamp, frame.received)
-        self._log_stages(result, cloud)
+        self._log_results(result, cloud)
         self._log_changes(result, health, notes, states)
         if log_more is not None:
             log_more()
         self.end()
+
+    def log_frame(self, result: FrameResult, log_more: Callable[[], object]) -> None:
+        """Log the part of a frame that a viewer shows at its time, without numbers, states and notes.
+
+        Args:
+            result: the frame and its results.
+            log_more: function that logs additional data of the frame.
+        """
+        frame = result.frame
+        self.begin(frame.index, frame.stamp, frame.received)
+        self._log_results(result, False)
+        log_more()
+        self.end()
+
+    def log_numbers(self, result: FrameResult) -> None:
+        """Log the numbers, states and notes of the next frame, which ``log_frame`` leaves out."""
+        frame = result.frame
+        self.begin(frame.index, frame.stamp, frame.received)
+        self._log_changes(result, {}, (), {})
+        self.end()
+
+    def _log_results(self, result: FrameResult, cloud: bool) -> None:
+        """Log the results of this frame: those of the stages, objects and tracks."""
+        self._log_stages(result, cloud)
+        log_objects(self, result)
+        log_fusion(self, result)
+        if result.tracks is not None:
+            log_tracks(self, result.frame, result.tracks, self._config.bev)
 
     def _log_stages(self, result: FrameResult, cloud: bool) -> None:
         """Log the results of the stages for this frame alone."""
@@ -268,7 +298,7 @@ class FrameLogger(Writer):
         self._input_entities |= self._frame_entities - entities_before
         self._log_lidar_results(result)
         for camera in result.cameras:
-            log_detections(self, camera, result.explanations)
+            log_detections(self, camera, result.explanations, has_truth=frame.truth is not None)
             if self._config.logging.projected_points and self._config.logging.keep != "report":
                 log_projected_points(self, camera, packed=not keeps_everything(self._config))
         log_opinions_in_images(self, result)
@@ -291,13 +321,12 @@ class FrameLogger(Writer):
         notes: Sequence[tuple[str, str]],
         states: Mapping[str, str],
     ) -> None:
-        """Log data that depends on earlier frames: tracks, anomalies, states, rates."""
+        """Log data that depends on earlier frames: anomalies, states, rates."""
         frame = result.frame
-        log_objects(self, result)
-        log_fusion(self, result)
-        if result.tracks is not None:
-            log_tracks(self, frame, result.tracks, self._config.bev)
         lines = mark_lines(frame) if self.root else self._robot_log.lines(frame)
+        before = self._last_frame
+        if frame.world_frame == ESTIMATED and (before is None or before.world_frame != ESTIMATED):
+            notes = [*notes, ("INFO", MOTION_NOTE)]
         self.lines(entities.EXPLAIN_LOG, [*notes, *lines])
         started = self._onsets.of(result.anomalies)
         log_anomalies(self, result, started)

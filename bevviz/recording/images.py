@@ -44,10 +44,13 @@ from bevviz.recording.primitives import (
     transform,
 )
 from bevviz.recording.writer import Writer
-from bevviz.support.colors import FAINT, UNNAMED, class_color, color_rows
+from bevviz.support.colors import FAINT, UNNAMED, StateColor, class_color, color_rows
 
 if TYPE_CHECKING:
     from bevviz.recording.video import VideoEncoder
+
+
+_SAME_BOX = 0.5  # IoU from which a detection is the double of another
 
 
 def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
@@ -171,11 +174,32 @@ class VideoEncoders:
             to.put(path, rr.VideoStream.from_fields(sample=sample.data))
 
 
-def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Explanation]) -> None:
+def unexplained_detections(result: CameraResult, *, doubles: bool = False) -> I64:
+    """Return the rows of kept detections without an object, except doubles of a detection that has one.
+
+    Of unexplained detections that are doubles of one another, only the best is returned without ``doubles``.
+    """
+    detections, fusion = result.detections, result.fusion
+    if detections is None or fusion is None:
+        return np.zeros(0, np.int64)
+    matched = fusion.detection_decision == Decision.MATCHED
+    rows: I64 = np.flatnonzero(detections.kept & ~matched)
+    if len(rows) and matched.any():
+        rows = rows[geometry.iou(detections.xyxy[rows], detections.xyxy[matched]).max(axis=1) < _SAME_BOX]
+    if doubles:
+        return rows
+    overlaps = np.triu(geometry.iou(detections.xyxy[rows], detections.xyxy[rows]) >= _SAME_BOX, k=1)
+    singles: I64 = rows[~overlaps.any(axis=0)]  # the best of doubles comes first
+    return singles
+
+
+def log_detections(
+    to: Writer, result: CameraResult, explanations: Iterable[Explanation], *, has_truth: bool = False
+) -> None:
     """Log kept detections in the colour of their class, and the other detections faint.
 
-    Names are written at unmatched detections first, then at the tallest, as long as names do not overlap. The
-    tooltip of each outline explains the decision, see ``bevviz.recording.labels``.
+    Without ground truth, unexplained detections are outlined as doubtful and have names, as long as these do
+    not overlap. The tooltip of each outline explains the decision, see ``bevviz.recording.labels``.
     """
     name, detections = result.camera.name, result.detections
     if detections is None:
@@ -191,20 +215,24 @@ def log_detections(to: Writer, result: CameraResult, explanations: Iterable[Expl
             _log_masks(to, name, detections, detections.masks, kept)
         xyxy = detections.xyxy[kept]
         labels = scored((detections.names[row] for row in kept), detections.score[kept])
-        unmatched = np.zeros(len(kept), bool)
-        if result.fusion is not None:
-            unmatched = result.fusion.detection_decision[kept] != Decision.MATCHED
+        doubtful = np.isin(kept, unexplained_detections(result)) & (not has_truth)
+        # The box of a double lies over that of the best, so both have one colour.
+        doubtful_outlines = np.isin(kept, unexplained_detections(result, doubles=True)) & (not has_truth)
+        outline_colors = [
+            StateColor.DOUBTFUL.value if is_doubtful else color
+            for is_doubtful, color in zip(doubtful_outlines, colors, strict=True)
+        ]
         size = _size(result.camera)
         label_positions = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
         # The tallest boxes come first, as they are usually the nearest.
-        has_name = choose_named(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, unmatched)
+        has_name = choose_named(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, doubtful) & doubtful
         log_image_box_labels(
             to,
             entities.detections(name),
             xyxy,
             [label if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
             [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)],
-            colors,
+            outline_colors,
         )
 
 

@@ -23,7 +23,7 @@ MAX_NAMES = 6  # boxes with a name; names of all boxes would cover the scene
 EYE, LOOK_TARGET = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
 # Size of a name, across and up: as tangents of the view angle in 3D, in metres from above, and as fractions
 # of the image width in an image. Two names must be further apart than this in one direction.
-IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.035), (20.0, 3.5), (0.21, 0.05)
+IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.045), (20.0, 3.5), (0.21, 0.05)
 LETTER_WIDTH = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
 
 _INVISIBLE, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)

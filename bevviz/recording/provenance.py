@@ -6,7 +6,6 @@ runs a bag again if a dependency other than the machine has changed.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 from collections.abc import Iterator, Mapping
@@ -19,6 +18,7 @@ from pathlib import Path
 from bevviz.config import METHOD_KEYS, Config, object_files, plugin_of
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
+from bevviz.support.files import file_hash
 from bevviz.support.version import __version__
 
 PACKAGES = (  # packages that are not installed are skipped: some libraries have several packages
@@ -26,6 +26,7 @@ PACKAGES = (  # packages that are not installed are skipped: some libraries have
     "protobuf",  # decodes Foxglove messages
     *("velodyne-decoder", "dracopy", "pypcd4"),  # decode packets, compressed clouds and PCD files
     *("numba", "llvmlite"),  # compile every LiDAR stage
+    "kiss-icp",  # estimates the motion
     *(
         "opencv-python-headless",
         "opencv-python",
@@ -126,18 +127,6 @@ def names_path(config: Config) -> Path | None:
     """Return the file with the detector's class names; None: there is no such file."""
     name = config.detector.names
     return Path(name) if name and name not in CLASS_LISTS and config.detector.model else None
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file's content in hexadecimal. The file is read again only if it changed."""
-    stat = path.stat()
-    return _hash(path, stat.st_size, stat.st_mtime_ns)
-
-
-@lru_cache
-def _hash(path: Path, size: int, mtime: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # --- the machine -------------------------------------------------------------------------------

@@ -36,7 +36,6 @@ from bevviz.recording.source_lookup import Origin
 from bevviz.support.contexts import Closable
 from bevviz.support.files import UnfinishedFile, atomic_write, write_all
 
-APPLICATION = "bevviz"
 CHUNK_SECONDS = 2.0  # seconds that a frame may wait until a chunk is written
 CHUNK_BYTES = 1 << 24  # bytes that may wait until a chunk is written
 PIPE_BYTES = 1 << 20

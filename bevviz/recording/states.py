@@ -20,6 +20,7 @@ COLORS: Mapping[str, Color] = {
     "ok": StateColor.GOOD.value,
     ReasonKind.MATCHED.value: StateColor.GOOD.value,
     "degraded": StateColor.DOUBTFUL.value,
+    "no detector": StateColor.UNKNOWN.value,
     "failed": StateColor.BAD.value,
     ReasonKind.NO_CLUSTER.value: StateColor.BAD.value,
     ReasonKind.TOO_FEW_POINTS.value: StateColor.DOUBTFUL.value,
@@ -74,7 +75,9 @@ class StateLanes:
 def states_of(result: FrameResult) -> dict[str, str]:
     """Return lane -> state of the pipeline, of each camera and its classes, and of each anomaly kind."""
     degraded = result.frame.problems or any(camera_result.camera.problems for camera_result in result.cameras)
-    states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else "ok"}
+    has_detector = not result.cameras or any(camera.detections is not None for camera in result.cameras)
+    state = "ok" if has_detector else "no detector"
+    states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else state}
     if result.frame.around is not None and result.frame.around.marks:
         states[entities.state("marks")] = "; ".join(result.frame.around.marks)
     for camera in result.cameras:

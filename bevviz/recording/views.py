@@ -100,14 +100,17 @@ def spaces(scene: Scene, **options: Any) -> rrb.Container | rrb.View:
 
 
 def _eye_near(target: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return an eye position a few metres from a target: on the robot's side, to the left and above."""
+    """Return an eye position some metres from a target: on the robot's side, to the left and above.
+
+    A large object, such as a truck, is seen whole from there.
+    """
     x, y, z = target
     distance = max(math.hypot(x, y), 1e-6)
-    offset = min(distance, 10.0)
+    offset = min(max(distance + 3.0, 12.0), 16.0)
     return (
-        x - offset * x / distance - 2.0 * y / distance,
-        y - offset * y / distance + 2.0 * x / distance,
-        z + 4.0,
+        x - offset * x / distance - 4.0 * y / distance,
+        y - offset * y / distance + 4.0 * x / distance,
+        z + 7.0,
     )
 
 
@@ -167,6 +170,11 @@ def explain(root: str = "", name: str = "Explain") -> rrb.TextDocumentView:
 def why() -> rrb.TextDocumentView:
     """Return a view of the answer of ``bevviz why``."""
     return rrb.TextDocumentView(name="Why", origin=entities.WHY, contents=["$origin"])
+
+
+def report() -> rrb.TextDocumentView:
+    """Return a view of the text of a bug report."""
+    return rrb.TextDocumentView(name="Report", origin=entities.REPORT, contents=["$origin"])
 
 
 def text_log(name: str, origin: str) -> rrb.TextLogView:

@@ -324,13 +324,22 @@ class _CameraFrustums:
         """Drop the points of the box that the detection's mask does not cover."""
         return rows[~self._beside_masks[d][rows]] if d in self._beside_masks else rows
 
+    def _without_others(self, d: int, rows: I64) -> I64:
+        """Drop the points beside a detection's box that a box of another class shows."""
+        others = np.array([name != self._detections.names[d] for name in self._detections.names])
+        boxes = self._boxes[[d, *np.flatnonzero(others & self._detections.kept)]]
+        uv = self._uv[rows, None]
+        inside = np.asarray(((uv >= boxes[:, :2]) & (uv <= boxes[:, 2:])).all(axis=2))
+        return rows[inside[:, 0] | ~inside[:, 1:].any(axis=1)]
+
     def settle(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
         """Return the object's points, its box (centre, size, heading), and which of its sides were seen."""
         work, rows = self._work, candidate.rows
         if not grow:
             return rows, *self._upright_box(rows, self._fit(d, rows, candidate.depth))
         # The object's clusters may continue beyond the image border that cuts the box, and beside a tight
-        # box. If one box of the class holds them, they are the object, however narrow the image box is.
+        # box. If one box of the class holds them, they are the object, however narrow the image box is,
+        # but for what another box shows: a cyclist beside a car may be in one cluster with it.
         counts = np.bincount(work.clusters.labels[rows] + 1)
         free_rows = [
             work.free_of(k) for k in np.flatnonzero(counts[1:] > MIN_CLUSTER_SHARE * len(rows)).tolist()
@@ -343,10 +352,11 @@ class _CameraFrustums:
             long = np.nan_to_num(self._sizes[d][:, 0].max(), nan=candidate.depth * self._wide[d])
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
         flat, is_whole = self._fit(d, rows, candidate.depth).flat, False
-        if len(kin) > len(rows) and self._sizes[d][:, 0].max() >= NO_SIDES:
-            whole = self._fit(d, kin, candidate.depth).flat
-            is_whole = share_inside(work.points, kin, whole) >= WHOLE_SHARE
-            flat = whole if is_whole else flat
+        own = self._without_others(d, kin)
+        if len(own) > len(rows) and self._sizes[d][:, 0].max() >= NO_SIDES:
+            whole = self._fit(d, own, candidate.depth).flat
+            is_whole = share_inside(work.points, own, whole) >= WHOLE_SHARE
+            flat, kin = (whole, own) if is_whole else (flat, kin)
         inside = points_inside(
             work.points,
             self._uv,

@@ -56,12 +56,13 @@ def segment_ground(points: F32, config: GroundConfig) -> Ground:
 def _segment_plane(points: F32, config: GroundConfig) -> Ground:
     inliers = _largest_plane(points, config.distance_threshold, config)
     if not inliers.any():
-        return _no_ground(len(points))
+        return no_ground(len(points))
     plane = _fit_plane(points, inliers)
     return Ground(inliers, _above(points, plane), plane)
 
 
-def _no_ground(count: int) -> Ground:
+def no_ground(count: int) -> Ground:
+    """Return Ground of points of which none is ground, and whose heights above it are not known."""
     return Ground(np.zeros(count, np.bool_), np.full(count, np.nan, np.float32))
 
 
@@ -164,7 +165,7 @@ def _segment_polar(points: F32, config: GroundConfig) -> Ground:
     ring, sector, order, start = _sort_into_bins(points, rings, config.sectors)
     plane = _first_plane(points, order, start, config)
     if plane is None:
-        return _no_ground(len(points))
+        return no_ground(len(points))
     radius = RING_SCALE * np.sinh(np.arange(0.5, rings) / RING_COUNT)
     steepest = math.tan(math.radians(config.max_slope))
     height, below = _heights(
