@@ -275,3 +275,8 @@ def test_beams_without_a_return_are_no_points() -> None:
     cloud = decode_cloud(message, "/points", 0)
     assert cloud.dropped == 10 and len(cloud.xyz) == 40
     assert np.array_equal(cloud.fields["ring"], [i for i in range(50) if i % 5])
+
+
+def test_a_cloud_within_one_cube_has_no_ground() -> None:
+    """No plane can be drawn through a single point: the clouds of a depth camera are that dense."""
+    assert ground_normal(np.random.default_rng(0).uniform(0.01, 0.02, (500, 3)).astype(np.float32)) is None

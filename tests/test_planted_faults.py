@@ -94,7 +94,16 @@ def test_demo_teaches_and_plants_every_fault(
     taught = [line.split()[0] for line in demo.PLANTS.splitlines() if line.startswith("  ")]
     assert taught == [*FAULTS, *SENSOR_FAULTS]
     monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--frames", "11", "--plant", "hidden_person", "--bag", "a.mcap"]) == 0
-    assert Path("a.mcap").exists()
-    assert main(["demo", "--frames", "11", "--plant", "flat_car", "--bag", "b.mcap"]) == 2
+    assert main(["demo", "--frames", "11", "--plant", "hidden_person", "-o", "a.mcap"]) == 0
+    capsys.readouterr()
+    why = ["why", "a.mcap", "--at", "1", "--class", "person", "--model", "demo", "--preset", "reference"]
+    assert main([*why, "--limit", "1"]) == 0
+    said = capsys.readouterr().out
+    listed = said[said.index("out of the sensors' sight") :]
+    (row,) = planted("hidden_person", "person", 16.3)
+    boxes = at("hidden_person").frame.truth
+    assert boxes is not None
+    distance = float(np.hypot(*boxes.boxes.center[row, :2]))
+    assert f"The person at {distance:.1f} m was not reported" in listed
+    assert main(["demo", "--frames", "11", "--plant", "flat_car", "-o", "b.mcap"]) == 2
     assert "give it more frames" in capsys.readouterr().err

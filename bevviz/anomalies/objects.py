@@ -13,12 +13,13 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from bevviz.config import AnomaliesConfig
 from bevviz.model import geometry
-from bevviz.model.frame import F32, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, Bool, Boxes3D
 from bevviz.model.results import Anomaly, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.visibility import range_image, visible
@@ -72,7 +73,7 @@ class _TrackHistory:
     steps: int = 0  # frames with an innovation
     spread: float = 0.0  # square metres, mean squared distance from the expected position
     length: float = 0.0  # metres, longer side of the last cluster
-    center: F32 | None = None  # centre of the last cluster, in the frame of the tracks
+    center: F32 | F64 | None = None  # centre of the last cluster, in the frame of the tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,13 @@ class _Visibility:
     open: F32  # (T,) share that no nearer object hides
     whole: Bool  # (T,) whether it is in a camera image and not cut off by the border
     detected: Bool  # (T,) whether a kept detection, or any one of its class, overlaps it
+
+
+class _Measured(NamedTuple):
+    """Clusters of the newest frame."""
+
+    length: F32  # (K,) metres, longer side
+    center: F32 | F64  # (K, 3) in the frame of the tracks
 
 
 class ObjectWatch:
@@ -149,7 +157,7 @@ def _jump(
     visibility: _Visibility,
     row: int,
     known: _TrackHistory,
-    measured: Boxes3D,
+    measured: _Measured,
     config: AnomaliesConfig,
 ) -> Iterator[Anomaly]:
     """Yield a jump: the same track far from its expected position, or a new track while its box is empty.
@@ -192,21 +200,17 @@ def _count_older_points(result: FrameResult, tracks: Tracks, visibility: _Visibi
     return int(np.isin(result.clusters.labels[in_box], old).sum()) if len(result.clusters.labels) else 0
 
 
-def _measured(measured: Boxes3D, tracks: Tracks, row: int) -> tuple[float, F32]:
+def _measured(measured: _Measured, tracks: Tracks, row: int) -> tuple[float, F32 | F64]:
     """Return the longer side and the centre of a track's cluster."""
     k = int(tracks.cluster[row])
-    return float(measured.size[k, :2].max()), measured.center[k]
+    return float(measured.length[k]), measured.center[k]
 
 
-def _clusters(result: FrameResult, tracks: Tracks) -> Boxes3D:
-    """Return the boxes of the clusters in the frame of the tracks."""
-    clusters = result.clusters
-    if clusters is None:
-        return Boxes3D.empty()
-    if not tracks.absolute:
-        return clusters.obb
-    center = geometry.apply(result.frame.pose, clusters.obb.center)
-    return Boxes3D(center, clusters.obb.size, clusters.obb.yaw)
+def _clusters(result: FrameResult, tracks: Tracks) -> _Measured:
+    """Return the clusters in the frame of the tracks."""
+    boxes = Boxes3D.empty() if result.clusters is None else result.clusters.obb
+    center = geometry.apply(result.frame.pose, boxes.center) if tracks.absolute else boxes.center
+    return _Measured(boxes.size[:, :2].max(axis=1), center)
 
 
 def _missing(

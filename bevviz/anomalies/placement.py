@@ -27,6 +27,7 @@ from bevviz.stages.edges import (
     shrink,
     undistort,
 )
+from bevviz.support.kernel import kernel
 
 EVERY = 10  # frames from one check to the next, each of one camera with one LiDAR
 PAST = 6  # checks that are judged together: 6 s at 10 Hz with one camera
@@ -163,7 +164,15 @@ def _in_view(xyz: F32, camera_from_cloud: F64, view: Intrinsics, reach: float) -
     corners = np.array([[u, v, 1.0] for u in (0, view.width) for v in (0, view.height)])
     rays = corners @ np.linalg.inv(view.K).T
     angle = np.arccos((rays[:, 2] / np.linalg.norm(rays, axis=1)).min()) + reach
-    to_camera = camera_from_cloud.astype(np.float32)
-    depth = xyz @ to_camera[2, :3] + to_camera[2, 3]
-    inside: Bool = depth > np.float32(np.cos(angle)) * np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    return _in_cone(xyz, camera_from_cloud[2].astype(np.float32), np.float32(np.cos(angle)))
+
+
+@kernel
+def _in_cone(xyz: F32, axis: F32, cosine: np.float32) -> Bool:
+    """Return which points are within an angle of the optical axis, a row of ``camera_from_cloud``."""
+    inside = np.empty(len(xyz), np.bool_)
+    for i in range(len(xyz)):
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        depth = axis[0] * x + axis[1] * y + axis[2] * z + axis[3]
+        inside[i] = depth > cosine * np.sqrt(x * x + y * y + z * z)
     return inside

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 
 from bevviz.anomalies.sensor_faults import SensorFault
-from bevviz.model.frame import F32, F64, U8, Camera
+from bevviz.model.frame import F32, F64, I64, U8, Camera
 from bevviz.model.results import FrameResult
+from bevviz.support.kernel import kernel
 
 BINS = 360  # directions in which the range is compared
 BANDS = (20, 33, 46, 59, 72, 85, 98)  # percentiles of the elevations that bound the bands of a scan
@@ -57,27 +58,19 @@ class ScanShape:
     def measure(result: FrameResult, before: ScanShape | None = None) -> ScanShape:
         """Measure the scan of a frame, in the bands of the scan before."""
         points = result.frame.points
-        xyz = points[:: -(-len(points) // POINTS) or 1]
-        distance = np.hypot(xyz[:, 0], xyz[:, 1])
-        xyz, distance = xyz[distance > FAR], distance[distance > FAR]
-        elevation = xyz[:, 2] / distance
-        if before is not None:
-            bounds = before.elevations
-        else:
-            bounds = np.percentile(elevation, BANDS) if len(xyz) else np.zeros(len(BANDS))
-        inside = (elevation > bounds[0]) & (elevation < bounds[-1])
-        band = np.searchsorted(bounds, elevation[inside]) - 1
-        azimuth = np.arctan2(xyz[inside, 1], xyz[inside, 0])
-        cell = band * BINS + ((azimuth + np.pi) * BINS / (2 * np.pi)).astype(np.int64) % BINS
+        points = points[:: -(-len(points) // POINTS) or 1]
+        bounds = _elevation_bounds(points) if before is None else before.elevations
+        band, x, y, distance = _between(points, bounds)
+        cell = band * BINS + ((np.arctan2(y, x) + np.pi) * BINS / (2 * np.pi)).astype(np.int64) % BINS
         cells = (len(BANDS) - 1) * BINS
         count = np.bincount(cell, minlength=cells)
-        total = np.bincount(cell, np.log(distance[inside]), cells)
+        total = np.bincount(cell, np.log(distance), cells)
         ranges = (
             np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
             .reshape(-1, BINS)
             .astype(np.float32)
         )
-        return ScanShape(ranges, np.asarray(bounds, np.float64), _ground_slope(result))
+        return ScanShape(ranges, bounds, _ground_slope(result))
 
     def rotation_to(self, other: ScanShape) -> F64 | None:
         """Return the (3,) rotation of the scene in degrees, about x, y and z of the points.
@@ -102,6 +95,33 @@ class ScanShape:
         tilt = np.degrees(other.slope - self.slope)
         # The ground rises along x where the scene turned about -y, and along y where it turned about x.
         return np.array([tilt[1], -tilt[0], (shifts[best] + fraction) * 360 / BINS])
+
+
+def _elevation_bounds(points: F32) -> F64:
+    """Return the tangents of the elevations that bound the bands of a scan."""
+    distance = np.hypot(points[:, 0], points[:, 1])
+    is_far = distance > FAR
+    if not is_far.any():
+        return np.zeros(len(BANDS))
+    return np.asarray(np.percentile(points[is_far, 2] / distance[is_far], BANDS), np.float64)
+
+
+@kernel
+def _between(points: F32, bounds: F64) -> tuple[I64, F32, F32, F32]:
+    """Return band, x, y and distance of the far points whose elevation is between the bounds."""
+    band = np.empty(len(points), np.int64)
+    x, y, distance = np.empty((3, len(points)), np.float32)
+    count = 0
+    for i in range(len(points)):
+        away = np.float32(np.sqrt(np.float64(points[i, 0]) ** 2 + np.float64(points[i, 1]) ** 2))
+        elevation = points[i, 2] / away
+        if away > FAR and bounds[0] < elevation < bounds[-1]:
+            k = 0
+            while bounds[k + 1] < elevation:
+                k += 1
+            band[count], x[count], y[count], distance[count] = k, points[i, 0], points[i, 1], away
+            count += 1
+    return band[:count], x[:count], y[:count], distance[:count]
 
 
 def _ground_slope(result: FrameResult) -> F64:

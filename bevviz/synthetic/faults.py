@@ -55,6 +55,12 @@ def _shared_box(stage: SceneArea) -> None:
     stage.place(models.litter_bin(stage.rng).moved(np.diag([1.2, 1.2, 1.7, 1.0])), 10.5, -5.4)
 
 
+def _small_child(stage: SceneArea) -> None:
+    """Add a child of 0.9 m at the roadside."""
+    child = models.Model(models.person(stage.rng, walking=False, child=True).at(0.0))
+    stage.add("person", child.scaled((0.8, 0.8, 0.7)), 7.0, -4.3, turn=np.pi)
+
+
 FAULTS: Mapping[str, Fault] = {
     "hidden_person": Fault("a person hidden behind a parked van: no point, no pixel", 1.0, _hidden_person),
     "flat_car": Fault(
@@ -71,6 +77,11 @@ FAULTS: Mapping[str, Fault] = {
         "a person beside a switch cabinet: the reference preset names both by the person's box",
         7.0,
         _shared_box,
+    ),
+    "small_child": Fault(
+        "a child of 0.9 m at the roadside: the reference preset takes half of it for ground",
+        0.5,
+        _small_child,
     ),
 }
 
