@@ -12,6 +12,8 @@ from bevviz.support.contexts import Closable
 from bevviz.support.files import catch_full_disk
 
 AHEAD = 6  # pieces of the run that may be sent before the page acknowledges the first of them
+CACHE = 800_000_000  # bytes of frames on demand that are kept
+NEIGHBOURS = (1, -1)  # frames that are made after the one that a page requests
 
 
 class News:
@@ -63,9 +65,20 @@ class Reader(Protocol):
         """Tells when there are new pieces."""
         ...
 
-    def take(self) -> Sequence[bytes]:
-        """Return the pieces to send now. Empty: wait for news of the recording or of the page."""
+    def take(self) -> Sequence[bytes | str]:
+        """Return the pieces to send now. Empty: wait for news of the recording or of the page.
+
+        A text is the number of the frame that the next piece holds.
+        """
         ...
+
+
+def write_at(file: int, content: bytes, start: int) -> None:
+    """Write all bytes at a position of a file."""
+    view = memoryview(content)
+    while view:
+        written = os.pwrite(file, view, start)
+        view, start = view[written:], start + written
 
 
 class RecordingBuffer(Closable):
@@ -88,8 +101,10 @@ class RecordingBuffer(Closable):
         self.news = News()
 
     def close(self) -> None:
-        """Delete the temporary file."""
-        self._file.close()
+        """Delete the temporary file. Readers get no more pieces."""
+        with self._lock:
+            self._ends = [0]
+            self._file.close()
 
     def __len__(self) -> int:
         return len(self._ends) - 1
@@ -103,19 +118,68 @@ class RecordingBuffer(Closable):
         if not piece:
             return
         with self._lock:
-            view, end = memoryview(piece), self._ends[-1]
             with catch_full_disk():
-                while view:
-                    written = os.pwrite(self._file.fileno(), view, end)
-                    view, end = view[written:], end + written
-            self._ends.append(end)
+                write_at(self._file.fileno(), piece, self._ends[-1])
+            self._ends.append(self._ends[-1] + len(piece))
         self.news.tell()
 
     def __getitem__(self, row: int) -> bytes:
-        if not 0 <= row < len(self):
-            raise IndexError(row)
-        start, end = self._ends[row], self._ends[row + 1]
-        return os.pread(self._file.fileno(), end - start, start)
+        with self._lock:
+            if not 0 <= row < len(self):
+                raise IndexError(row)
+            start, end = self._ends[row], self._ends[row + 1]
+            return os.pread(self._file.fileno(), end - start, start)
+
+
+class FrameCache(Closable):
+    """Pieces of frames by number, in a temporary file of limited size. The oldest are overwritten.
+
+    Args:
+        size: bytes of the file.
+
+    Raises:
+        UserError: the disk of the temporary folder is full.
+    """
+
+    def __init__(self, size: int = CACHE) -> None:
+        with catch_full_disk():
+            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, as in RecordingBuffer
+        self._size, self._end = size, 0
+        self._places: dict[int, tuple[int, int]] = {}  # first byte and the byte after the last
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        """Delete the temporary file."""
+        with self._lock:
+            self._places.clear()
+            self._file.close()
+
+    def get(self, number: int) -> bytes | None:
+        """Return the piece of a frame. None: it is not kept, or no longer."""
+        with self._lock:
+            if number not in self._places:
+                return None
+            start, end = self._places[number]
+            return os.pread(self._file.fileno(), end - start, start)
+
+    def put(self, number: int, piece: bytes) -> None:
+        """Keep the piece of a frame in place of the oldest ones.
+
+        Raises:
+            UserError: the disk of the temporary folder is full.
+        """
+        with self._lock:
+            self._places.pop(number, None)
+            if len(piece) > self._size:
+                return
+            start = self._end if self._end + len(piece) <= self._size else 0
+            self._end = start + len(piece)
+            for other, (low, high) in list(self._places.items()):
+                if low < self._end and high > start:
+                    del self._places[other]
+            with catch_full_disk():
+                write_at(self._file.fileno(), piece, start)
+            self._places[number] = start, self._end
 
 
 class BufferReader:
@@ -141,7 +205,7 @@ class BufferReader:
         self._sent = 0
         self.news = buffer.news
 
-    def take(self) -> Sequence[bytes]:
+    def take(self) -> Sequence[bytes | str]:
         """Return the next piece, if the page can take one now."""
         row = self._requested_row()
         if row is None and (self._row_of is None or self._sent < self._state.count + AHEAD):
@@ -162,4 +226,88 @@ class BufferReader:
             if row is not None and row >= self._next and row not in self._early:
                 self._early.add(row)
                 return row
+        return None
+
+
+class FrameMaker(Protocol):
+    """Drive whose frames are rows of a buffer, or are made on demand."""
+
+    @property
+    def on_demand(self) -> bool:
+        """Whether frames are made on demand. It is known once there is a row."""
+        ...
+
+    def row(self, stamp: int) -> int | None:
+        """Return the row of the frame at a stamp. None: there is none, or not yet."""
+        ...
+
+    def number_at(self, stamp: int) -> int:
+        """Return the number of the frame at a stamp."""
+        ...
+
+    def version(self, number: int) -> int:
+        """Return a number that changes if the frame would be drawn otherwise than before."""
+        ...
+
+    def piece(self, number: int, *, wanted: bool) -> bytes | None:
+        """Return the piece of a frame. None: there is no such frame, or it cannot be read.
+
+        Args:
+            number: number of the frame.
+            wanted: whether a page waits for it. Else it is a neighbour of such a frame.
+        """
+        ...
+
+
+class FilmReader(BufferReader):
+    """Reader of a drive. Of one with frames on demand: the rows, then the frames that this page looks at.
+
+    Args:
+        rows: pieces that every page gets.
+        first: row of the first piece.
+        state: state of the page.
+        frames: makes the frames.
+    """
+
+    def __init__(self, rows: RecordingBuffer, first: int, state: PageState, frames: FrameMaker) -> None:
+        super().__init__(rows, first, state, frames.row)
+        self._frames = frames
+        self._requested = -1  # number of the frame that the page waits for
+        self._queue: list[int] = []  # numbers of the frames to make
+        self._versions: dict[int, int] = {}  # of the frames that the page has
+
+    def take(self) -> Sequence[bytes | str]:
+        """Return the next row, or the frame to send now."""
+        if not self._frames.on_demand:
+            return super().take()
+        pieces: tuple[bytes | str, ...] = ()
+        if self._next < len(self._buffer):
+            pieces = (self._buffer[self._next],)
+            self._next += 1
+        elif (frame := self._frame()) is not None:
+            pieces = str(frame[0]), frame[1]
+        self._sent += bool(pieces)
+        return pieces
+
+    def _frame(self) -> tuple[int, bytes] | None:
+        """Return the next frame and its number. None: the page waits for nothing, or can take no more."""
+        while not self._state.gone:
+            stamp = None
+            while self._state.requested:  # The newest one counts: the user has moved on from the others.
+                stamp = self._state.requested.pop(0)
+            if stamp is not None:
+                self._requested = number = self._frames.number_at(stamp)
+                self._queue = [number, *(number + by for by in NEIGHBOURS)]
+            if not self._queue:
+                return None
+            wanted = self._queue[0] == self._requested
+            if not wanted and self._sent >= self._state.count + AHEAD:
+                return None
+            number = self._queue.pop(0)
+            version = self._frames.version(number)
+            if self._versions.get(number) != version:
+                piece = self._frames.piece(number, wanted=wanted)
+                if piece is not None:
+                    self._versions[number] = version
+                    return number, piece
         return None

@@ -15,7 +15,6 @@ from bevviz.live.outputs import Output
 from bevviz.live.runtime import Live
 from bevviz.recording import blueprints
 from bevviz.recording.frame_logger import RecordingContext
-from bevviz.recording.sinks import APPLICATION
 from bevviz.workbench.buffers import News, PageState
 
 AHEAD = 10  # pieces that may be sent before the page's viewer has drawn the first of them
@@ -38,11 +37,15 @@ class LiveReader:
         buffer: the buffer.
         state: state of the page, with its acknowledgements.
         clock: returns the time in seconds.
+
+    Attributes:
+        opened: time when the page was opened.
     """
 
     def __init__(self, buffer: LiveBuffer, state: PageState, clock: Callable[[], float]) -> None:
         self._buffer, self._state, self._clock = buffer, state, clock
         self.news = buffer.news
+        self.opened = clock()
         self._next: int | None = None  # number of the next piece. None: the page has nothing yet
         self._sent: deque[float] = deque()  # send times of the pieces that are not drawn yet
         self._drawn = 0
@@ -121,6 +124,11 @@ class LiveBuffer(Output):
         """Lag of the slowest page, in seconds. It includes what its browser has not drawn."""
         return max((page.lag for page in self._pages.copy()), default=None)
 
+    @property
+    def opened(self) -> float:
+        """Time when the newest page was opened, in monotonic seconds. 0: no page is open."""
+        return max((page.opened for page in self._pages.copy()), default=0.0)
+
     @contextmanager
     def shown(self, state: PageState) -> Iterator[LiveReader]:
         """Return a context in which a page is connected."""
@@ -161,7 +169,8 @@ class LiveBuffer(Output):
         return head + [piece.data for piece in pieces if piece.number >= start.number], following
 
     def _layout(self, context: RecordingContext) -> bytes:
-        recording = rr.RecordingStream(APPLICATION, recording_id=self._encoder.recording_id)
+        encoder = self._encoder
+        recording = rr.RecordingStream(encoder.application, recording_id=encoder.recording_id)
         stream = rr.binary_stream(recording)
         layout = blueprints.load("workbench_live", context.scene, context.config)
         recording.send_blueprint(layout, make_active=True)

@@ -4,39 +4,38 @@ from __future__ import annotations
 
 import bisect
 import threading
-import time
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rerun as rr
 
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
 from bevviz.pipeline.notes import Notes
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Variants, check_same_frames
-from bevviz.recording import blueprints, entities
-from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.sinks import APPLICATION
-from bevviz.recording.writer import SCALAR_WAIT
-from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.recording import entities
+from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.workbench.buffers import BufferReader, PageState, Reader, RecordingBuffer
+from bevviz.workbench.buffers import BufferReader, FilmReader, PageState, Reader, RecordingBuffer
+from bevviz.workbench.desk import Attempt, Desk
+from bevviz.workbench.film import Film
 from bevviz.workbench.findings import Finding, find_findings
-from bevviz.workbench.findings_layer import FindingRows, log_layer
-from bevviz.workbench.reports import ReportMaker
+from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
+from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
+from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.workbench.session import DriveTools, WorkbenchSession
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner
@@ -44,7 +43,7 @@ from bevviz.workbench.trials import TrialRunner
 KEPT = 6  # results of recently viewed frames that are kept
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
-BOTH = (entities.STAMP, entities.TRIED)
+RAW = 4  # frames that are kept as they were read
 
 
 def recorded_session(
@@ -53,6 +52,7 @@ def recorded_session(
     paths: Sequence[Path],
     truth_of: TruthLookup | None = None,
     first: int = 0,
+    labels: Sequence[str | Path | None] = (),
 ) -> WorkbenchSession:
     """Return the workbench session of a recorded drive.
 
@@ -62,54 +62,75 @@ def recorded_session(
         paths: paths of the bag.
         truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
         first: number of the scan that is shown first.
+        labels: stated topic and files of the ground truth.
     """
-    source = RecordedDrive(drive, again, truth_of, first)
+    recording = getattr(drive.frames, "recording", None)
+    files = [] if recording is None else [file.path for file in recording.files]
+    table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
+    source = RecordedDrive(drive, again, truth_of, first, table)
     session = WorkbenchSession(source)
-    session.equip(DriveTools(TrialRunner(source), ReportMaker(session, drive, paths), Notes(paths)))
+
+    def bag_of(number: int) -> ReportedBag:
+        return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
+
+    reports = ReportMaker(session, bag_of, folder_beside(paths))
+    session.equip(reports, DriveTools(TrialRunner(source), Notes(paths)))
     return session
 
 
 class RecordedDrive(Source, Observer[FrameResult]):
     """Recorded drive as the source of a page. A run over all frames is recorded in the background.
 
-    A result of the run is logged on the timeline ``stamp``. It is logged on ``tried`` as well, unless other
-    values were tried on that frame. A result with other values is logged on ``tried`` alone. A viewer shows
-    one or the other by its choice of timeline.
+    An overview of single frames comes before the run of a long drive. The run replaces its findings.
+
+    Of a long drive the run records numbers only. A frame is recorded when a page looks at it.
 
     Args:
         drive: the drive that questions are about.
         again: the same frames a second time. The run reads them.
         truth_of: returns the ground truth of a frame.
         first: number of the scan that is shown first.
+        table: place of the list of a whole run. None: it is not kept.
 
     Attributes:
-        film: buffer with the recording of the whole drive.
-        desk: buffer with answers and tried results, shown together with ``film``.
-        recording_id: recording id of both buffers.
+        film: recording of the drive.
+        lanes: buffers by name: ``film``, the desk of each page, and the runs with other values.
         over: whether the run over the drive has ended.
     """
 
     def __init__(
-        self, drive: Drive, again: FrameSource, truth_of: TruthLookup | None = None, first: int = 0
+        self,
+        drive: Drive,
+        again: FrameSource,
+        truth_of: TruthLookup | None = None,
+        first: int = 0,
+        table: RunTable | None = None,
     ) -> None:
         super().__init__(drive.scene.name, drive.session, truth_of)
         self.drive, self.again, self.scans = drive, again, len(drive)
-        self._first = first
-        self.film, self.desk = RecordingBuffer(), RecordingBuffer()
+        self._first, self._table = first, table
+        self._is_listed = False  # whether the list is that of an earlier run
+        self.film = Film(drive.scene, drive.config, self.again.total)
+        self.lanes: dict[str, RecordingBuffer] = {"film": self.film.rows}
+        self._desks = 0  # number of desks until now
         self.over = False
+        self._overview: OverviewFrames | None = None  # while it is made
         self._done, self._error = 0, ""
-        self._stamps: list[tuple[int, int]] = []  # (stamp, number) of each frame in ``film``, sorted
-        self._rows: dict[int, int] = {}  # row in ``film`` by stamp
+        self._stamps: list[tuple[int, int]] = []  # (stamp, number) of each known frame, sorted
+        self._stamp_by_number: dict[int, int] = {}
         self._reached = 0  # newest stamp that the run has reached
         self._tracks: dict[int, Tracks] = {}
         self._objects: dict[int, Objects | None] = {}
         self._onsets = Onsets()
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
-        self._variants, self._looking = Variants(drive.session.loader), threading.RLock()
+        self._raw: OrderedDict[int, Frame] = OrderedDict()  # frames as read, by number
+        self._variants = Variants(drive.session.loader)
+        self._looking = threading.RLock()  # guards the reading of frames, _raw, _results and _making
+        self._making: defaultdict[tuple[int, Settings], threading.Lock] = defaultdict(threading.Lock)
+        self._asking, self._counting = 0, threading.Lock()  # number of questions that are being answered
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
         self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
-        self._begin_recording()
 
     def start(self) -> None:
         """Start the run: record the frame that is shown first, then all frames in order."""
@@ -122,12 +143,16 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self._go.set()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
-        for stream in (self._run_stream, self._desk_stream):
-            stream.read()  # Rerun warns about a binary stream with unread data.
+        for buffer in self.lanes.values():
+            buffer.close()
         self.film.close()
-        self.desk.close()
         self.drive.close()
         self.again.close()
+
+    @property
+    def on_demand(self) -> bool:
+        """Whether a page gets a frame of the recording only when it looks at it."""
+        return self.film.on_demand
 
     def objects(self, number: int) -> Objects | None:
         """Return the objects that the run found in a frame."""
@@ -137,9 +162,11 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def progress(self) -> dict[str, Any]:
         """Return the progress of the run for the page."""
+        overview = self._overview
         return {
+            "pass": "overview" if overview is not None else "again" if self._is_listed else "run",
             "done": self._done,
-            "total": self.again.total,
+            "total": self.again.total if overview is None else overview.total,
             "over": self.over,
             "error": self._error,
             "warnings": list(self.again.warnings) if self.over else [],
@@ -147,17 +174,56 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def _run(self) -> None:
         try:
+            self._load_list()
             first = self.look(self._first)
             self.first = self._stamp_of(0)
             self.show(first, find_findings(self.explainer(first)))
             self._go.wait(FIRST)
+            if self.again.total >= LEAST and not self._is_listed:
+                self._make_overview()
             run(self.again, self.drive.new_session(), [self], stop=self._stop)
+            if not (self._stop.is_set() or self._is_listed):
+                self.findings.end_overview(self.scans)
+                self._save_list()
         except Exception as error:
             self._error = (
                 str(error) if isinstance(error, UserError) else f"the run failed: {first_line(error)}"
             )
         self.over = True
         self.news.tell()
+
+    def _load_list(self) -> None:
+        """List the findings of an earlier run, if they are kept. The run is still needed for the rest."""
+        stored = None if self._table is None else self._table.load()
+        if stored is not None:
+            self.findings.restore((group.what, group.name, group.frames) for group in stored.groups)
+            for stamp, number in stored.frames:
+                self._stamp_by_number[number] = stamp
+            self._stamps = sorted((stamp, number) for stamp, number in stored.frames)
+            self._reached = max((stamp for stamp, _ in self._stamps), default=0)
+            self._is_listed = True
+            self.news.tell()
+
+    def _save_list(self) -> None:
+        """Keep the findings of the whole run."""
+        if self._table is not None:
+            groups = [StoredGroup(*group) for group in self.findings.content()]
+            self._table.save(StoredRun(groups, self._stamps))
+
+    def _make_overview(self) -> None:
+        """List the findings of single frames all over the drive."""
+        self._overview = OverviewFrames(self.again)
+        processor = SingleFrames(self.drive.session)
+        run(self._overview, processor, [_OverviewObserver(self)], stop=self._stop)
+        self._overview, self._done = None, 0
+
+    def observe_single(self, result: FrameResult) -> None:
+        """List the findings of a frame of the overview. Then wait while a question is being answered."""
+        self.findings.add_overview(result.frame.index, find_findings(self.explainer(result)))
+        self._know(result.frame)
+        self._done += 1
+        self.news.tell()
+        self.wait_for_quiet()
 
     def go_on(self) -> None:
         """Let the run continue: a page shows the first frame."""
@@ -167,22 +233,33 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
         findings = find_findings(self.explainer(result))
-        self.show(result, findings)
+        if self.film.on_demand:
+            self.film.add_numbers(result)
+            self._know(frame)
+        else:
+            self.show(result, findings)
         self._reached = max(self._reached, frame.stamp)
+        with self._looking:  # What was looked at before its pose was known is computed again.
+            if (raw := self._raw.get(frame.index)) is not None and raw.world_frame != frame.world_frame:
+                del self._raw[frame.index]
+            for key, known in list(self._results.items()):
+                if key[0] == frame.index and known.frame.world_frame != frame.world_frame:
+                    del self._results[key]
         if result.tracks is not None:
             no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)
             self._tracks[frame.index] = replace(result.tracks, trail=no_trail)
         self._objects[frame.index] = result.objects
-        self.findings.add(findings)
-        self.findings.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
+        if not self._is_listed:
+            self.findings.end_overview(frame.index)
+            self.findings.add(findings)
+            self.findings.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self._done += 1
         self.news.tell()
         self.wait_for_quiet()
 
     def end(self) -> None:
         """Record the last scalars of the run."""
-        self._run_logger.flush()
-        self.film.add(self._run_stream.read())
+        self.film.flush()
 
     def wait_for_quiet(self) -> None:
         """Wait until no question is being answered."""
@@ -191,99 +268,107 @@ class RecordedDrive(Source, Observer[FrameResult]):
     @contextmanager
     def quiet(self) -> Iterator[None]:
         """Return a context in which the run pauses after its current frame."""
-        self._quiet.clear()
+        with self._counting:
+            self._asking += 1
+            self._quiet.clear()
         try:
             yield
         finally:
-            self._quiet.set()
+            with self._counting:
+                self._asking -= 1
+                if not self._asking:
+                    self._quiet.set()
 
     # --- recording -----------------------------------------------------------------------------
 
-    def _begin_recording(self) -> None:
-        """Start both streams of the recording, with the layout and the static data."""
-        drive = self.drive
-        self.recording_id = f"bench-{time.time_ns()}"
-        self._first_times = (0, 0, 0)  # index, stamp and receive time of the frame that was drawn first
-        self._first_entities: frozenset[str] = frozenset()  # entities that have data or a clear at that frame
-        self._layers: dict[tuple[int, bool], FindingRows] = {}  # by frame number and side (tried or not)
-        self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
-        recording, self._run_stream = self.stream()
-        recording.send_blueprint(blueprints.load("workbench", drive.scene, drive.config), make_active=True)
-        self._run_logger = FrameLogger(recording, drive.config, drive.scene, wait=SCALAR_WAIT, stamps=BOTH)
-        self._run_logger.apart = True  # Pages receive frames in any order, so each is complete.
-        self._run_logger.log_static()
-        recording, self._desk_stream = self.stream()
-        self._marker = FrameLogger(recording, drive.config, drive.scene, stamps=BOTH)
-        self._tried_logger = self.tried_logger(recording, drive.config)
+    def open_desk(self) -> Desk:
+        """Return a new desk. A page shows what is on its own desk alone."""
+        with self._looking:
+            self._desks += 1
+            desk = Desk(f"desk-{self._desks}", self.film.mark_logger, self.film.tried_logger)
+            self.lanes[desk.lane] = desk.buffer
+        return desk
 
-    def stream(self) -> tuple[rr.RecordingStream, rr.BinaryStream]:
-        """Return a new stream into the recording, for a further thread that writes to it."""
-        recording = rr.RecordingStream(APPLICATION, recording_id=self.recording_id)
-        recording.set_log_time_enabled(False)
-        return recording, rr.binary_stream(recording)
-
-    def tried_logger(self, recording: rr.RecordingStream, config: Config) -> FrameLogger:
-        """Return a logger that writes tried results on a timeline of their own, beside those of the run."""
-        stamps = (entities.TRIED,)
-        return FrameLogger(recording, config, self.drive.scene, wait=SCALAR_WAIT, stamps=stamps, inputs=False)
+    def close_desk(self, desk: Desk) -> None:
+        """Remove a desk whose page is closed."""
+        with self._looking:
+            self.lanes.pop(desk.lane, None)
+        desk.close()
 
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
-        frame, logger = result.frame, self._run_logger
-        self._draw(logger, result, findings, tried=False)
+        self.film.show(result, findings)
+        self._know(result.frame)
         if self.opening is None:
-            self._first_times = (frame.index, frame.stamp, frame.received)
-            self._first_entities = logger.known
-        elif frame.stamp < self._first_times[1]:
-            logger.clear_at(*self._first_times, logger.known - self._first_entities)
-            self._first_entities = logger.known
-        key = (frame.stamp, frame.index)
-        index = bisect.bisect_left(self._stamps, key)
-        if self._stamps[index : index + 1] != [key]:
-            self._stamps.insert(index, key)
-        self._rows[frame.stamp] = len(self.film)
-        self.film.add(self._run_stream.read())
-        if self.opening is None:
-            self.opening = frame.stamp
+            self.opening = result.frame.stamp
             self.news.tell()
 
-    def draw_tried(self, logger: FrameLogger, explainer: FrameExplainer) -> None:
-        """Log a frame with other values beside the result of the run."""
-        result = explainer.traces.result
-        logger.refresh(self._run_logger.results)
-        # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
-        # always drawn again, so that its colours change back, too.
-        config, opened, number = result.config, self.drive.config, result.frame.index
-        if (config.voxel, config.ground) != (opened.voxel, opened.ground):
-            self._recoloured.add(number)
-        findings = find_findings(explainer)
-        self._draw(logger, result, findings, tried=True, cloud=number in self._recoloured)
-
-    def _draw(
-        self,
-        logger: FrameLogger,
-        result: FrameResult,
-        findings: Sequence[Finding],
-        *,
-        tried: bool,
-        cloud: bool = False,
-    ) -> None:
-        layers: list[FindingRows] = []
-        logger.log(result, log_more=lambda: layers.append(log_layer(logger, result, findings)), cloud=cloud)
-        self._layers[result.frame.index, tried] = layers[0]
+    def _know(self, frame: Frame) -> None:
+        """Keep the stamp of a frame."""
+        if frame.index not in self._stamp_by_number:
+            self._stamp_by_number[frame.index] = frame.stamp
+            bisect.insort(self._stamps, (frame.stamp, frame.index))
 
     @contextmanager
     def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
-        """Return a context in which a page reads the film or the desk."""
-        if lane == "desk":
-            yield BufferReader(self.desk, first, state)
-        else:
-            yield BufferReader(self.film, first, state, self._film_row)
+        """Return a context in which a page reads the film, its desk, or a run with other values.
 
-    def _film_row(self, stamp: int) -> int | None:
-        """Return the row in ``film`` of the frame that a viewer shows at a stamp."""
+        Raises:
+            UserError: there is no such buffer.
+        """
+        buffer = self.lanes.get(lane)
+        if buffer is None:
+            raise UserError(f"there is no recording '{lane}'")
+        if lane == "film":
+            yield FilmReader(buffer, first, state, self)
+        else:
+            yield BufferReader(buffer, first, state, None if lane.startswith("desk") else lambda _: None)
+
+    def row(self, stamp: int) -> int | None:
+        """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
         recorded = self._recorded_at(stamp)
-        return None if recorded is None else self._rows.get(recorded[0])
+        return None if recorded is None else self.film.row(recorded[0])
+
+    def version(self, number: int) -> int:
+        """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
+        return int(number in self._objects)
+
+    def piece(self, number: int, *, wanted: bool) -> bytes | None:
+        """Return the recording of a frame, which is made if it is not kept.
+
+        Args:
+            number: number of the frame.
+            wanted: whether a page waits for it. The run pauses then.
+        """
+        version = self.version(number)
+        if (piece := self.film.frame(number, version)) is not None:
+            return piece
+        try:
+            with self.quiet() if wanted else nullcontext():
+                result = self.look(number) if wanted else self.look_aside(number)
+                if (tracks := self._tracks.get(number)) is not None:
+                    result = replace(result, tracks=replace(tracks, trail=self._trail(number, tracks)))
+                piece = self.film.draw(result, find_findings(self.explainer(result)), version)
+        except UserError:  # There is no such frame, or it cannot be read.
+            return None
+        self._know(result.frame)
+        self.news.tell()
+        return piece
+
+    def _trail(self, number: int, tracks: Tracks) -> F32:
+        """Return the trails of the tracks of a frame, from the tracks of the frames before."""
+        span, stamp = self.drive.config.tracking.trail * 1e9, self._stamp_by_number[number]
+        columns = [tracks.boxes.center]
+        earlier = number - 1
+        while (before := self._tracks.get(earlier)) and stamp - self._stamp_by_number[earlier] <= span:
+            rows = {track: row for row, track in enumerate(before.id.tolist())}
+            places = np.full((len(tracks), 3), np.nan, np.float32)
+            for row, track in enumerate(tracks.id.tolist()):
+                if track in rows:
+                    places[row] = before.boxes.center[rows[track]]
+            columns.insert(0, places)
+            earlier -= 1
+        return np.stack(columns, axis=1).astype(np.float32)
 
     # --- single frames -------------------------------------------------------------------------
 
@@ -304,13 +389,12 @@ class RecordedDrive(Source, Observer[FrameResult]):
         at, number = self._recorded_at(stamp) or self._stamps[0]
         if self.over or stamp <= self._reached or abs(stamp - at) <= entities.TIME_TOLERANCE:
             return number
-        with self._looking:
-            return self._find_frame(stamp, number)
+        return self._find_frame(stamp, number)
 
     def _find_frame(self, stamp: int, start: int) -> int:
         """Return the last frame that is not later. The search starts at the estimate from the log times."""
-        scans, frame = self.drive.frames.scans, self.look(start).frame
-        number = int(np.abs(scans - (stamp + int(scans[start]) - frame.stamp)).argmin())
+        scans = self.drive.frames.scans
+        number = int(np.abs(scans - (stamp + int(scans[start]) - self._stamp_of(start))).argmin())
         while number > 0 and self._stamp_of(number) > stamp + entities.TIME_TOLERANCE:
             number -= 1
         while number + 1 < len(scans) and self._stamp_of(number + 1) <= stamp + entities.TIME_TOLERANCE:
@@ -319,17 +403,27 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def _stamp_of(self, number: int) -> int:
         """Return the stamp of a frame, or its log time if the frame cannot be read."""
-        frame = self.drive.frames.frame(number)
-        return int(self.drive.frames.scans[number]) if frame is None else frame.stamp
+        if number in self._stamp_by_number:
+            return self._stamp_by_number[number]
+        with self._looking, suppress(UserError):
+            return self._read(number).stamp
+        return int(self.drive.frames.scans[number])
+
+    def _read(self, number: int) -> Frame:
+        """Return a frame before any stage. Call it with ``_looking``.
+
+        Raises:
+            UserError: there is no such frame, or it cannot be read.
+        """
+        if number not in self._raw:
+            self._raw[number] = self.drive.raw(number)
+            while len(self._raw) > RAW:
+                self._raw.popitem(last=False)
+        return self._raw[number]
 
     def tracks(self, number: int) -> Tracks | None:
         """Return the tracks that the run found in a frame. None: it has not reached the frame."""
         return self._tracks.get(number)
-
-    @property
-    def desk_pieces(self) -> int:
-        """Number of pieces in ``desk``."""
-        return len(self.desk)
 
     def frame_times(self) -> list[tuple[int, int]]:
         """Return stamp and number of each recorded frame."""
@@ -343,23 +437,30 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """
         key = number, settings
         with self._looking:
-            if key not in self._results:
+            making = self._making[key]
+        with making:
+            with self._looking:
+                if key in self._results:
+                    self._results.move_to_end(key)
+                    return self._results[key]
                 config = self.configured(settings)
                 check_same_frames({"the drive": self.drive.config, "what is tried": config})
                 known_frames = [result.frame for (n, _), result in self._results.items() if n == number]
-                frame = known_frames[0] if known_frames else self.drive.raw(number)
-                self._results[key] = add_explanations(self._variants.perceive(frame, config))
+                frame = known_frames[0] if known_frames else self._read(number)
+            result = add_explanations(self._variants.perceive(frame, config))
+            with self._looking:
+                self._results[key] = result
+                self._making.pop(key, None)
                 while len(self._results) > KEPT:
                     self._results.popitem(last=False)
-            self._results.move_to_end(key)
-            return self._results[key]
+        return result
 
     def look_aside(self, number: int) -> FrameResult:
         """Return the result of a frame as opened. A question waits at most until the frame is read."""
         with self._looking:
             if (known := self._results.get((number, ()))) is not None:
                 return known
-            frame = self.drive.raw(number)
+            frame = self._read(number)
         return self.pipeline.run_single(frame)
 
     def configured(self, settings: Settings) -> Config:
@@ -374,24 +475,42 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
         """Return the selection of a click in a frame: a finding, or see ``select_click``."""
-        rows = self._layers.get((number, bool(settings)), {}).get(path, ())
+        rows = self.film.findings_of(number, settings, path)
         if instance is not None and 0 <= instance < len(rows):
             return rows[instance].selection
         return select_click(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
-    def mark(self, result: FrameResult, answer: Answer) -> None:
-        """Mark the object of an answer in every view."""
-        mark_answers(self._marker, result.frame, [answer], result.config.bev)
-        self.desk.add(self._desk_stream.read())
+    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None) -> None:
+        """Mark the object of an answer in every view of a page."""
+        if desk is not None:
+            mark_answers(desk.marker, result.frame, [answer], result.config.bev)
+            desk.add_marks()
 
-    def try_values(self, number: int, settings: Settings) -> tuple[FrameResult, FrameResult]:
-        """Log a frame with other values. Return its result before and after.
+    def try_values(
+        self, number: int, settings: Settings, attempt: Attempt | None = None
+    ) -> tuple[FrameResult, FrameResult]:
+        """Log a frame with other values for a page. Return its result before and after.
 
         Raises:
-            UserError: as ``look``.
+            UserError: as ``look``, or the attempt was stopped.
         """
+        if attempt is not None:
+            attempt.check()
         before, after = self.look(number), self.look(number, settings)
-        self.draw_tried(self._tried_logger, self.explainer(after))
-        self._tried_logger.flush()
-        self.desk.add(self._desk_stream.read())
+        if attempt is not None:
+            attempt.check()
+            self.film.draw_tried(attempt.logger, self.explainer(after), settings, attempt.desk.known)
+            attempt.logger.flush()
+            attempt.desk.add_tried(attempt)
         return before, after
+
+
+class _OverviewObserver(Observer[FrameResult]):
+    """Observer of the overview."""
+
+    def __init__(self, drive: RecordedDrive) -> None:
+        self._drive = drive
+
+    def observe(self, result: FrameResult) -> None:
+        """Pass the result on."""
+        self._drive.observe_single(result)

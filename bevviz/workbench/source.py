@@ -17,6 +17,7 @@ from bevviz.pipeline.session import Session
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.workbench.buffers import News, PageState, Reader
+from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.findings import FindingList
 
 Settings = tuple[str, ...]
@@ -90,6 +91,11 @@ class Source(Closable):
                 self._remarks[number, pick] = self._aside.with_hints(answer).remark
             return self._remarks[number, pick]
 
+    @property
+    def on_demand(self) -> bool:
+        """Whether a page gets a frame of the recording only when it looks at it."""
+        return False
+
     @abstractmethod
     def progress(self) -> dict[str, Any]:
         """Return the progress of the run for the page."""
@@ -128,10 +134,12 @@ class Source(Closable):
     def frame_times(self) -> list[tuple[int, int]]:
         """Return stamp and number of each frame that a page can show."""
 
-    @property
-    def desk_pieces(self) -> int:
-        """Number of pieces with answers and tried results that a page gets beside the run."""
-        return 0
+    def open_desk(self) -> Desk | None:
+        """Return a new desk for a page. None: all pages share one recording."""
+        return None
+
+    def close_desk(self, desk: Desk) -> None:
+        """Remove a desk whose page is closed."""
 
     def asked_settings(self, settings: Settings, again: bool) -> Settings:
         """Return the settings that a question is about.
@@ -149,15 +157,17 @@ class Source(Closable):
         """Return the selection of a click in a frame, see ``bevviz.why.click.select_click``."""
 
     @abstractmethod
-    def mark(self, result: FrameResult, answer: Answer) -> None:
-        """Mark the object of an answer in every view."""
+    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None) -> None:
+        """Mark the object of an answer in every view of the page of a desk."""
 
     @abstractmethod
-    def try_values(self, number: int, settings: Settings) -> tuple[FrameResult, FrameResult]:
-        """Show a frame with other values. Return its result before and after.
+    def try_values(
+        self, number: int, settings: Settings, attempt: Attempt | None = None
+    ) -> tuple[FrameResult, FrameResult]:
+        """Show a frame with other values to the page of an attempt. Return its result before and after.
 
         Raises:
-            UserError: as ``look``.
+            UserError: as ``look``, or the attempt was stopped.
         """
 
     @abstractmethod

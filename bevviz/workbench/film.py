@@ -1,0 +1,216 @@
+"""Recording of a drive in pieces for the pages: all of a short drive, frames on demand of a long one."""
+
+from __future__ import annotations
+
+import bisect
+import threading
+import time
+from collections.abc import Sequence
+
+import rerun as rr
+
+from bevviz.config import Config
+from bevviz.model.frame import Scene
+from bevviz.model.results import FrameResult
+from bevviz.recording import blueprints, entities
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.writer import SCALAR_WAIT
+from bevviz.support.contexts import Closable
+from bevviz.why import FrameExplainer
+from bevviz.workbench.buffers import FrameCache, RecordingBuffer
+from bevviz.workbench.findings import Finding, find_findings
+from bevviz.workbench.findings_layer import FindingRows, log_layer
+from bevviz.workbench.source import Settings
+
+WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
+TOGETHER = 50, 800  # frames whose numbers are sent together: the first ones, and most
+BOTH = (entities.STAMP, entities.TRIED)
+
+
+class Film(Closable):
+    """Recording of a drive.
+
+    A frame of the drive as opened is logged on the timelines ``stamp`` and ``tried``. One with other values
+    is logged on ``tried`` alone. A viewer shows one or the other by its choice of timeline.
+
+    Args:
+        scene: names of the sensors.
+        config: configuration of the drive.
+        total: number of frames of the drive.
+
+    Attributes:
+        rows: pieces that every page gets. The first has the layout, the static data and a frame.
+        on_demand: whether pages get further frames only on demand, because they hold no whole recording.
+        recording_id: recording id of all pieces.
+    """
+
+    def __init__(self, scene: Scene, config: Config, total: int) -> None:
+        self._scene, self._config, self._total = scene, config, total
+        self.rows, self.on_demand = RecordingBuffer(), False
+        self._frames: FrameCache | None = None
+        self._frame_versions: dict[int, int] = {}  # of the frames in ``_frames``
+        self._rows_by_stamp: dict[int, int] = {}
+        self._drawn: list[tuple[int, int, int]] = []  # stamp, number and receive time, sorted
+        self._layers: dict[tuple[int, Settings], FindingRows] = {}  # by frame number and settings
+        self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
+        self._drawing = threading.Lock()  # guards the frames on demand, and the logger that draws them
+        self._waiting_numbers = 0  # frames whose numbers are logged and not sent
+        self._together = TOGETHER[0]  # Few large pieces take a quarter of the bytes of many small ones.
+        self.recording_id = f"bench-{time.time_ns()}"
+        recording, self._stream = self.stream()
+        recording.send_blueprint(blueprints.load("workbench", scene, config), make_active=True)
+        self._logger = FrameLogger(recording, config, scene, wait=SCALAR_WAIT, stamps=BOTH)
+        self._logger.apart = True  # Pages receive frames in any order, so each is complete.
+        self._logger.log_static()
+        self._numbers: FrameLogger | None = None  # logger of the numbers of a long drive
+
+    def close(self) -> None:
+        """Delete all pieces."""
+        self._stream.read()  # Rerun warns about a binary stream with unread data.
+        if self._numbers is not None:
+            self._numbers_stream.read()
+        self.rows.close()
+        if self._frames is not None:
+            self._frames.close()
+
+    def stream(
+        self, batches: rr.ChunkBatcherConfig | None = None
+    ) -> tuple[rr.RecordingStream, rr.BinaryStream]:
+        """Return a new stream into the recording, for a further thread that writes to it."""
+        application = blueprints.application_id("workbench", self._scene, self._config)
+        recording = rr.RecordingStream(application, recording_id=self.recording_id, batcher_config=batches)
+        recording.set_log_time_enabled(False)
+        return recording, rr.binary_stream(recording)
+
+    def mark_logger(self) -> tuple[FrameLogger, rr.BinaryStream]:
+        """Return a logger of marks, and its stream."""
+        recording, stream = self.stream()
+        return FrameLogger(recording, self._config, self._scene, stamps=BOTH), stream
+
+    def tried_logger(self, config: Config | None = None) -> tuple[FrameLogger, rr.BinaryStream]:
+        """Return a logger that writes tried results on a timeline of their own, and its stream.
+
+        Args:
+            config: configuration of the results. None: that of the drive.
+        """
+        recording, stream = self.stream()
+        config, stamps = config or self._config, (entities.TRIED,)
+        return FrameLogger(
+            recording, config, self._scene, wait=SCALAR_WAIT, stamps=stamps, inputs=False
+        ), stream
+
+    # --- frames as opened ----------------------------------------------------------------------
+
+    def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
+        """Record a frame for all pages, which may come before frames that were recorded already.
+
+        The first one decides whether the others come on demand.
+        """
+        with self._drawing:
+            piece = self._drawn_piece(result, findings)
+        if not self._rows_by_stamp and len(piece) * self._total > WHOLE:
+            self._frames, self.on_demand = FrameCache(), True
+            self._logger.streams_video = False  # A page may lack the packets that a picture depends on.
+        self._rows_by_stamp[result.frame.stamp] = len(self.rows)
+        self.rows.add(piece)
+
+    def row(self, stamp: int) -> int | None:
+        """Return the row of the frame with this stamp."""
+        return self._rows_by_stamp.get(stamp)
+
+    def frame(self, number: int, version: int) -> bytes | None:
+        """Return the piece of a frame, if it is kept in this version."""
+        if self._frames is None or self._frame_versions.get(number) != version:
+            return None
+        return self._frames.get(number)
+
+    def draw(self, result: FrameResult, findings: Sequence[Finding], version: int) -> bytes:
+        """Return the piece of a frame on demand. It is complete in itself."""
+        assert self._frames is not None
+        with self._drawing:
+            self._logger.refresh()
+            piece = self._drawn_piece(result, findings)
+            self._frames.put(result.frame.index, piece)
+            self._frame_versions[result.frame.index] = version
+        return piece
+
+    def _drawn_piece(self, result: FrameResult, findings: Sequence[Finding]) -> bytes:
+        """Log a frame. The next frame of those that were drawn before clears what it did not know of."""
+        frame, logger = result.frame, self._logger
+        known, time_of = logger.known, (frame.stamp, frame.index, frame.received)
+        self._log(logger, result, findings, ())
+        place = bisect.bisect_left(self._drawn, time_of)
+        if self._drawn[place : place + 1] != [time_of]:
+            self._drawn.insert(place, time_of)
+        if new := logger.known - known if place + 1 < len(self._drawn) else ():
+            stamp, number, received = self._drawn[place + 1]
+            logger.clear_at(number, stamp, received, frozenset(new))
+        if self.on_demand:
+            logger.flush()
+        return self._stream.read() or b""
+
+    def add_numbers(self, result: FrameResult) -> None:
+        """Record the numbers and states of the next frame of the run, of which pages get no frame."""
+        if self._numbers is None:
+            recording, self._numbers_stream = self.stream(rr.ChunkBatcherConfig.NEVER())
+            self._numbers = FrameLogger(
+                recording, self._config, self._scene, wait=float("inf"), stamps=BOTH, inputs=False
+            )
+        self._numbers.log_numbers(result)
+        self._waiting_numbers += 1
+        if self._waiting_numbers >= self._together:
+            self._together = min(2 * self._together, TOGETHER[1])
+            self.flush()
+
+    def flush(self) -> None:
+        """Record what waits of the run."""
+        self._waiting_numbers = 0
+        with self._drawing:
+            self._logger.flush()
+            self.rows.add(self._stream.read())
+        if self._numbers is not None:
+            self._numbers.flush()
+            self.rows.add(self._numbers_stream.read())
+
+    # --- frames with other values --------------------------------------------------------------
+
+    def draw_tried(
+        self,
+        logger: FrameLogger,
+        explainer: FrameExplainer,
+        settings: Settings,
+        known: frozenset[str] = frozenset(),
+    ) -> None:
+        """Log a frame with these settings beside the result of the run. Clear what is ``known`` of others."""
+        result = explainer.traces.result
+        logger.refresh(self._logger.results | known)
+        # The colours of the cloud show ground and obstacles. A frame that was recoloured once is
+        # always drawn again, so that its colours change back, too.
+        config, opened, number = result.config, self._config, result.frame.index
+        if (config.voxel, config.ground) != (opened.voxel, opened.ground):
+            self._recoloured.add(number)
+        self._log(logger, result, find_findings(explainer), settings, cloud=number in self._recoloured)
+
+    def findings_of(self, number: int, settings: Settings, path: str) -> Sequence[Finding]:
+        """Return the findings behind the rows of an entity in a frame."""
+        return self._layers.get((number, settings), {}).get(path, ())
+
+    def _log(
+        self,
+        logger: FrameLogger,
+        result: FrameResult,
+        findings: Sequence[Finding],
+        settings: Settings,
+        *,
+        cloud: bool = False,
+    ) -> None:
+        layers: list[FindingRows] = []
+
+        def log_more() -> None:
+            layers.append(log_layer(logger, result, findings))
+
+        if self.on_demand and not settings:
+            logger.log_frame(result, log_more)
+        else:
+            logger.log(result, log_more=log_more, cloud=cloud)
+        self._layers[result.frame.index, settings] = layers[0]

@@ -1,0 +1,75 @@
+"""Overview of a long drive: single frames in an order that covers the whole drive early."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+
+from bevviz.model.frame import Frame, Scene
+from bevviz.model.protocols import FrameSource
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import add_explanations, perceive
+from bevviz.pipeline.session import Session
+
+LEAST = 128  # frames of a drive that gets an overview; a shorter one is run in order almost as soon
+STEP = 8  # frames from one to the next at the end of the overview, which takes an eighth of the whole run
+
+
+def overview_order(total: int) -> list[int]:
+    """Return every eighth frame number. Any beginning of the list is spread evenly over the drive."""
+    step = 1 << max(total - 1, 0).bit_length()
+    numbers = list(range(0, total, step))
+    while step > STEP:
+        step //= 2
+        numbers += range(step, total, 2 * step)
+    return numbers
+
+
+class OverviewFrames:
+    """Frames of the overview as the items of a run. Those that cannot be read are left out.
+
+    Args:
+        source: the drive.
+    """
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source, self._numbers = source, overview_order(len(source.scans))
+
+    @property
+    def scene(self) -> Scene:
+        """Names that entities and blueprints are made from."""
+        return self._source.scene
+
+    @property
+    def total(self) -> int:
+        """Number of frames of the overview."""
+        return len(self._numbers)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Losses and suspicious data so far, one sentence each."""
+        return self._source.warnings
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in self._numbers:
+            if (frame := self._source.frame(number)) is not None:
+                yield frame
+
+
+class SingleFrames:
+    """Processor of frames in any order, without tracks and anomalies, which need the frames before.
+
+    Args:
+        session: session with the configuration and the networks.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
+        """Run the stages on a frame."""
+        return perceive(frame, self._session.config, self._session.stages, network=network)
+
+    def finish(self, result: FrameResult) -> FrameResult:
+        """Add the explanations to a result."""
+        return add_explanations(result, seen=False)

@@ -1,0 +1,122 @@
+"""Findings of whole runs in the store of results: a drive that was run before shows its list at once."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from bevviz.bags.remote import address_of
+from bevviz.config import Config, values
+from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key, with_weights
+from bevviz.recording.provenance import model_path, versions
+from bevviz.support.files import file_hash
+from bevviz.workbench.findings import FindingFrame
+
+
+@dataclass(frozen=True, slots=True)
+class StoredGroup:
+    """Group of findings as it is stored."""
+
+    what: str
+    name: str
+    frames: list[FindingFrame]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRun:
+    """List of a complete run.
+
+    Attributes:
+        groups: the findings.
+        frames: stamp and number of each frame.
+    """
+
+    groups: list[StoredGroup]
+    frames: list[tuple[int, int]]
+
+
+_RUN = TypeAdapter(StoredRun)
+
+
+class RunTable:
+    """Place of the list of one drive with one configuration in the store.
+
+    Args:
+        store: the store of results.
+        key: key of the drive, the configuration and the code.
+    """
+
+    def __init__(self, store: ResultStore, key: bytes) -> None:
+        self._store, self._key = store, key
+
+    def load(self) -> StoredRun | None:
+        """Return the list of an earlier run. None: there is none, or it is damaged."""
+        content = self._store.get(self._key)
+        if content is None:
+            return None
+        try:
+            return _RUN.validate_json(zlib.decompress(content))
+        except (zlib.error, ValidationError):
+            return None
+
+    def save(self, run: StoredRun) -> None:
+        """Keep the list of a complete run."""
+        self._store.put(self._key, zlib.compress(json.dumps(asdict(run)).encode(), 1))
+
+
+def run_table(
+    paths: Iterable[Path], config: Config, provider: str, labels: Iterable[str | Path | None]
+) -> RunTable | None:
+    """Return the place of the list of a drive.
+
+    None: there is no store, the drive is not on this machine and may have changed, or functions of the user
+    run, whose results may depend on anything.
+
+    Args:
+        paths: files and folders that the drive is read from.
+        config: configuration of the run.
+        provider: provider of the networks.
+        labels: topic, and file or folder, of the ground truth that the user states.
+    """
+    store = open_store(config.store.size)
+    paths = list(paths)
+    if store is None or config.functions or any(map(address_of, paths)):
+        return None
+    model = model_path(config)
+    files = [Path(text) for text in _strings(list(values(config).values()))]
+    files = [path for path in files if path.is_file()]
+    for path in [path for path in (model, *files) if path is not None and path.suffix == ".onnx"]:
+        files += with_weights(path)
+    facts = [config.model_dump_json(), provider, str(sorted(versions().items())), code_hash("")]
+    facts += [file_hash(path) for path in files]
+    for stated in [*paths, *labels]:
+        facts.append(str(stated))
+        if isinstance(stated, Path):
+            facts += map(_state_of, _files(stated.resolve()))
+    return RunTable(store, store_key("run", *facts))
+
+
+def _strings(value: object) -> Iterator[str]:
+    """Yield the texts in the values of parameters, which may be names of files."""
+    if isinstance(value, str) and value:
+        yield value
+    elif isinstance(value, Mapping):
+        yield from _strings(list(value.values()))
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for inner in value:
+            yield from _strings(inner)
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+
+
+def _state_of(file: Path) -> str:
+    """Return path, size and time of a file. A file that changed has another one."""
+    state = file.stat()
+    return f"{file} {state.st_size} {state.st_mtime_ns}"

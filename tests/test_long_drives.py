@@ -1,0 +1,223 @@
+"""Long drives in the workbench: the overview before the run in order, and frames on demand."""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rerun.chunk import RrdReader
+
+import bevviz
+from bevviz.config import load
+from bevviz.drive import Drive
+from bevviz.pipeline import result_store
+from bevviz.pipeline.run import run
+from bevviz.recording import entities
+from bevviz.why import Selection
+from bevviz.workbench import film, recorded_drive
+from bevviz.workbench.buffers import FrameCache, PageState
+from bevviz.workbench.findings import CELL, Finding, FindingFrame, FindingList
+from bevviz.workbench.overview import STEP, overview_order
+from bevviz.workbench.recorded_drive import RecordedDrive
+from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
+from tests.support.waiting import until
+from tests.support.workbench_pages import FRAMES, demo_bag
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return demo_bag(tmp_path_factory.mktemp("long"))
+
+
+@pytest.fixture
+def drives(bag: Path) -> Iterator[tuple[Drive, Drive]]:
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        yield drive, again
+
+
+def finding(frame: int, row: int, x: float) -> Finding:
+    """Return a missed person."""
+    return Finding(frame, frame * 10**8, "missed", "person", 5.0, Selection(truth=row), position=(x, 0, 0))
+
+
+def groups(listed: FindingList) -> list[list[int]]:
+    """Return the frames of each group."""
+    news: list[dict[str, Any]] = list(listed.news({}))
+    return [[sight[0] for sight in entry["sights"]] for entry in news[0]["entries"]] if news else []
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Give the process a store of its own."""
+    result_store._opened.cache_clear()
+    monkeypatch.setenv("BEVVIZ_STORE", str(tmp_path / "store"))
+    yield
+    result_store._opened.cache_clear()
+
+
+def whole_list(drive: RecordedDrive, passes: set[str]) -> list[list[int]]:
+    """Run a drive and return the groups of its list. Collect the names of its passes."""
+    drive.news.listen(lambda: passes.add(str(drive.progress()["pass"])))
+    drive.start()
+    until(lambda: drive.over)
+    assert drive.progress()["done"] == FRAMES and not drive.progress()["error"]
+    drive.film.close()
+    return groups(drive.findings)
+
+
+@pytest.mark.parametrize("total", [0, 1, 128, 1000, 18000])
+def test_any_beginning_of_an_overview_covers_the_drive(total: int) -> None:
+    order = overview_order(total)
+    assert sorted(order) == list(range(0, total, STEP))
+    for count in (5, 40, 300):
+        begun = [*sorted(order[:count]), total]
+        gaps = [later - earlier for earlier, later in pairwise(begun)]
+        assert max(gaps, default=0) <= max(STEP, 4 * total / min(count, len(order) or 1))
+
+
+def test_findings_of_single_frames_end_where_the_run_comes() -> None:
+    """Near ones are grouped within their part of the drive, in any order of the frames."""
+    listed = FindingList()
+    for frame in (0, 2 * CELL, CELL, CELL + 8, 8):
+        listed.add_overview(frame, [finding(frame, 1, 3.0), finding(frame, 2, 30.0)])
+    assert groups(listed) == [[0, 8], [0, 8], [2 * CELL], [2 * CELL], [CELL, CELL + 8], [CELL, CELL + 8]]
+    listed.end_overview(3)
+    listed.add([finding(3, 1, 3.0)])
+    assert groups(listed)[-1] == [3]
+    assert [0, 8] not in groups(listed) and [CELL, CELL + 8] in groups(listed)
+
+
+def test_the_run_replaces_the_overview(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The list is that of a run without an overview."""
+    monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
+    lists, passes = [], set[str]()
+    for least in (FRAMES, FRAMES + 1):
+        monkeypatch.setattr(recorded_drive, "LEAST", least)
+        lists.append(whole_list(RecordedDrive(drives[0], drives[1].frames), passes))
+    assert lists[0] == lists[1] and lists[0]
+    assert passes == {"overview", "run"}
+
+
+# --- frames on demand ---------------------------------------------------------------------------
+
+
+def test_the_oldest_frames_of_a_cache_make_room() -> None:
+    with FrameCache(100) as cache:
+        for number in range(5):
+            cache.put(number, bytes([number]) * 30)
+        assert [cache.get(number) is not None for number in range(5)] == [False, False, True, True, True]
+        cache.put(3, b"again" * 6)
+        cache.put(9, bytes(101))
+        assert cache.get(3) == b"again" * 6 and cache.get(4) == bytes([4]) * 30
+        assert cache.get(9) is None
+
+
+@pytest.fixture
+def long_drive(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> Iterator[RecordedDrive]:
+    """Yield a drive whose recording is too large for a browser, before its run."""
+    monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
+    monkeypatch.setattr(film, "WHOLE", 0)
+    drive = RecordedDrive(drives[0], drives[1].frames)
+    drive.show(drive.look(0), ())
+    yield drive
+    drive.film.close()
+
+
+def test_a_page_gets_the_frames_that_it_looks_at(long_drive: RecordedDrive) -> None:
+    """First the requested one, then its neighbours. Tracks come with the run."""
+    state = PageState()
+    stamps = [long_drive.drive.raw(number).stamp for number in range(FRAMES)]
+    with long_drive.reader("film", 0, state) as reader:
+        assert len(reader.take()) == 1 and reader.take() == ()  # the layout with the first frame
+        state.requested += [stamps[1], stamps[4]]
+        numbers = []
+        while sent := reader.take():
+            numbers.append(int(sent[0]))
+            state.take("")
+        assert numbers == [4, 5, 3]
+        run(long_drive.again, long_drive.drive.new_session(), [long_drive])
+        while len(reader.take()) == 1:  # the numbers of the run
+            state.take("")
+        state.requested.append(stamps[4])
+        number, piece = reader.take()
+        assert number == "4"
+        assert long_drive.film.frame(4, 1) == piece
+    assert [number for _, number in long_drive.frame_times()] == list(range(FRAMES))
+
+
+def test_frames_on_demand_are_complete_in_any_order(long_drive: RecordedDrive, tmp_path: Path) -> None:
+    """A viewer that has some of them shows nothing of the others, and the numbers of all."""
+    run(long_drive.again, long_drive.drive.new_session(), [long_drive])
+    pieces = {number: long_drive.piece(number, wanted=True) for number in (5, 2, 3)}
+    tracks = long_drive.tracks(3)
+    assert tracks is not None
+    shown = entities_at(tmp_path, pieces)
+    assert {entities.TRAILS, entities.image("zed"), entities.points("rslidar")} <= shown[2] & shown[
+        3
+    ] & shown[5]
+    numbers = [long_drive.film.rows[row] for row in range(1, len(long_drive.film.rows))]
+    totals = entities_at(tmp_path, dict(enumerate(numbers)))
+    assert {entities.count("clusters"), entities.stage_time("total")} <= set.union(*totals.values())
+    assert not any(path.startswith(entities.WORLD) for paths in totals.values() for path in paths)
+
+
+def entities_at(folder: Path, pieces: dict[int, bytes | None]) -> dict[int, set[str]]:
+    """Return the entities with data other than a clear in each piece."""
+    found: dict[int, set[str]] = {}
+    for number, piece in pieces.items():
+        assert piece is not None
+        (path := folder / "piece.rrd").write_bytes(piece)
+        found[number] = {
+            chunk.entity_path
+            for chunk in RrdReader(path).stream()
+            if not any("Clear" in name for name in chunk.to_record_batch().schema.names)
+        }
+    return found
+
+
+# --- lists of earlier runs ----------------------------------------------------------------------
+
+
+def test_a_drive_that_was_run_before_shows_its_list_at_once(
+    drives: tuple[Drive, Drive], bag: Path, store: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run goes on behind it and adds nothing twice."""
+    monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
+    table = run_table([bag], drives[0].config, "", [None])
+    assert table is not None and table.load() is None
+    first = whole_list(RecordedDrive(drives[0], drives[1].frames, table=table), set())
+    again, passes = RecordedDrive(drives[0], drives[1].frames, table=table), set[str]()
+    again._load_list()
+    assert groups(again.findings) == first != []
+    assert len(again.frame_times()) == FRAMES
+    again.film.close()
+    assert whole_list(RecordedDrive(drives[0], drives[1].frames, table=table), passes) == first
+    assert passes == {"again"}
+
+
+def test_a_list_belongs_to_one_drive_and_configuration(bag: Path, store: None, tmp_path: Path) -> None:
+    """A bag that changed, other values and a damaged entry have none."""
+    (copy := tmp_path / "copy.mcap").write_bytes(b"content")
+    frame = FindingFrame(3, 5, math.nan, "truth=1")
+    stored = StoredRun([StoredGroup("missed", "person", [frame])], [(5, 3)])
+
+    def table(*settings: str, labels: Sequence[str | Path | None] = ()) -> RunTable:
+        made = run_table([copy], load(None, ["detector.model=demo", *settings]), "", labels)
+        assert made is not None
+        return made
+
+    table().save(stored)
+    found = table().load()
+    assert found is not None and repr(found) == repr(stored)
+    assert table("clustering.eps=0.7").load() is None
+    assert table(labels=["/truth"]).load() is None
+    os.utime(copy, ns=(1, 1))
+    assert table().load() is None
+    table()._store.put(table()._key, zlib.compress(b'{"groups": 3}'))
+    assert table().load() is None
