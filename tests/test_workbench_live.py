@@ -29,7 +29,7 @@ from bevviz.workbench.session import WorkbenchSession
 from tests.support.live_sessions import live_bench
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, until
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 HELD = 4
@@ -188,8 +188,14 @@ def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     assert talk.until("tried", number)["effects"]["fixed"]
     number = talk.send(type="try", time=stamp, set=["clustering.eps=-1"])
     assert "must be greater than 0" in talk.until("tried", number)["text"]
-    number = talk.send(type="report", time=stamp, text="", before=1, after=1)
-    assert "a drive that is over" in talk.until("report", number)["text"]
+    number = talk.send(type="note", time=stamp, text="", pick="")
+    assert "a drive that is over" in talk.until("noted", number)["text"]
+    talk.send(type="report", time=int(later["stamp"]), set=[], text="odd", before=0.5, after=0.5)
+    report: dict[str, Any] = {"state": "running"}
+    while report["state"] == "running":
+        report = (talk.until("progress").get("reports") or [report])[-1]
+    assert report["state"] == "over", report["error"]
+    assert {Path(file["name"]).suffix for file in report["files"]} == {".rrd", ".html", ".mcap"}
 
     talk.send(type="mark", time=stamp, text="odd")
     said = talk.until("said")["text"]
@@ -232,7 +238,7 @@ def test_only_the_newest_frames_and_those_held_are_there(
         bench.observe(result)
     assert bench.look(1) is first
     assert bench.number_at(results[-1].frame.stamp + 10**7) == results[-1].frame.index
-    with pytest.raises(UserError, match=f"the newest {HELD} can be asked about"):
+    with pytest.raises(UserError, match=r"that frame is gone: the last \d s can be asked about"):
         bench.number_at(results[0].frame.stamp)
     with pytest.raises(UserError, match="frame 0 is gone"):
         bench.look(0)
@@ -242,6 +248,24 @@ def test_only_the_newest_frames_and_those_held_are_there(
     with pytest.raises(UserError, match="frame 1 is gone"):
         bench.look(1)
     assert len(bench._held()) == HELD + KEPT
+
+
+def test_a_page_says_that_no_frame_comes(
+    bench: RunningRobot, results: list[FrameResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The only LiDAR is silent: its state is a piece of the recording, at which the page learns of it."""
+    news: list[str] = []
+    live = bench.live
+    live.log(results[0])
+    assert bench.progress()["error"] == ""
+    bench.news.listen(lambda: news.append(bench.progress()["error"]))
+    states = {"/points": "silent", "/camera": "ok"}
+    monkeypatch.setattr(live._source._source, "states", states, raising=False)
+    monkeypatch.setattr(live, "_logged", time.monotonic() - 2)
+    live._log_meanwhile()
+    until(lambda: "no frame comes: /points (silent)" in news)
+    live.log(results[1])
+    assert bench.progress()["error"] == ""
 
 
 def test_a_held_frame_can_be_asked_with_other_values(bench: RunningRobot, results: list[FrameResult]) -> None:

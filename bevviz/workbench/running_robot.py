@@ -1,11 +1,17 @@
-"""A running robot as the source of a page: its newest frames are kept and can be asked about."""
+"""A running robot as the source of a page: every frame of the held seconds can be asked about.
+
+The results of the newest frames are in memory. Earlier ones are made again from the messages.
+"""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import rerun as rr
@@ -14,31 +20,48 @@ from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
 from bevviz.live.encoder import sample_rows
-from bevviz.live.runtime import Live
+from bevviz.live.runtime import Live, ObservingSession
+from bevviz.live.status import give_way
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Variants
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.sinks import APPLICATION
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.workbench.buffers import PageState, Reader
+from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.findings import find_findings
+from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
+from bevviz.workbench.reports import ReportedBag, ReportMaker
+from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.source import Message, Settings, Source
 
 KEPT = 4  # held frames that are kept
+MADE = 3  # frames made again that are kept
+BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame needs
+BAGS = 2  # bags of held seconds that are kept: a report may be cut from the one before the newest
+LISTED_FRAMES = 64  # frames of the held seconds that are listed
 TRIED = 2  # results of held frames with other values that are kept
 LISTED = ("missed", "false", "doubtful", "contradicted", "lost", "unmatched", "unnamed")
+
+
+def robot_session(live: Live) -> WorkbenchSession:
+    """Return the workbench session of a live run that has not started."""
+    robot = RunningRobot(live)
+    session = WorkbenchSession(robot)
+    if live.raw is not None:
+        session.equip(ReportMaker(session, robot.bag_of, Path(live.config.live.flight_folder).absolute()))
+    return session
 
 
 class RunningRobot(Source):
     """Running robot as the source of a page.
 
-    Its newest frames can be asked about. Changed parameters are in force for all later frames.
+    Changed parameters are in force for all later frames.
 
     Args:
         live: the live run, before it starts.
@@ -52,22 +75,35 @@ class RunningRobot(Source):
         super().__init__(live.scene.name, live.session)
         self.live = live
         self.film = LiveBuffer(live, live.config.live.output_queue)
-        self.commands = {"hold": self._hold, "snap": self._snap, "mark": self._mark}
+        self.commands = {"hold": self._hold, "list": self._list, "snap": self._snap, "mark": self._mark}
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
-        self._lock = threading.Lock()  # guards _newest and _kept
+        self._delivered: OrderedDict[int, DeliveredFrame] = OrderedDict()  # of the held seconds, by number
+        self._lock = threading.Lock()  # guards _newest, _kept and _delivered
+        self._made: OrderedDict[int, FrameResult] = OrderedDict()  # frames made again, by number
+        self._bags: deque[HeldSeconds] = deque()
+        self._making = threading.RLock()  # guards _made and _bags
+        self._whole: set[int] = set()  # frames that pages got again, with all points
+        self._listing: threading.Thread | None = None
+        self._stop = threading.Event()  # ends the listing
         self._tried_results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._settings: Settings = ()  # settings that pages have changed
         self._variants = Variants(live.session.loader)
-        recording = rr.RecordingStream(APPLICATION, recording_id=live.encoder.recording_id)
+        encoder = live.encoder
+        recording = rr.RecordingStream(encoder.application, recording_id=encoder.recording_id)
         recording.set_log_time_enabled(False)
         self._marks = rr.binary_stream(recording)
         self._marker = FrameLogger(recording, live.config, live.scene)
         live.attach(self.film, self.observe)
+        self.film.news.listen(self.news.tell)  # There is news while no frame comes, too.
 
     def close(self) -> None:
-        """Close the buffer of the pages."""
+        """Close the buffer of the pages, and delete the bags."""
+        self._end_list()
         self.film.close()
+        with self._making:
+            while self._bags:
+                self._bags.pop().close()
 
     def progress(self) -> dict[str, Any]:
         """Return the progress of the run for the page."""
@@ -77,14 +113,22 @@ class RunningRobot(Source):
             "done": status.frames,
             "total": None,
             "over": True,
-            "error": "",
+            "error": self.live.silence,
             "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
+            "held": [str(stamp) for stamp in self._held_stamps()],
         }
 
     def observe(self, result: FrameResult) -> None:
         """Keep a new frame."""
+        raw = self.live.raw
         with self._lock:
             self._newest.append(result)
+            if raw is not None:
+                self._delivered[result.frame.index] = DeliveredFrame.of(result)
+                oldest = raw.since + BEFORE
+                while self._delivered and next(iter(self._delivered.values())).received < oldest:
+                    number, _ = self._delivered.popitem(last=False)
+                    self._whole.discard(number)
         if result.frame.truth is not None and self.truth_of is None:
             self.truth_of = _truth_in_frame
         self.news.tell()
@@ -101,17 +145,29 @@ class RunningRobot(Source):
         with self._lock:
             return [*self._kept.values(), *self._newest]
 
-    def _shown_at(self, stamp: int) -> tuple[FrameResult | None, FrameResult]:
-        """Return the frame that a viewer shows at a stamp, None if it is gone, and the oldest frame.
+    def _held_stamps(self) -> tuple[int, ...]:
+        """Return the first and last stamp of the frames that can be asked about. Empty: there are none."""
+        stamps = [stamp for stamp, _ in self.frame_times()]
+        return (min(stamps), max(stamps)) if stamps else ()
+
+    def frame_times(self) -> list[tuple[int, int]]:
+        """Return stamp and number of each frame that can be asked about."""
+        with self._lock:
+            results = [*self._kept.values(), *self._newest]
+            times = {frame.stamp: number for number, frame in self._delivered.items()}
+        return sorted({**times, **{result.frame.stamp: result.frame.index for result in results}}.items())
+
+    def _shown_at(self, stamp: int) -> tuple[int | None, int]:
+        """Return the number of the frame that a viewer shows at a stamp, or None, and that of the oldest.
 
         Raises:
             UserError: no frame has come yet.
         """
-        results = sorted(self._held(), key=lambda result: (result.frame.stamp, result.frame.index))
-        if not results:
+        times = self.frame_times()
+        if not times:
             raise UserError("no frame has come yet")
-        earlier = [result for result in results if result.frame.stamp <= stamp + entities.TIME_TOLERANCE]
-        return earlier[-1] if earlier else None, results[0]
+        earlier = [number for at, number in times if at <= stamp + entities.TIME_TOLERANCE]
+        return earlier[-1] if earlier else None, times[0][1]
 
     def number_at(self, stamp: int) -> int:
         """Return the number of the frame that a viewer shows at a stamp.
@@ -119,13 +175,14 @@ class RunningRobot(Source):
         Raises:
             UserError: the frame is no longer in memory.
         """
-        result, _ = self._shown_at(stamp)
-        if result is None:
+        number, _ = self._shown_at(stamp)
+        if number is None:
+            first, last = self._held_stamps()
             raise UserError(
-                f"that frame is gone: the newest {self._newest.maxlen} can be asked about "
-                "(live.held); hold one with H, and ask then"
+                f"that frame is gone: the last {(last - first) / 1e9:.0f} s can be asked about "
+                "(live.flight_time, live.raw_size); hold a frame with H to keep it"
             )
-        return result.frame.index
+        return number
 
     def hold(self, stamp: int) -> FrameResult:
         """Keep the frame that a viewer shows, so that it can be asked about later.
@@ -134,10 +191,13 @@ class RunningRobot(Source):
         frame in memory is held.
 
         Raises:
-            UserError: no frame has come yet.
+            UserError: no frame has come yet, or it cannot be made again.
         """
+        self._end_list()
         shown, oldest = self._shown_at(stamp)
-        result = self.look((shown or oldest).frame.index)
+        number = oldest if shown is None else shown
+        self._show_again(number)
+        result = self.look(number)
         index = result.frame.index
         with self._lock:
             self._kept[index] = result
@@ -149,15 +209,29 @@ class RunningRobot(Source):
         self.news.tell()
         return result
 
+    def _show_again(self, number: int) -> None:
+        """Send a frame again from the flight recorder, if a page was opened after it."""
+        delivered = self._delivered.get(number)
+        if delivered is None or self.film.opened < delivered.logged or number in self._whole:
+            return
+        packets = [packet for packet in self.live.flight.packets() if packet.time <= delivered.logged]
+        start = max((row for row, packet in enumerate(packets) if packet.whole), default=len(packets))
+        for packet in packets[start:]:
+            self.film.add(self.live.encoder.header + packet.data)
+        if start < len(packets):
+            first = packets[start].time
+            with self._lock:
+                again = self._delivered.items()
+                self._whole.update(n for n, one in again if first <= one.logged <= delivered.logged)
+
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
-        """Return the result of a frame in memory, with other values if ``settings`` names some.
+        """Return the result of a held frame, with other values if ``settings`` names some.
 
         Raises:
             UserError: the frame is gone, a parameter is unknown, or a value is wrong.
         """
         result = next((candidate for candidate in self._held() if candidate.frame.index == number), None)
-        if result is None:
-            raise UserError(f"frame {number} is gone: hold one with H, and ask then")
+        result = result or self._make_again(number)
         if not settings:
             return result
         config = changed_config(self.live.config, settings)
@@ -170,13 +244,55 @@ class RunningRobot(Source):
                 self._tried_results.popitem(last=False)
         return self._tried_results[key]
 
+    def _make_again(self, number: int) -> FrameResult:
+        """Return the result of a frame that is made again from the messages, as it was shown.
+
+        Raises:
+            UserError: the frame is gone, or cannot be made again.
+        """
+        with self._making:
+            if number in self._made:
+                self._made.move_to_end(number)
+                return self._made[number]
+            bag, delivered = self._bag(number)
+            frame, config = bag.frame(delivered), delivered.config
+            if isinstance(self.live.session, ObservingSession):
+                result = FrameResult.unprocessed(frame, config)
+            else:
+                result = add_explanations(self._variants.perceive(frame, config))
+            self._made[number] = result = replace(result, tracks=delivered.tracks)
+            while len(self._made) > MADE:
+                self._made.popitem(last=False)
+        return result
+
+    def _bag(self, number: int) -> tuple[HeldSeconds, DeliveredFrame]:
+        """Return the bag that has a frame, which is made if no bag has it, and facts about the frame."""
+        for bag in reversed(self._bags):
+            if number in bag.frames:
+                return bag, bag.frames[number]
+        with self._lock:
+            frames = dict(self._delivered)
+        raw = self.live.raw
+        if raw is None or number not in frames:
+            raise UserError(f"frame {number} is gone: hold one with H, and ask then")
+        self._bags.append(HeldSeconds(raw.messages(), frames))
+        while len(self._bags) > BAGS:
+            self._bags.popleft().close()
+        return self._bags[-1], frames[number]
+
+    def bag_of(self, number: int) -> ReportedBag:
+        """Return the bag of a frame for a report.
+
+        Raises:
+            UserError: the frame is gone, or the bag cannot be written.
+        """
+        with self._making:
+            bag, delivered = self._bag(number)
+            return ReportedBag([bag.path], delivered.config, bag.start(delivered))
+
     def tracks(self, number: int) -> Tracks | None:
         """Return the tracks in a frame."""
         return self.look(number).tracks
-
-    def frame_times(self) -> list[tuple[int, int]]:
-        """Return stamp and number of each frame in memory."""
-        return [(result.frame.stamp, result.frame.index) for result in self._held()]
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -193,18 +309,20 @@ class RunningRobot(Source):
     ) -> Selection | None:
         """Return the selection of a click in a frame, see ``select_click``."""
         result = self.look(number)
-        points = result.config.live.viewer_points
+        points = None if number in self._whole else result.config.live.viewer_points
         if instance is not None and points is not None and path == entities.points(result.frame.lidar):
             rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
         return select_click(result, result.tracks, path, instance, position)
 
-    def mark(self, result: FrameResult, answer: Answer) -> None:
-        """Mark the object of an answer in every view."""
+    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None = None) -> None:
+        """Mark the object of an answer in every view of all pages."""
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
         self.film.add(self._marks.read())
 
-    def try_values(self, number: int, settings: Settings) -> tuple[FrameResult, FrameResult]:
+    def try_values(
+        self, number: int, settings: Settings, attempt: Attempt | None = None
+    ) -> tuple[FrameResult, FrameResult]:
         """Change parameters of the running robot. Return the result of one frame before and after.
 
         A parameter that a page changed before and that is not in ``settings`` gets its configured value back.
@@ -229,14 +347,50 @@ class RunningRobot(Source):
         frame = self.hold(round(float(message["time"]))).frame
         return {"type": "held", "frame": frame.index, "stamp": str(frame.stamp)}
 
+    def _list(self, message: Message) -> dict[str, Any]:
+        """Begin to list the findings of the held seconds, frame by frame, at the lowest priority."""
+        self._end_list()
+        numbers = [number for _, number in self.frame_times()]
+        step = -(-len(numbers) // LISTED_FRAMES)
+        self._stop = threading.Event()
+        self._listing = threading.Thread(
+            target=self._list_frames, args=(numbers[::step], self._stop), name="list", daemon=True
+        )
+        self.findings.replace(LISTED)
+        self._listing.start()
+        every = "frame" if step == 1 else f"{step} frames"
+        return {"type": "said", "text": f"Listing the held seconds, each {every} ..."}
+
+    def _list_frames(self, numbers: Sequence[int], stop: threading.Event) -> None:
+        give_way()
+        for number in numbers:
+            start = time.monotonic()
+            with suppress(UserError):  # The frame is gone meanwhile.
+                findings = find_findings(self.explainer(self.look(number)))
+                if stop.is_set():
+                    return
+                self.findings.add(findings)
+                self.news.tell()
+            if stop.wait(time.monotonic() - start):  # The run gets at least half of the time.
+                return
+
+    def _end_list(self) -> None:
+        """End the listing."""
+        self._stop.set()
+        if self._listing is not None:
+            self._listing.join()
+            self._listing = None
+
     def _snap(self, message: Message) -> dict[str, Any]:
         """Save the flight recorder."""
         return {"type": "said", "text": f"saved in {self.live.save()}"}
 
     def _mark(self, message: Message) -> dict[str, Any]:
-        """Log a note at the shown frame, in every recording and on the terminal."""
+        """Mark the shown frame, as a message on the robot's topic of marks does, and on the terminal."""
         number = self.number_at(round(float(message["time"])))
-        text = f"mark at frame {number}: {str(message.get('text', '')).strip() or 'look here'}"
+        text = str(message.get("text", "")).strip() or "look here"
+        self.live.mark(f"{text} (frame {number})")
+        text = f"mark at frame {number}: {text}"
         self.live.notes.info(text)
         return {"type": "said", "text": text}
 

@@ -1,12 +1,11 @@
-// Panel of a running robot: hold a frame, follow the newest one, save the flight recorder, mark a frame.
+// Panel of a running robot: go back, hold a frame, follow the newest one, save the flight recorder, mark a frame.
 
 import { on, send } from "./connection.js";
-import { $ } from "./page_state.js";
-import { goTo } from "./viewer.js";
+import { $, dropFrames, frameTimes } from "./page_state.js";
+import { goTo, seek } from "./viewer.js";
 
 $("robot").hidden = false;
-for (const id of ["drive", "flip"]) $(id).hidden = true; // These need a recorded drive.
-$("words").closest("section").hidden = true;
+for (const id of ["drive", "flip", "note"]) $(id).hidden = true; // These need a recorded drive.
 
 let time = null; // of the viewer, nanoseconds
 let newest = null;
@@ -20,6 +19,34 @@ function say(text, wrong) {
   $("said").className = wrong ? "alarm" : "faint";
 }
 
+// The slider has one step for each frame of the held seconds, which go on. While it is held, they stay.
+let sliding = null; // times of the frames when the slider was taken
+const ago = (times, row) => `${((times.at(-1) - times[row]) / 1e9).toFixed(1)} s ago`;
+export function progress({ held }) {
+  if (held.length) dropFrames(held[0]);
+  const times = frameTimes();
+  $("past").disabled = times.length < 2;
+  if (sliding || times.length < 2) return;
+  const shown = times.findLastIndex((one) => one <= (time ?? newest) + 1000);
+  $("past").max = times.length - 1;
+  $("past").value = Math.max(shown, 0);
+  const gone = time === null ? "" : "longer ago than is held"; // The viewer has drawn nothing yet.
+  $("past-at").textContent = shown < 0 ? gone : ago(times, shown);
+}
+$("past").oninput = () => {
+  sliding ??= frameTimes();
+  const row = Math.min(Number($("past").value), sliding.length - 1);
+  $("past-at").textContent = ago(sliding, row);
+  goTo(String(BigInt(sliding[row])), false);
+};
+$("past").onchange = () => {
+  if (!sliding) return;
+  const wanted = sliding[Math.min(Number($("past").value), sliding.length - 1)];
+  sliding = null;
+  say("Holding the frame ...");
+  send({ type: "hold", time: wanted });
+};
+
 function mark() {
   if (time !== null) send({ type: "mark", time, text: $("mark-text").value });
   $("mark-text").value = "";
@@ -28,7 +55,7 @@ function mark() {
 on({
   held: (message) => {
     say(`Frame ${message.frame} is held: ask about it.`);
-    goTo(message.stamp, false);
+    seek(message.stamp); // The viewer may get the frame only after this message.
   },
   said: (message) => say(message.text, message.wrong),
   gone: () => say("No connection to the robot: the last frame that came is shown.", true),
@@ -38,8 +65,9 @@ on({
 export const actions = {
   h: () => { if (time !== null) send({ type: "hold", time }); },
   f: () => { say("At the newest frame."); if (newest !== null) goTo(String(BigInt(Math.round(newest))), true); },
+  l: () => { say("Listing ..."); send({ type: "list" }); },
   s: () => { say("Saving ..."); send({ type: "snap" }); },
   m: mark,
 };
-for (const [id, key] of [["hold", "h"], ["follow", "f"], ["snap", "s"], ["mark", "m"]]) $(id).onclick = actions[key];
+for (const [id, key] of [["hold", "h"], ["follow", "f"], ["list", "l"], ["snap", "s"], ["mark", "m"]]) $(id).onclick = actions[key];
 $("mark-text").onkeydown = (event) => { if (event.key === "Enter") mark(); };
