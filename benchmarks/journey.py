@@ -97,7 +97,7 @@ def main() -> int:
 def demo(folder: Path, frames: int) -> list[str]:
     bag = folder / "demo.mcap"
     subprocess.run(
-        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", str(frames), "--bag", str(bag)], check=True
+        [sys.executable, "-m", "bevviz.cli", "demo", "--frames", str(frames), "-o", str(bag)], check=True
     )
     return [str(bag), "--model", "demo"]
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import tempfile
 from pathlib import Path
 
 from tqdm import tqdm
 
 from benchmarks import bags
-from benchmarks.measure import Times, machine, run
+from benchmarks.measure import Times, children_time, machine, run
 
 FRAMES = 40  # of the drive
 WANTED = {"why": 1.0, "bag": 2.0}  # seconds
@@ -49,19 +48,14 @@ def measured(bag: Path, saved: Path, repetitions: int) -> list[str]:
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
     for _ in tqdm(range(repetitions), unit="run", disable=None):
         for name, command in commands.items():
-            before = _processor()
+            before = children_time()
             seconds = run(*command).seconds
-            found[name].append((seconds, _processor() - before))
+            found[name].append((seconds, children_time() - before))
     rows = ["| command | s | processor s | wanted |", "| --- | ---: | ---: | ---: |"]
     for name, text in (("why", "`bevviz why`, one frame"), ("bag", "`bevviz bag`, ten frames")):
         clock, processor = (Times(column) for column in zip(*found[name], strict=True))
         rows.append(f"| {text} | {clock} | {processor} | {WANTED[name]:.0f} s |")
     return rows
-
-
-def _processor() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

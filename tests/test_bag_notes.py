@@ -40,7 +40,12 @@ def test_any_text_of_a_note_is_read_back(tmp_path_factory: pytest.TempPathFactor
     assert [note.text for note in notes] == [text]
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"notes": [{"stamp": 1}]}', '{"notes": 3}'])
+WRONG_TYPE = '{"notes": [{"stamp": "now", "received": 0, "text": "a child"}]}'
+
+
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"notes": [{"stamp": 1}]}', '{"notes": 3}', WRONG_TYPE, "[" * 100_000]
+)
 def test_a_file_without_notes_is_left_unchanged(bag: Path, content: str) -> None:
     notes = Notes([bag])
     notes.path.write_text(content)

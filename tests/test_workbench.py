@@ -8,13 +8,14 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
 
 import bevviz
@@ -22,11 +23,12 @@ from bevviz.cli import main
 from bevviz.config import changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
+from bevviz.model import geometry
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.notes import Note, Notes
 from bevviz.pipeline.session import Session
-from bevviz.recording import entities
+from bevviz.recording import blueprints, entities
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
@@ -39,7 +41,20 @@ from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.session import WorkbenchSession
 from tests.support.small_disk import small_disk
 from tests.support.waiting import PATIENCE
-from tests.support.workbench_pages import FRAMES, POLL, chromium, demo_bag, serving, state, until, verdict
+from tests.support.workbench_pages import (
+    FRAMES,
+    POLL,
+    Talk,
+    chromium,
+    demo_bag,
+    events,
+    listed,
+    opened,
+    serving,
+    state,
+    until,
+    verdict,
+)
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -70,21 +85,6 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
-@contextmanager
-def opened(browser: Browser, address: str, width: int = 1400, height: int = 900) -> Iterator[Page]:
-    """Yield the page as soon as the viewer shows a frame."""
-    page = browser.new_page(viewport={"width": width, "height": height})
-    page.add_init_script(
-        "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
-    )
-    try:
-        page.goto(address)
-        until(lambda: events(page, "time_update") or events(page, "timeline_change"))
-        yield page
-    finally:
-        page.close()
-
-
 def click(page: Page, x: float, y: float) -> dict[str, Any]:
     """Until the viewer selects an entity, which is given; without a graphics card it may miss a click."""
     number = len(events(page, "selection_change"))
@@ -110,12 +110,6 @@ def click(page: Page, x: float, y: float) -> dict[str, Any]:
     return found
 
 
-def events(page: Page, kind: str) -> list[dict[str, Any]]:
-    """Return the viewer's events of one kind."""
-    found: list[dict[str, Any]] = page.evaluate("window.seen")
-    return [event for event in found if event["type"] == kind]
-
-
 def subject(page: Page) -> dict[str, Any]:
     """Return the identity of the object that the page's address holds."""
     identity: dict[str, Any] = json.loads(state(page)["pick"][0])
@@ -134,7 +128,7 @@ def new_verdict(page: Page, before: str) -> str:
 def test_a_click_is_answered(browser: Browser, address: str, bag: Path) -> None:
     """On an image, on the line around what was missed in it, in space and from above."""
     pick, (u, v), image = missed_line(bag)
-    with opened(browser, address, 1000, 560) as page:  # a small picture is drawn sooner
+    with opened(browser, address, 1000, 620) as page:  # a small picture is drawn sooner
         before = verdict(page)
 
         def answered_at(x: float, y: float) -> dict[str, Any]:
@@ -218,8 +212,7 @@ def test_the_page_shows_what_was_tried_in_vain(browser: Browser, address: str) -
                 break
         sentence = page.inner_text("#hints")
         assert sentence.startswith(("No ", "Nothing ")) and sentence.endswith(".")
-        until(lambda: page.locator("#found [aria-current=true] small").count())
-        assert page.inner_text("#found [aria-current=true] small") == sentence
+        until(lambda: page.locator("#found [aria-current=true] small").last.inner_text() == sentence)
 
 
 def test_the_first_rows_show_a_hint_or_a_sentence(browser: Browser, address: str) -> None:
@@ -227,9 +220,9 @@ def test_the_first_rows_show_a_hint_or_a_sentence(browser: Browser, address: str
     with opened(browser, address) as page:
         until(lambda: listed(page))
         rows = page.locator("#found li").all()[:10]
-        until(lambda: all(row.locator("small").count() for row in rows))
-        texts = [row.locator("small").inner_text() for row in rows]
-        assert all(text.endswith(".") for text in texts)
+        remarks = [row.locator("small").last for row in rows]  # The first one may list the frames.
+        until(lambda: all(one.count() and one.inner_text().endswith(".") for one in remarks))
+        texts = [one.inner_text() for one in remarks]
         assert any(text.startswith("Change ") for text in texts)
 
 
@@ -255,12 +248,6 @@ def test_parameters_are_tried_on_the_shown_frame(browser: Browser, address: str)
         control.fill("-3")
         control.press("Enter")
         until(lambda: "must be greater than or equal to 1" in page.inner_text("#effect"))
-
-
-def listed(page: Page) -> bool:
-    """Whether a page has all frames, and what is missed in them."""
-    whole = f"{FRAMES} frames" in page.inner_text("#run")
-    return whole and page.locator("#found button .missed").count() > 0
 
 
 def test_two_pages_on_one_drive(browser: Browser, address: str) -> None:
@@ -290,53 +277,6 @@ def test_a_server_that_was_killed_is_found_again(bag: Path, browser: Browser) ->
 
 
 # --- the whole way, as the page talks -----------------------------------------------------------
-
-
-class Talk:
-    """A page without a browser."""
-
-    def __init__(self, address: str) -> None:
-        from websockets.sync.client import connect
-        from websockets.typing import Origin
-
-        parts = urlsplit(address)
-        self.entries: dict[int, dict[str, Any]] = {}
-        self._number = 0
-        url, origin = f"ws://{parts.netloc}/talk?{parts.query}", Origin(f"http://{parts.netloc}")
-        self._channel = connect(url, origin=origin, max_size=None).__enter__()
-        self.say(type="shown")
-        self.over = self.until("progress", lambda message: message["over"])
-
-    def __enter__(self) -> Talk:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._channel.__exit__(*error)
-
-    def say(self, **message: Any) -> None:
-        self._number += 1
-        self._channel.send(json.dumps({"id": self._number, **message}))
-
-    def asked(self, kind: str, **message: Any) -> dict[str, Any]:
-        """Send a message and return its answer of this kind, or its error."""
-        self.say(**message)
-        return self.until(kind, lambda answer: answer.get("id") == self._number)
-
-    def until(self, kind: str, wanted: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
-        """Return the next message of a kind that meets the condition, or the next error."""
-        while True:
-            message: dict[str, Any] = json.loads(self._channel.recv(timeout=PATIENCE))
-            if message["type"] == "entries":
-                for number in message["gone"]:
-                    del self.entries[number]
-                for entry in message["entries"]:
-                    known = self.entries.setdefault(entry["number"], {**entry, "sights": []})
-                    known["sights"] += entry["sights"]
-            if message["type"] == "error" or (message["type"] in kind.split("|") and wanted(message)):
-                return message
-
-    def of(self, *whats: str) -> list[dict[str, Any]]:
-        return [entry for entry in self.entries.values() if entry["what"] in whats]
 
 
 @pytest.fixture
@@ -458,7 +398,7 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:
     with Talk(address) as other:
         talk.say(type="drive", set=hint["settings"])
         trials = [
-            one.until("progress", lambda m: m["trial"] and m["trial"]["state"] == "over")["trial"]
+            one.until("progress", lambda m: m["trials"] and m["trials"][-1]["state"] == "over")["trials"][-1]
             for one in (talk, other)
         ]
         assert trials[0] == trials[1]
@@ -472,9 +412,11 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str) -> None:
     assert sum(frame[1] for frame in trial["strip"]) == good
     talk.say(type="drive", set=["clustering.eps=0.7"])
     talk.say(type="cancel", what="drive")
-    ended = talk.until("progress", lambda m: m["trial"]["settings"] == ["clustering.eps=0.7"])["trial"]
+    ended = talk.until("progress", lambda m: m["trials"][-1]["settings"] == ["clustering.eps=0.7"])["trials"][
+        -1
+    ]
     while ended["state"] in ("waiting", "running"):
-        ended = talk.until("progress")["trial"]
+        ended = talk.until("progress")["trials"][-1]
     assert ended["state"] in ("cancelled", "over")
     assert "nothing is changed" in talk.asked("never", type="drive", set=[])["text"]
     assert "clustering.epps" in talk.asked("never", type="drive", set=["clustering.epps=1"])["text"]
@@ -494,7 +436,7 @@ def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
 
 
 def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, bag: Path) -> None:
-    """Of the values that are tried, with what was asked before; beside the bag; for who has the token."""
+    """The verdict of the drive as it was run comes first; beside the bag; for who has the token."""
     stamp, pick, hint = helped(talk)
     before = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
     after = talk.asked("answer", type="ask", time=stamp, set=hint["settings"], pick=pick)
@@ -520,15 +462,15 @@ def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, b
         text = response.read().decode()
     assert "it is plainly there" in text
     assert "a note of mine" in text
-    assert f"change {hint['settings'][0]}" in text
-    key, _, value = hint["settings"][0].partition("=")
-    told = re.sub(r"<[^>]*>", " ", unescape(text))
-    assert after["verdict"] in told
-    assert (
-        f"Before other values were tried: {before['verdict'].rstrip('.')}; change {hint['settings'][0]}"
-        in told
-    )
-    assert re.search(rf"{re.escape(key)}\s+{re.escape(value)}\s+\S", told)
+    assert f"<code>{', '.join(hint['settings'])}</code>" in text
+    told = " ".join(re.sub(r"<[^>]*>", " ", unescape(text)).split())
+    places = [
+        told.index(part) for part in ("Missed: the", before["verdict"], "What was tried", after["verdict"])
+    ]
+    assert places == sorted(places)
+    assert f"{' '.join(hint['settings'])} {after['verdict']}" in told
+    assert "--set-b" in told
+    assert hint["settings"][0].partition("=")[0] not in told[told.index("How it was made") :]
     talk.say(type="unnote", stamp=str(stamp), text="a note of mine")
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
 
@@ -740,13 +682,20 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     assert select_click(result, None, entities.image(name), None, (10.5, 20.5)) == Selection(
         box=(10.0, 20.0), camera=name
     )
+    pose, intrinsics = camera.camera.camera_from_points, camera.camera.intrinsics
+    assert pose is not None and intrinsics is not None
+    shown = geometry.apply(geometry.inverse(pose), np.array([[0.1, 0.05, 0.5]]))  # an image in the 3D view
+    pixel = intrinsics.K @ (0.2, 0.1, 1)
+    in_image = select_click(result, None, entities.image(name), None, shown[0].tolist())
+    assert in_image is not None and in_image.box == pytest.approx(pixel[:2], abs=0.01)
+    below = geometry.apply(geometry.inverse(pose), np.array([[0.0, 1.0, 0.5]]))  # a line of its frustum
+    assert select_click(result, None, entities.sensor(name), None, below[0].tolist()) is None
     assert select_click(result, None, entities.BEV, None, (12.7, 3.2)) == Selection(cell=(3, 12))
     point = result.frame.points[5]
     assert select_click(result, None, entities.points(lidar), 5, ()) == Selection(
         point=tuple(map(float, point))
     )
-    fixed = (result.frame.pose @ [*point, 1])[:3]
-    in_space = select_click(result, None, entities.obstacles(lidar), None, tuple(fixed))
+    in_space = select_click(result, None, entities.obstacles(lidar), None, tuple(point.tolist()))
     assert in_space is not None
     assert in_space.place == pytest.approx(point, abs=1e-4)
     measured = result.objects.measured
@@ -754,8 +703,8 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     drawn = [row for row, one in enumerate(measured.size != result.objects.boxes.size) if one.any()]
     last = len(drawn) - 1
     assert select_click(result, None, entities.MEASURED, last, ()) == Selection(object=drawn[last])
-    center = (result.frame.pose @ [*result.objects.boxes.center[0], 1])[:3]
-    assert select_click(result, None, "/world/anything", None, tuple(center)) == Selection(object=0)
+    center = result.objects.boxes.center[0].tolist()
+    assert select_click(result, None, "/world/anything", None, center) == Selection(object=0)
     assert select_click(result, None, entities.FUSED, 10_000, ()) is None
     assert select_click(result, None, "/health/time_ms/total", None, ()) is None
 
@@ -824,11 +773,13 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
         bench = RecordedDrive(drive, again.frames)
         session = WorkbenchSession(bench)
         bench.observe(drive.at(frame=0))
-        told = session.try_values(0, ("clustering.min_cluster_points=100000",))
-        recoloured = session.try_values(0, ("ground.distance_threshold=0.5",))
-        session.try_values(0, ("detector.conf_threshold=0.9",))
+        desk, other = bench.open_desk(), bench.open_desk()
+        told = session.try_values(0, ("clustering.min_cluster_points=100000",), attempt=desk.attempt())
+        recoloured = session.try_values(0, ("ground.distance_threshold=0.5",), attempt=desk.attempt())
+        session.try_values(0, ("detector.conf_threshold=0.9",), attempt=desk.attempt())
         result = drive.at(frame=0)
-        pieces = [film[row] for film in (bench.film, bench.desk) for row in range(len(film))]
+        pieces = [film[row] for film in (bench.film.rows, desk.buffer) for row in range(len(film))]
+        assert len(other.buffer) == 0, "another page shows nothing of it"
         bench.close()
     assert result.objects is not None
     assert result.frame.truth is not None
@@ -851,6 +802,53 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     for path_of_input in (entities.points(lidar), entities.image(camera), entities.sensor(camera)):
         assert not any(cleared for _, cleared in rows[path_of_input])
     assert sum(timelines == {"tried"} for timelines, _ in rows[entities.points(lidar)]) == 2, "it is put back"
+
+
+def test_a_stopped_try_shows_nothing(bag: Path) -> None:
+    """The next try begins anew."""
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        bench = RecordedDrive(drive, again.frames)
+        bench.observe(drive.at(frame=0))
+        desk = bench.open_desk()
+        attempt = desk.attempt()
+        desk.stop()
+        with pytest.raises(UserError, match="cancelled"):
+            desk.add_tried(attempt)
+        assert len(desk.buffer) == 0
+        bench.try_values(0, ("clustering.eps=0.9",), desk.attempt())
+        assert len(desk.buffer) == 1
+        bench.close()
+
+
+def test_a_slow_try_keeps_no_question_waiting(talk: Talk) -> None:
+    """It can be cancelled; its own answer comes never, that of the next try at once."""
+    slow, entry = ["bev.resolution=0.02"], talk.of("missed")[0]
+    _, stamp, _, pick, *_ = entry["sights"][0]
+    talk.say(type="try", time=int(stamp), set=slow, pick=pick)
+    talk.say(type="ask", time=int(stamp), set=[], pick=pick)
+    first = talk.until("tried|answer")
+    assert first["type"] == "answer" and first["set"] == []
+    talk.say(type="try", time=int(stamp), set=["bev.resolution=0.025"], pick=pick)
+    talk.say(type="cancel", what="try")
+    talk.say(type="try", time=int(stamp), set=["clustering.eps=0.9"], pick=pick)
+    tried = talk.until("tried")
+    while tried["type"] == "error":
+        assert tried["text"] == "the try was cancelled"
+        tried = talk.until("tried")
+    assert tried["set"] == ["clustering.eps=0.9"]
+
+
+def test_a_question_about_a_cancelled_try_is_answered(talk: Talk) -> None:
+    values, entry = ["bev.resolution=0.03"], talk.of("missed")[0]
+    _, stamp, _, pick, *_ = entry["sights"][0]
+    talk.say(type="try", time=int(stamp), set=values, pick=pick)
+    talk.say(type="ask", time=int(stamp), set=values, pick=pick)
+    talk.say(type="cancel", what="try")
+    answer = talk.until("answer")
+    while answer["type"] == "error":
+        assert answer["text"] == "the try was cancelled"
+        answer = talk.until("answer")
+    assert answer["set"] == values
 
 
 def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> None:
@@ -897,8 +895,11 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
         bench.show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):
             bench.observe(result)
-        first, *others = [bench.film[row] for row in range(len(bench.film))]
+        first, *others = [bench.film.rows[row] for row in range(len(bench.film.rows))]
+        application = blueprints.application_id("workbench", drive.scene, drive.config)
         bench.close()
+    (whole := tmp_path / "first.rrd").write_bytes(first)
+    assert {store.application_id for store in RrdReader(whole).recordings()} == {application}
     assert left([first, others[0]], results[3].frame.stamp) == [True]
     assert left([others[0], others[2]], results[2].frame.stamp) == [True]
     assert left([others[0]], results[0].frame.stamp) == [False]

@@ -1,18 +1,21 @@
-"""Notes that a user took about a drive, in a small file beside the bag: ``drive.mcap.notes.json``."""
+"""Notes of a user about a drive and its findings, in a file beside the bag: ``drive.mcap.notes.json``."""
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
+from bevviz.bags.remote import beside
 from bevviz.errors import UserError
 from bevviz.support.files import atomic_write, read_text
 
 SUFFIX = ".notes.json"
 LONGEST = 2000  # most characters of a note
+STATES = ("done", "ignored")  # of a finding that the user has dealt with
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -37,15 +40,54 @@ class Note:
         return f"{self.about}: {self.text}" if self.about else self.text
 
 
+@dataclass(frozen=True, slots=True)
+class HandledFinding:
+    """A finding of the workbench that the user has dealt with.
+
+    Attributes:
+        stamp: sensor time of its frame, in nanoseconds.
+        what: kind of the finding.
+        name: its class.
+        pick: text of the selection of its object in that frame.
+        distance: distance of the object in metres. None: unknown.
+        state: done or ignored.
+        text: reason of the user.
+    """
+
+    stamp: int
+    what: str
+    name: str
+    pick: str
+    distance: float | None
+    state: str
+    text: str = ""
+
+    @property
+    def key(self) -> tuple[int, str, str, str]:
+        """Values that tell the finding from others."""
+        return self.stamp, self.what, self.name, self.pick
+
+
+@dataclass(frozen=True, slots=True)
+class _Content:
+    """Content of the file."""
+
+    notes: list[Note]
+    findings: list[HandledFinding] = field(default_factory=list)
+
+
+_CONTENT = TypeAdapter(_Content)
+
+
 class Notes:
-    """Notes of one drive, in order of time. The file exists as long as there are notes.
+    """Notes of one drive, in order of time. The file exists as long as there are notes or handled findings.
 
     Args:
         paths: paths of the drive. The file lies beside the first.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        bag = paths[0].resolve()
+        bag = beside(paths[0])
         self.path = bag.with_name(bag.name + SUFFIX)
         self._lock = threading.Lock()
 
@@ -55,7 +97,15 @@ class Notes:
         Raises:
             UserError: the file cannot be read.
         """
-        return iter(self._read())
+        return iter(self._read()[0])
+
+    def handled(self) -> list[HandledFinding]:
+        """Return the findings that the user has dealt with.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        return self._read()[1]
 
     def between(self, low: int, high: int) -> list[Note]:
         """Return the notes whose log time is in [low, high) nanoseconds.
@@ -75,7 +125,8 @@ class Notes:
         if not text or len(text) > LONGEST:
             raise UserError(f"a note has 1 to {LONGEST:,} characters, this one has {len(text):,}")
         with self._lock:
-            self._write(sorted([*self._read(), note]))
+            notes, findings = self._read()
+            self._write(sorted([*notes, note]), findings)
 
     def remove(self, note: Note) -> None:
         """Remove a note.
@@ -84,24 +135,40 @@ class Notes:
             UserError: the file cannot be read or written.
         """
         with self._lock:
-            self._write([other for other in self._read() if other != note])
+            notes, findings = self._read()
+            self._write([other for other in notes if other != note], findings)
 
-    def _read(self) -> list[Note]:
+    def handle(self, finding: HandledFinding) -> None:
+        """Keep that a finding is done or ignored. An empty state lists it again.
+
+        Raises:
+            UserError: the state is unknown, the text is too long, or the file cannot be read or written.
+        """
+        if finding.state not in ("", *STATES):
+            raise UserError(f"a finding is {' or '.join(STATES)}, not '{finding.state}'")
+        if len(finding.text) > LONGEST:
+            raise UserError(f"a note has 1 to {LONGEST:,} characters, this one has {len(finding.text):,}")
+        with self._lock:
+            notes, findings = self._read()
+            others = [other for other in findings if other.key != finding.key]
+            self._write(notes, [*others, finding] if finding.state else others)
+
+    def _read(self) -> tuple[list[Note], list[HandledFinding]]:
         """Read the file."""
         if not self.path.exists():
-            return []
+            return [], []
         try:
-            values = json.loads(read_text(self.path))
-            return sorted(Note(**value) for value in values["notes"])
-        except (ValueError, KeyError, TypeError, RecursionError):
+            content = _CONTENT.validate_json(read_text(self.path))
+            return sorted(content.notes), content.findings
+        except ValueError:
             raise UserError(f"{self.path}: holds no notes as bevviz writes them; move it away") from None
 
-    def _write(self, notes: Sequence[Note]) -> None:
-        """Write the file, or delete it without notes."""
-        if not notes:
+    def _write(self, notes: Sequence[Note], findings: Sequence[HandledFinding]) -> None:
+        """Write the file, or delete it if nothing is in it."""
+        if not notes and not findings:
             self.path.unlink(missing_ok=True)
             return
-        text = json.dumps({"notes": [asdict(note) for note in notes]}, indent=1, ensure_ascii=False)
+        text = _CONTENT.dump_json(_Content(list(notes), list(findings)), indent=1).decode()
         with atomic_write(self.path, "notes") as file:
             try:
                 file.path.write_bytes(f"{text}\n".encode(errors="replace"))

@@ -5,6 +5,7 @@ A file keeps the token while the server runs, so that pages survive a crash of t
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import secrets
@@ -19,6 +20,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 HOSTS = ("127.0.0.1", "localhost")
+SHARED = "/shared"  # page behind a shared link, which needs no token
 
 
 class Guard:
@@ -33,7 +35,10 @@ class Guard:
         self._hosts = {f"{host}:{port}" for host in HOSTS}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a refused request with status 403. Pass every other request to the application."""
+        """Answer a refused request with status 403. Pass every other request to the application.
+
+        A server that stops cancels the requests that are still waiting, which is no error.
+        """
         if scope["type"] in ("http", "websocket"):
             refusal = self._refusal(HTTPConnection(scope))
             if refusal and scope["type"] == "websocket":
@@ -45,7 +50,8 @@ class Guard:
             if refusal:
                 await PlainTextResponse(f"bevviz: {refusal}\n", 403)(scope, receive, send)
                 return
-        await self._app(scope, receive, send)
+        with suppress(asyncio.CancelledError):
+            await self._app(scope, receive, send)
 
     def _refusal(self, request: HTTPConnection) -> str:
         """Return the reason to refuse a request. Empty: it is allowed."""
@@ -56,6 +62,8 @@ class Guard:
             return "another site's page may not ask here"
         if request.scope["type"] == "websocket" and origin is None:
             return "only the page itself may ask here"
+        if request.url.path == SHARED:
+            return ""
         tokens = (*parse_qs(request.url.query).get("token", ()), _cookie(request, cookie_name(self._port)))
         if not any(secrets.compare_digest(candidate.encode(), self._token.encode()) for candidate in tokens):
             return "wrong or no token: open the address that was printed"

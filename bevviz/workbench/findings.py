@@ -22,7 +22,9 @@ from bevviz.why import Answer, FrameExplainer, Selection
 FEW = 30  # points. A smaller cluster without a detection is probably no object of a known class.
 
 REACH = 2.5  # metres that an object may have moved since the last frame with this finding
+WAY = 2.0  # metres to each side of the robot that it needs to drive straight on
 GAP = 5  # frames without the finding after which a new group begins
+CELL = 64  # frames that single frames of an overview are grouped over
 SAME_BOX = 0.3  # IoU of the image boxes of one detection in two frames
 
 DIFFERENCES = {  # kind -> remark
@@ -60,6 +62,7 @@ class Finding:
         selection: selection that asks about it.
         reason: reason that the answer gives.
         position: position in the fixed frame, if known.
+        in_way: whether it is ahead of the robot, no more than ``WAY`` to the side.
         box: (4,) box in the image, for a detection without position.
     """
 
@@ -71,6 +74,7 @@ class Finding:
     selection: Selection
     reason: str = ""
     position: Position | None = None
+    in_way: bool = False
     box: F32 | None = None
 
 
@@ -99,16 +103,26 @@ def find_findings(explainer: FrameExplainer) -> list[Finding]:
 
 def finding_of(frame: Frame, what: str, answer: Answer) -> Finding:
     """Return an answer about an object, a detection or a cluster as a finding."""
-    subject, selection, position = answer.subject, answer.selection, None
+    subject, selection, position, in_way = answer.subject, answer.selection, None, False
     assert selection is not None
     if answer.center is not None:
+        in_way = answer.center[0] > 0 and abs(answer.center[1]) <= WAY
         x, y, z = geometry.apply(frame.pose, np.asarray(answer.center, np.float32)[None])[0].tolist()
         position = x, y, z
     name, reason = subject.label or subject.kind, answer.verdict.kind.value
     if subject.kind == "truth":
         name = name.lower()
     return Finding(
-        frame.index, frame.stamp, what, name, answer.distance, selection, reason, position, subject.xyxy
+        frame.index,
+        frame.stamp,
+        what,
+        name,
+        answer.distance,
+        selection,
+        reason,
+        position,
+        in_way,
+        subject.xyxy,
     )
 
 
@@ -164,6 +178,7 @@ class FindingFrame:
         tried: whether the tried side shows it, rather than the drive as it was opened.
         text: reason in this frame.
         remark: one sentence where no hint can be searched.
+        in_way: whether it is in the way of the robot.
     """
 
     frame: int
@@ -173,11 +188,13 @@ class FindingFrame:
     tried: bool = False
     text: str = ""
     remark: str = ""
+    in_way: bool = False
 
     def as_list(self) -> list[Any]:
         """Return the values for the page. The stamp is text: JavaScript numbers cannot hold it."""
         distance = None if math.isnan(self.distance) else round(self.distance, 1)
-        return [self.frame, str(self.stamp), distance, self.pick, self.tried, self.text, self.remark]
+        head = [self.frame, str(self.stamp), distance, self.pick, self.tried]
+        return [*head, self.text, self.remark, self.in_way]
 
 
 @dataclass(slots=True)
@@ -198,6 +215,7 @@ class FindingList:
     def __init__(self) -> None:
         self._groups: dict[int, FindingGroup] = {}
         self._recent: dict[tuple[str, str], list[FindingGroup]] = {}
+        self._overview: dict[int, list[FindingGroup]] = {}  # groups of single frames, by cell of the drive
         self._number = 0
         self._lock = threading.Lock()
 
@@ -209,38 +227,65 @@ class FindingList:
         with self._lock:
             taken_groups: set[int] = set()
             for finding in findings:
-                group = self._same(finding, taken_groups) or self._new(finding.what, finding.name)
-                taken_groups.add(group.number)
-                group.position, group.box = finding.position, finding.box
-                pick = str(finding.selection)
-                group.frames.append(
-                    FindingFrame(
-                        finding.frame,
-                        finding.stamp,
-                        finding.distance,
-                        pick,
-                        tried,
-                        finding.reason,
-                        DIFFERENCES.get(finding.what, ""),
-                    )
+                group = self._same(finding, taken_groups) or self._new_recent(finding.what, finding.name)
+                self._extend(group, finding, taken_groups, tried)
+
+    def add_overview(self, frame: int, findings: Iterable[Finding]) -> None:
+        """Add the findings of a single frame. They stay until ``end_overview`` reaches the frame.
+
+        A finding near one of the same kind and name joins its group, within ``CELL`` frames.
+        """
+        with self._lock:
+            groups, taken_groups = self._overview.setdefault(frame // CELL, []), set[int]()
+            for finding in findings:
+                kind = finding.what, finding.name
+                near = _nearest(
+                    (one for one in groups if (one.what, one.name) == kind), finding, taken_groups
                 )
+                if near is None:
+                    groups.append(near := self._new(*kind))
+                self._extend(near, finding, taken_groups)
+
+    def end_overview(self, frame: int) -> None:
+        """Remove the findings of single frames up to the cell of a frame. The run in order has reached it."""
+        with self._lock:
+            for cell in [cell for cell in self._overview if cell <= frame // CELL]:
+                for group in self._overview.pop(cell):
+                    del self._groups[group.number]
+
+    def _extend(
+        self, group: FindingGroup, finding: Finding, taken_groups: set[int], tried: bool = False
+    ) -> None:
+        """Add one finding to a group."""
+        taken_groups.add(group.number)
+        group.position, group.box = finding.position, finding.box
+        group.frames.append(
+            FindingFrame(
+                finding.frame,
+                finding.stamp,
+                finding.distance,
+                str(finding.selection),
+                tried,
+                finding.reason,
+                DIFFERENCES.get(finding.what, ""),
+                finding.in_way,
+            )
+        )
 
     def _same(self, finding: Finding, taken_groups: set[int]) -> FindingGroup | None:
         groups = self._recent.get((finding.what, finding.name), [])
         groups[:] = [group for group in groups if 0 <= finding.frame - group.frames[-1].frame <= GAP]
-        candidates = [
-            (_relative_distance(group, finding), group.number)
-            for group in groups
-            if group.number not in taken_groups
-        ]
-        best, number = min(candidates, default=(math.inf, -1))
-        return self._groups[number] if best <= 1 else None
+        return _nearest(groups, finding, taken_groups)
+
+    def _new_recent(self, kind: str, name: str) -> FindingGroup:
+        group = self._new(kind, name)
+        self._recent.setdefault((kind, name), []).append(group)
+        return group
 
     def _new(self, kind: str, name: str) -> FindingGroup:
         self._number += 1
         group = FindingGroup(self._number, kind, name)
         self._groups[group.number] = group
-        self._recent.setdefault((kind, name), []).append(group)
         return group
 
     def add_anomalies(self, frame: int, stamp: int, anomalies: Sequence[Anomaly]) -> None:
@@ -252,6 +297,17 @@ class FindingList:
                     frame, stamp, math.nan, "", text=anomaly.text, remark=ANOMALIES[anomaly.kind]
                 )
                 self._new("anomaly", kind).frames.append(finding_frame)
+
+    def content(self) -> list[tuple[str, str, list[FindingFrame]]]:
+        """Return kind, name and frames of each group."""
+        with self._lock:
+            return [(group.what, group.name, list(group.frames)) for group in self._groups.values()]
+
+    def restore(self, groups: Iterable[tuple[str, str, list[FindingFrame]]]) -> None:
+        """Add whole groups of an earlier run."""
+        with self._lock:
+            for kind, name, frames in groups:
+                self._new(kind, name).frames += frames
 
     def replace(self, kinds: Sequence[str]) -> None:
         """Remove all findings of these kinds, before new ones are added."""
@@ -290,6 +346,17 @@ class FindingList:
             del sent_counts[number]
         if gone or new_items:
             yield {"type": "entries", "entries": new_items, "gone": gone}
+
+
+def _nearest(groups: Iterable[FindingGroup], finding: Finding, taken_groups: set[int]) -> FindingGroup | None:
+    """Return the nearest group that a finding may join. None: there is none."""
+    candidates = [
+        (_relative_distance(group, finding), group.number, group)
+        for group in groups
+        if group.number not in taken_groups
+    ]
+    best, _, group = min(candidates, default=(math.inf, -1, None))
+    return group if best <= 1 else None
 
 
 def _relative_distance(group: FindingGroup, finding: Finding) -> float:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError, first_line
+from bevviz.support.colors import class_color
 from bevviz.support.loggers import logger
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.source import Message, Settings
 
+LEGEND = ("person", "cyclist", "car", "truck", "bus")  # classes in the legend of the page
 TOGETHER = 0.05  # seconds in which news are collected before they are sent
 
 _log = logger(__name__)
@@ -49,6 +51,9 @@ class PageConnection:
         self._asked = 0  # of the questions
         self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
         self._remarking = False
+        self._page_desk = self._source.open_desk()
+        self._tries = ThreadPoolExecutor(1, "tries")  # A slow try keeps no other question waiting.
+        self._trying = 0  # number of the try in progress
         self._handlers = {
             "ask": self._ask,
             "try": self._try,
@@ -60,6 +65,7 @@ class PageConnection:
             "report": self._report,
             "note": self._note,
             "unnote": self._unnote,
+            "handle": self._handle_finding,
         }
 
     async def stay(self) -> None:
@@ -77,11 +83,15 @@ class PageConnection:
                 sender.cancel()
                 for task in self._tasks:
                     task.cancel()
+                self._stop_try()
+                self._tries.shutdown(wait=False)
+                if self._page_desk is not None:
+                    self._source.close_desk(self._page_desk)
 
     # --- messages to the page ------------------------------------------------------------------
 
     def _welcome(self) -> dict[str, Any]:
-        from bevviz.workbench.page_messages import controls
+        from bevviz.workbench.page_messages import controls, opened_values
 
         source = self._source
         self._opened = source.pipeline.config
@@ -89,10 +99,13 @@ class PageConnection:
         return {
             "type": "welcome",
             "run": self._run,
+            "desk": "" if self._page_desk is None else self._page_desk.lane,
             "bag": source.title,
             "scans": source.scans,
             "truth": source.truth_of is not None,
             "detector": bool(self._opened.detector.model),
+            "opened": opened_values(self._opened),
+            "classes": {name: f"rgb{class_color(name)}" for name in LEGEND},
             "controls": self._controls,
         }
 
@@ -106,10 +119,16 @@ class PageConnection:
             if not opening_sent and source.opening is not None:
                 opening_sent = True
                 await self._send(
-                    {"type": "opening", "stamp": str(source.opening), "first": str(source.first)}
+                    {
+                        "type": "opening",
+                        "stamp": str(source.opening),
+                        "first": str(source.first),
+                        "demand": source.on_demand,
+                    }
                 )
-            if times := sorted(set(source.frame_times()) - sent_times):
-                sent_times.update(times)
+            now_times = set(source.frame_times())
+            times, sent_times = sorted(now_times - sent_times), now_times
+            if times:
                 await self._send({"type": "frames", "frames": [[str(at), number] for at, number in times]})
             for message in source.findings.news(sent_counts):
                 await self._send(message)
@@ -125,13 +144,19 @@ class PageConnection:
             await self._socket.send_text(json.dumps(message))
 
     def _notes(self) -> dict[str, Any]:
-        from bevviz.workbench.page_messages import note_dict
+        from bevviz.workbench.page_messages import handled_dict, note_dict
 
         try:
-            notes, error = list(self._workbench.tools.notes), ""
+            file, error = self._workbench.tools.notes, ""
+            notes, findings = list(file), file.handled()
         except UserError as problem:
-            notes, error = [], str(problem)
-        return {"type": "notes", "notes": [note_dict(note) for note in notes], "error": error}
+            notes, findings, error = [], [], str(problem)
+        return {
+            "type": "notes",
+            "notes": [note_dict(note) for note in notes],
+            "findings": [handled_dict(finding) for finding in findings],
+            "error": error,
+        }
 
     # --- messages from the page ----------------------------------------------------------------
 
@@ -164,8 +189,14 @@ class PageConnection:
             description = f"error of bevviz itself: {type(error).__name__}: {first_line(error)}"
             await self._send({"type": "error", "id": number, "text": description})
 
-    async def _at_desk(self, number: int, work: Callable[[], Any], *, idle: bool = False) -> Any:
-        """Run ``work`` on the desk thread. Idle work is skipped once the page has sent a newer message."""
+    async def _at_desk(
+        self, number: int, work: Callable[[], Any], settings: Settings = (), *, idle: bool = False
+    ) -> Any:
+        """Run work about a frame on the thread of all pages, or with other values on that of this page.
+
+        Idle work is skipped once the page has sent a newer message.
+        """
+        own_thread = bool(settings) and self._page_desk is not None
 
         def job() -> Any:
             if idle and number not in (self._asked, self._newest):
@@ -173,7 +204,9 @@ class PageConnection:
             with self._source.quiet():
                 return work()
 
-        return await asyncio.get_running_loop().run_in_executor(self._desk, job)
+        return await asyncio.get_running_loop().run_in_executor(
+            self._tries if own_thread else self._desk, job
+        )
 
     async def _ask(self, number: int, message: Message) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer question came."""
@@ -209,14 +242,16 @@ class PageConnection:
             tree = {"pick": pick, "found": found, **answer.as_dict(), "beside": list(other_answers(others))}
             return selection, self._source.look(frame, settings), answer, tree
 
-        answered = await self._at_desk(number, work)
+        answered = await self._at_desk(number, work, settings)
         if isinstance(answered, dict):
             await self._send({**answered, **head})
             return
         selection, result, answer, tree = answered
         await self._send({"type": "answer", **head, **tree})
-        await self._at_desk(number, lambda: self._source.mark(result, answer))
-        hints = await self._at_desk(number, lambda: workbench.hints(frame, settings, selection), idle=True)
+        await self._at_desk(number, lambda: self._source.mark(result, answer, self._page_desk))
+        hints = await self._at_desk(
+            number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
+        )
         if hints is not None:
             asked = str(message.get("pick", tree["pick"]))
             await self._send({"type": "hints", **head, "row_pick": asked, **hints_dict(hints)})
@@ -235,27 +270,41 @@ class PageConnection:
     async def _try(self, number: int, message: Message) -> None:
         from bevviz.workbench.page_messages import controls
 
-        frame, settings, identity = await self._frame(message), _settings(message), _identity(message)
-        effects = await self._at_desk(number, lambda: self._workbench.try_values(frame, settings, identity))
-        await self._send(
-            {
-                "type": "tried",
-                "id": number,
-                "frame": frame,
-                "set": list(settings),
-                "pieces": self._source.desk_pieces,
-                **effects,
-            }
-        )
+        self._stop_try()
+        desk, workbench, settings = self._page_desk, self._workbench, _settings(message)
+        attempt = None if desk is None else desk.attempt()
+        self._trying = number
+        try:
+            frame, identity = await self._frame(message), _identity(message)
+            effects = await self._at_desk(
+                number, lambda: workbench.try_values(frame, settings, identity, attempt), settings
+            )
+        finally:
+            if self._trying == number:
+                self._trying = 0
+        pieces = 0 if desk is None else len(desk.buffer)
+        head = {"id": number, "frame": frame, "set": list(settings), "pieces": pieces}
+        await self._send({"type": "tried", **head, **effects})
         new_controls = controls(self._source.configured(settings), self._opened)
         if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
             self._controls = new_controls
             await self._send({"type": "controls", "controls": new_controls})
 
+    def _stop_try(self) -> None:
+        """Stop the try in progress, and give the next one a new thread.
+
+        The old thread ends after the current step and the questions that wait behind the try.
+        """
+        if self._trying and self._page_desk is not None:
+            self._trying = 0
+            self._page_desk.stop()
+            self._tries.shutdown(wait=False)
+            self._tries = ThreadPoolExecutor(1, "tries")
+
     async def _settle(self, number: int, message: Message) -> None:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
-        frame = await self._frame(message)
-        await self._at_desk(number, lambda: self._source.look(frame, _settings(message)), idle=True)
+        frame, settings = await self._frame(message), _settings(message)
+        await self._at_desk(number, lambda: self._source.look(frame, settings), settings, idle=True)
 
     async def _remark_rows(self, number: int, message: Message) -> None:
         """Send the remarks on the first rows of the page's list, one by one, behind all questions."""
@@ -288,26 +337,38 @@ class PageConnection:
         await asyncio.to_thread(self._workbench.tools.trials.begin, settings)
 
     async def _cancel(self, number: int, message: Message) -> None:
-        tools = self._workbench.tools
-        runner = tools.reports if message["what"] == "report" else tools.trials
+        if message["what"] == "try":
+            self._stop_try()
+            return
+        workbench = self._workbench
+        runner = workbench.reports if message["what"] == "report" else workbench.tools.trials
         await asyncio.to_thread(runner.end)
 
     async def _report(self, number: int, message: Message) -> None:
-        reports = self._workbench.tools.reports
+        reports = self._workbench.reports
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._at_desk(number, lambda: reports.begin(frame, settings, before, after, text))
+        await self._at_desk(number, lambda: reports.begin(frame, settings, before, after, text), settings)
 
     async def _note(self, number: int, message: Message) -> None:
         file = self._workbench.tools.notes.path.name
         frame, text, identity = await self._frame(message), str(message["text"]), _identity(message)
-        about = await self._at_desk(number, lambda: self._workbench.note(frame, text, identity))
+        about = await self._at_desk(
+            number, lambda: self._workbench.note(frame, text, identity, self._page_desk)
+        )
         said = f"Noted about {about} in frame {frame}."
         await self._send({"type": "noted", "id": number, "file": file, "text": said})
 
     async def _unnote(self, number: int, message: Message) -> None:
         stamp, text = int(message["stamp"]), str(message["text"])
         await self._at_desk(number, lambda: self._workbench.remove_note(stamp, text))
+
+    async def _handle_finding(self, number: int, message: Message) -> None:
+        """Keep that a finding is done or ignored."""
+        from bevviz.workbench.page_messages import handled_finding
+
+        finding = handled_finding(message)
+        await self._at_desk(number, lambda: self._workbench.handle(finding))
 
     def _reply(self, command: Callable[[Message], dict[str, Any]], message: Message) -> dict[str, Any]:
         """Return the reply of the source to one of its commands."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
-import annotated_types
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
 from bevviz.config import Config, unit, values
-from bevviz.config.keys import field_of
-from bevviz.pipeline.notes import Note
+from bevviz.config.keys import field_of, limits_of
+from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.why import Answer
+from bevviz.workbench.source import Message
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 BESIDE = 6  # further answers that are listed
@@ -42,6 +45,25 @@ def hints_dict(answer: Answer) -> dict[str, Any]:
 def note_dict(note: Note) -> dict[str, Any]:
     """Return a note. Its times are text, as JavaScript numbers cannot hold them."""
     return {**asdict(note), "stamp": str(note.stamp), "received": str(note.received)}
+
+
+def handled_dict(finding: HandledFinding) -> dict[str, Any]:
+    """Return a finding that the user has dealt with. Its time is text."""
+    return {**asdict(finding), "stamp": str(finding.stamp)}
+
+
+def handled_finding(message: Message) -> HandledFinding:
+    """Return the finding that a message of the page says is done or ignored."""
+    what, name, pick, state, text = (str(message[key]) for key in ("what", "name", "pick", "state", "text"))
+    distance = None if message["distance"] is None else float(message["distance"])
+    return HandledFinding(int(message["stamp"]), what, name, pick, distance, state, text.strip())
+
+
+def opened_values(config: Config) -> str:
+    """Return a short text that is the same for the same values on every machine, wherever the model lies."""
+    content = config.model_dump(mode="json")
+    content["detector"]["model"] = Path(content["detector"]["model"] or "").name
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
 
 
 # --- parameter controls ------------------------------------------------------------------------
@@ -77,20 +99,20 @@ def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
         "about": info.description or "",
         "kind": _kind(info.annotation),
     }
-    for rule in info.metadata:
-        if isinstance(rule, annotated_types.Ge | annotated_types.Gt):
-            control["low"] = rule.ge if isinstance(rule, annotated_types.Ge) else rule.gt
-        if isinstance(rule, annotated_types.Le | annotated_types.Lt):
-            control["high"] = rule.le if isinstance(rule, annotated_types.Le) else rule.lt
-    if get_origin(info.annotation) is Literal:
-        control["choices"] = list(get_args(info.annotation))
+    limits = zip(("low", "high"), limits_of(info), strict=True)
+    control |= {name: limit for name, limit in limits if limit is not None}
+    (choice, *_) = [*get_args(info.annotation), None] if control["kind"] == "list" else [info.annotation]
+    if get_origin(choice) is Literal:
+        control["choices"] = list(get_args(choice))
     return control
 
 
 def _kind(annotation: Any) -> str:
-    """Return the kind of input for a type annotation: choice, switch, whole, number or text."""
+    """Return the kind of input for a type annotation: choice, list, switch, whole, number or text."""
     if get_origin(annotation) is Literal:
         return "choice"
+    if get_origin(annotation) in (list, tuple):
+        return "list"
     united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
     inner = {annotation, *united}
     return "switch" if bool in inner else "whole" if int in inner else "number" if float in inner else "text"

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bevviz.bags.remote import beside
 from bevviz.bags.source import iso
-from bevviz.config import changed_config
+from bevviz.config import Config, changed_config
 from bevviz.errors import UserError, first_line
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 
 if TYPE_CHECKING:
-    from bevviz.drive import Drive
     from bevviz.report.make import ReportRequest
     from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.source import Settings
@@ -31,7 +31,7 @@ class ReportJob:
     Attributes:
         number: number in the address of its files.
         name: file name without suffix.
-        settings: the settings that differ from those the drive was opened with.
+        settings: the values that were tried, which it tells of.
         state: running, over, cancelled or failed.
         error: reason of the failure.
         done: number of finished frames.
@@ -75,23 +75,41 @@ class ReportJob:
         return next((path for path in self._existing_files() if path.name == name), None)
 
 
+@dataclass(frozen=True, slots=True)
+class ReportedBag:
+    """Bag that a report is cut from.
+
+    Attributes:
+        paths: its paths.
+        config: configuration of the report.
+        start: log time of its first scan, in nanoseconds.
+    """
+
+    paths: Sequence[Path]
+    config: Config
+    start: int
+
+
+def folder_beside(paths: Sequence[Path]) -> Path:
+    """Return the folder of a bag, or the working directory if that is read-only."""
+    folder = beside(paths[0]).parent
+    return folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
+
+
 class ReportMaker:
     """Reports of a workbench session, made one at a time.
 
     Args:
         session: the workbench session.
-        drive: its drive.
-        paths: paths of the bag. The reports lie beside it, or in the working directory if its folder is
-            read-only.
+        bag_of: returns the bag that has a frame.
+        folder: folder of the reports.
 
     Attributes:
         made: the reports, the newest last.
     """
 
-    def __init__(self, session: WorkbenchSession, drive: Drive, paths: Sequence[Path]) -> None:
-        self._session, self._drive, self._paths = session, drive, paths
-        folder = paths[0].resolve().parent
-        self._folder = folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
+    def __init__(self, session: WorkbenchSession, bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
+        self._session, self._bag_of, self._folder = session, bag_of, folder
         self._tell = session.source.news.tell
         self._thread: threading.Thread | None = None
         self.made: list[ReportJob] = []
@@ -101,7 +119,7 @@ class ReportMaker:
 
         Args:
             number: number of the frame that it is about.
-            settings: settings to make it with.
+            settings: values that are tried. The report is of the drive as opened, and says what they change.
             before: seconds before the frame.
             after: seconds after the frame.
             note: what went wrong, in the user's words.
@@ -116,22 +134,27 @@ class ReportMaker:
             raise UserError("a report is being made: wait for it, or cancel it")
         if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
             raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
-        session, paths = self._session, self._paths
+        session, bag = self._session, self._bag_of(number)
         received = session.source.look(number, settings).frame.received
-        seconds = (received - int(self._drive.frames.scans[0])) / 1e9
-        output = _free(self._folder, f"{paths[0].resolve().stem}-{seconds:.1f}s")
+        seconds = (received - bag.start) / 1e9
+        output = _free(self._folder, f"{beside(bag.paths[0]).stem}-{seconds:.1f}s")
         low, high = received - round(before * 1e9), received + round(after * 1e9)
+        asked = session.asked_within(low, high)
+        about = [answer for frame, answer in asked if frame == number]
+        changed_config(bag.config, settings)  # Wrong values are told before the report is begun.
         request = ReportRequest(
-            paths=paths,
-            config=changed_config(self._drive.config, settings),
+            paths=bag.paths,
+            config=bag.config,
             at=iso(received),
             before=before,
             after=after,
             output=output,
             note=note.strip(),
-            asked=session.asked_within(low, high, settings),
-            asked_before=session.asked_within(low, high) if settings else (),
-            notes=list(session.tools.notes),
+            answers=about,
+            result=session.source.look(number),
+            asked=[answer for frame, answer in asked if frame != number],
+            tried=session.tried_on(number, settings, about[0] if about else None) if settings else None,
+            notes=session.notes(),
         )
         report = ReportJob(len(self.made), output.stem, settings)
         self.made.append(report)

@@ -19,7 +19,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError
 from bevviz.support.colors import css_properties
-from bevviz.workbench.access import Guard, cookie_name
+from bevviz.workbench.access import SHARED, Guard, cookie_name
 from bevviz.workbench.buffers import PageState
 from bevviz.workbench.page_connection import PageConnection, news_event
 from bevviz.workbench.startup import SessionStartup
@@ -61,6 +61,7 @@ class Site:
         """Return the application that serves the page behind its access guard."""
         routes = [
             Route("/", self.page),
+            Route(SHARED, self.shared),
             Route("/page/{name}", self.file),
             Route(f"/viewer/{self._version}/{{name}}", self.viewer),
             Route("/config.yaml", self.config),
@@ -81,6 +82,12 @@ class Site:
         response.headers["Referrer-Policy"] = "no-referrer"
         response.set_cookie(cookie_name(self._port), self._token, httponly=True, samesite="strict")
         return response
+
+    async def shared(self, request: Request) -> Response:
+        """Return the page behind a shared link. It has no data, so that it needs no token."""
+        return _File(
+            PAGE / "shared.html", media_type="text/html", headers={"Content-Security-Policy": POLICY}
+        )
 
     async def file(self, request: Request) -> Response:
         """Return a script or style sheet of the page."""
@@ -115,8 +122,8 @@ class Site:
         """Return a file of a report that this server made."""
         workbench, number = await self._startup.session(), request.path_params["number"]
         try:
-            reports = [] if workbench is None else workbench.tools.reports.made
-        except UserError:  # the page of a robot
+            reports = [] if workbench is None else workbench.reports.made
+        except UserError:  # the page of an artificial robot
             reports = []
         path = reports[number].file(request.path_params["name"]) if number < len(reports) else None
         if path is None:
@@ -141,6 +148,7 @@ class Site:
         lane, text = socket.query_params.get("lane", "film"), socket.query_params.get("from", "0")
         state = PageState()
         with (
+            contextlib.suppress(UserError, IndexError),  # The recording is not there, or no longer.
             workbench.source.reader(lane, int(text) if text.isdecimal() else 0, state) as reader,
             news_event(reader.news) as event,
             contextlib.suppress(WebSocketDisconnect, RuntimeError),
@@ -151,11 +159,15 @@ class Site:
                     event.clear()
                     pieces = await asyncio.to_thread(reader.take)
                     for piece in pieces:
-                        await socket.send_bytes(piece)
+                        await (
+                            socket.send_text(piece) if isinstance(piece, str) else socket.send_bytes(piece)
+                        )
                     if not pieces:
                         await event.wait()
             finally:
                 listener.cancel()
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # The page has closed it.
+            await socket.close()
 
     # --- questions -----------------------------------------------------------------------------
 

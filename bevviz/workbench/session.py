@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import Any
 
 from bevviz.errors import UserError
-from bevviz.pipeline.notes import Note, Notes
+from bevviz.pipeline.notes import HandledFinding, Note, Notes
+from bevviz.report.cause import TriedValues
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.identity import Identity, find, identify
 from bevviz.why.resolve import select_subjects
+from bevviz.why.side_effects import effects
+from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
@@ -22,21 +26,19 @@ ASKED = 8  # answers that are kept for reports
 
 @dataclass(frozen=True, slots=True)
 class DriveTools:
-    """Trials, reports and notes of a recorded drive.
+    """Trials and notes of a recorded drive.
 
     Attributes:
         trials: runs over the drive with other values.
-        reports: bug reports, saved beside the bag.
         notes: notes of the user, saved beside the bag.
     """
 
     trials: TrialRunner
-    reports: ReportMaker
     notes: Notes
 
 
 class WorkbenchSession(Closable):
-    """Workbench session of a drive or a robot. Ask questions from one thread only.
+    """Workbench session of a drive or a robot. Several threads may ask, each about results of its own.
 
     Args:
         source: source of the frames.
@@ -49,12 +51,14 @@ class WorkbenchSession(Closable):
         self.source = source
         self.notes_version = -1
         self._tools: DriveTools | None = None
-        self._explainer: FrameExplainer | None = None
+        self._reports: ReportMaker | None = None
+        self._local = threading.local()  # The explainer of each thread that asks.
+        self._lock = threading.Lock()  # guards _answers
         self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
 
     @property
     def tools(self) -> DriveTools:
-        """Trials, reports and notes.
+        """Trials and notes.
 
         Raises:
             UserError: the source is a robot.
@@ -65,9 +69,26 @@ class WorkbenchSession(Closable):
             )
         return self._tools
 
-    def equip(self, tools: DriveTools) -> None:
-        """Add the tools of a recorded drive."""
-        self._tools, self.notes_version = tools, 0
+    @property
+    def reports(self) -> ReportMaker:
+        """Bug reports.
+
+        Raises:
+            UserError: the frames are not made of messages.
+        """
+        if self._reports is None:
+            raise UserError("there are no messages that a report could be cut from")
+        return self._reports
+
+    def notes(self) -> list[Note]:
+        """Return the notes. A robot has none."""
+        return [] if self._tools is None else list(self._tools.notes)
+
+    def equip(self, reports: ReportMaker, tools: DriveTools | None = None) -> None:
+        """Add the maker of reports, and the tools of a recorded drive."""
+        self._reports = reports
+        if tools is not None:
+            self._tools, self.notes_version = tools, 0
 
     def start(self) -> None:
         """Start to make frames."""
@@ -76,17 +97,18 @@ class WorkbenchSession(Closable):
     def close(self) -> None:
         """Stop the trials, the reports and the run, and release the files."""
         if self._tools is not None:
-            self._tools.trials.close()
-            self._tools.reports.end()
+            self._tools.trials.end()
+        if self._reports is not None:
+            self._reports.end()
         self.source.close()
 
     def progress(self) -> dict[str, Any]:
         """Return the progress message for the page."""
-        message = {"type": "progress", **self.source.progress(), "reports": [], "trial": None}
+        message = {"type": "progress", **self.source.progress(), "reports": [], "trials": []}
+        if self._reports is not None:
+            message["reports"] = [report.as_dict() for report in self._reports.made]
         if self._tools is not None:
-            message["reports"] = [report.as_dict() for report in self._tools.reports.made]
-            if (trial := self._tools.trials.trial) is not None:
-                message["trial"] = trial.as_dict()
+            message["trials"] = [trial.as_dict() for trial in self._tools.trials.trials]
         return message
 
     # --- questions -----------------------------------------------------------------------------
@@ -157,40 +179,71 @@ class WorkbenchSession(Closable):
     ) -> tuple[FrameExplainer, list[Answer], list[Answer]]:
         """Return the explainer of the frame, the answers, and those of them that a place selects."""
         result = self.source.look(number, settings)
-        if self._explainer is None or self._explainer.traces.result is not result:
-            self._explainer = self.source.explainer(result)
-        candidates = self._explainer.candidates(selection) if selection.is_place else []
-        return self._explainer, candidates or self._explainer.ask(selection), candidates
+        explainer: FrameExplainer | None = getattr(self._local, "explainer", None)
+        if explainer is None or explainer.traces.result is not result:
+            explainer = self._local.explainer = self.source.explainer(result)
+        candidates = explainer.candidates(selection) if selection.is_place else []
+        return explainer, candidates or explainer.ask(selection), candidates
 
     def _keep(self, number: int, settings: Settings, selection: Selection, answer: Answer) -> None:
         """Keep an answer for reports. One with hints replaces one without."""
-        key = number, settings, str(selection)
-        if answer.hints or key not in self._answers:
-            self._answers[key] = self.source.look(number).frame.received, answer
-        self._answers.move_to_end(key)
-        while len(self._answers) > ASKED:
-            self._answers.popitem(last=False)
+        key, received = (number, settings, str(selection)), self.source.look(number).frame.received
+        with self._lock:
+            if answer.hints or key not in self._answers:
+                self._answers[key] = received, answer
+            self._answers.move_to_end(key)
+            while len(self._answers) > ASKED:
+                self._answers.popitem(last=False)
 
-    def asked_within(self, low: int, high: int, settings: Settings = ()) -> list[Answer]:
-        """Return the answers about frames in a range of log times, with these settings, newest first."""
-        return [
-            answer
-            for (_, asked_settings, _), (received, answer) in reversed(self._answers.items())
-            if asked_settings == settings and low <= received <= high
-        ]
+    def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
+        """Return the answers about the drive as opened in a range of log times, newest first.
 
-    def try_values(self, number: int, settings: Settings, identity: Identity | None = None) -> dict[str, Any]:
+        Each comes with the number of its frame. Of several answers about one object of a frame, the newest
+        is returned.
+        """
+        answers: dict[tuple[object, ...], tuple[int, Answer]] = {}
+        with self._lock:
+            kept = list(self._answers.items())
+        for (number, settings, _), (received, answer) in reversed(kept):
+            if not settings and low <= received <= high:
+                answers.setdefault((number, *answer.subject.key), (number, answer))
+        return list(answers.values())
+
+    def tried_on(self, number: int, settings: Settings, answer: Answer | None) -> TriedValues:
+        """Return what other values do to the object of an answer, to its frame, and to the drive."""
+        before, after = self.source.look(number), self.source.look(number, settings)
+        subjects, row = FrameIndex(after).truth, -1
+        answer_then = None
+        if answer is not None and answer.selection is not None:
+            identity = self.identity(number, (), answer.selection, answer, None)
+            selection, _ = self.follow(identity, number, settings)
+            row = answer.subject.row if answer.subject.kind == "truth" else -1
+            answer_then = None if selection is None else self.ask(number, settings, selection)[0]
+        texts = [trial.text for trial in self.tools.trials.trials if trial.settings == settings]
+        drive = texts[-1] if texts else ""
+        return TriedValues(
+            settings, answer_then, effects(before.objects, after.objects, subjects, row), drive
+        )
+
+    def try_values(
+        self,
+        number: int,
+        settings: Settings,
+        identity: Identity | None = None,
+        attempt: Attempt | None = None,
+    ) -> dict[str, Any]:
         """Show a frame with other values, and return their effects.
 
         Args:
             number: number of the frame.
             settings: the other values.
             identity: the object that the values are tried for. Its effect comes first.
+            attempt: attempt of the page that shows the frame.
 
         Raises:
-            UserError: a parameter is unknown, or a value is wrong.
+            UserError: a parameter is unknown, a value is wrong, or the attempt was stopped.
         """
-        before, after = self.source.try_values(number, settings)
+        before, after = self.source.try_values(number, settings, attempt)
         selection = None if identity is None else self.follow(identity, number)[0]
         asked_row = None if selection is None else selection.truth
         return trial_effects(
@@ -199,7 +252,7 @@ class WorkbenchSession(Closable):
 
     # --- notes ---------------------------------------------------------------------------------
 
-    def note(self, number: int, text: str, identity: Identity | None) -> str:
+    def note(self, number: int, text: str, identity: Identity | None, desk: Desk | None = None) -> str:
         """Save a note about an object, or about the frame if the object is not in it. Return its subject.
 
         Raises:
@@ -209,7 +262,7 @@ class WorkbenchSession(Closable):
         selection = None if identity is None else self.follow(identity, number)[0]
         if selection is not None:
             answer = self.ask(number, (), selection)[0]
-            self.source.mark(result, answer)
+            self.source.mark(result, answer, desk)
             about, pick = (
                 answer.subject.name.removeprefix("the "),
                 str(self.identity(number, (), selection, answer, identity)),
@@ -228,6 +281,15 @@ class WorkbenchSession(Closable):
         for note in list(self.tools.notes):
             if (note.stamp, note.text) == (stamp, text):
                 self.tools.notes.remove(note)
+        self._tell_notes()
+
+    def handle(self, finding: HandledFinding) -> None:
+        """Keep that a finding is done or ignored.
+
+        Raises:
+            UserError: the state is unknown, or the file cannot be written.
+        """
+        self.tools.notes.handle(finding)
         self._tell_notes()
 
     def _tell_notes(self) -> None:

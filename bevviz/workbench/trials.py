@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bevviz.config import changed_config, changes
+from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model import geometry
@@ -20,15 +20,17 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
-from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
+from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.findings import DIFFERENCES, Finding, finding_of
 
 if TYPE_CHECKING:
     from bevviz.workbench.recorded_drive import RecordedDrive
     from bevviz.workbench.source import Settings
+
+RUNS = 6  # trials that are kept
 
 
 @dataclass(slots=True)
@@ -36,6 +38,7 @@ class Trial:
     """A run over the drive with other values, and its effect on each frame.
 
     Attributes:
+        number: number of the run, from 0.
         settings: the settings that differ from those the drive was opened with.
         total: number of frames of the drive.
         state: waiting, running, over, cancelled or failed.
@@ -47,8 +50,10 @@ class Trial:
         scores: score before and after.
         known: whether there is ground truth.
         stop: cancels the run when it is set.
+        buffer: recording of its results, for the pages that show its settings.
     """
 
+    number: int
     settings: Settings
     total: int
     state: str = "waiting"
@@ -59,15 +64,33 @@ class Trial:
     scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
     known: bool = False
     stop: threading.Event = field(default_factory=threading.Event)
+    buffer: RecordingBuffer = field(default_factory=RecordingBuffer)
 
     @property
     def going(self) -> bool:
         """Whether the trial is waiting or running."""
         return self.state in ("waiting", "running")
 
+    @property
+    def text(self) -> str:
+        """Its changes in a sentence. Empty: it has not run to its end."""
+        counts = ", ".join(f"{self.counts[kind]} {kind}" for kind in DIFFERENCES if self.counts[kind])
+        return (
+            f"In the whole drive of {self.done} frames: {counts or 'no change'}."
+            if self.state == "over"
+            else ""
+        )
+
+    @property
+    def lane(self) -> str:
+        """Name by which a page requests its recording."""
+        return f"run-{self.number}"
+
     def as_dict(self) -> dict[str, Any]:
         """Return the trial as JSON for the page."""
         return {
+            "number": self.number,
+            "lane": self.lane,
             "settings": list(self.settings),
             "state": self.state,
             "error": self.error,
@@ -85,14 +108,14 @@ class TrialRunner:
     """Runner of trials over a drive, one at a time.
 
     Attributes:
-        trial: the newest trial.
+        trials: the newest trials, the newest last.
     """
 
     def __init__(self, drive: RecordedDrive) -> None:
         self._drive = drive
-        self._recording, self._stream = drive.stream()
         self._thread: threading.Thread | None = None
-        self.trial: Trial | None = None
+        self._begun = 0  # number of trials until now
+        self.trials: list[Trial] = []
 
     def begin(self, settings: Settings) -> None:
         """Run the drive with these settings. A trial that is running is cancelled.
@@ -107,7 +130,13 @@ class TrialRunner:
             raise UserError("nothing is changed: press a hint, or change a parameter first")
         session = Session(config, loader=drive.pipeline.loader)
         self.end()
-        trial = self.trial = Trial(settings, drive.again.total, known=drive.truth_of is not None)
+        trial = Trial(self._begun, settings, drive.again.total, known=drive.truth_of is not None)
+        self._begun += 1
+        drive.lanes[trial.lane] = trial.buffer
+        self.trials.append(trial)
+        for old in self.trials[:-RUNS]:
+            self.trials.remove(old)
+            drive.lanes.pop(old.lane).close()
         drive.findings.replace(tuple(DIFFERENCES))
         self._thread = threading.Thread(target=self._run, args=(trial, session), name="trial", daemon=True)
         self._thread.start()
@@ -115,15 +144,10 @@ class TrialRunner:
 
     def end(self) -> None:
         """Cancel the running trial. Its results until then stay."""
-        if self.trial is not None:
-            self.trial.stop.set()
+        if self.trials:
+            self.trials[-1].stop.set()
         if self._thread is not None:
             self._thread.join()
-
-    def close(self) -> None:
-        """Cancel the running trial, and drop what it has not shown."""
-        self.end()
-        self._stream.read()  # Rerun warns about a binary stream with unread data.
 
     def _run(self, trial: Trial, session: Session) -> None:
         drive = self._drive
@@ -131,27 +155,20 @@ class TrialRunner:
             while not drive.over and not trial.stop.wait(0.1):
                 pass  # The results of the first run are needed for comparison.
             trial.state = "running"
-            logger = drive.tried_logger(self._recording, session.config)
-            run(drive.again, session, [_TrialObserver(drive, trial, logger, self._show)], stop=trial.stop)
+            run(drive.again, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
             trial.state = "cancelled" if trial.stop.is_set() else "over"
         except Exception as error:
             trial.state = "failed"
             trial.error = str(error) if isinstance(error, UserError) else first_line(error)
         drive.news.tell()
 
-    def _show(self) -> None:
-        """Pass what was logged to the pages."""
-        self._drive.film.add(self._stream.read())
-        self._drive.news.tell()
-
 
 class _TrialObserver(Observer[FrameResult]):
     """Observer of a trial. It logs each frame with the other values and counts the changes."""
 
-    def __init__(
-        self, drive: RecordedDrive, trial: Trial, logger: FrameLogger, show: Callable[[], None]
-    ) -> None:
-        self._drive, self._trial, self._logger, self._show = drive, trial, logger, show
+    def __init__(self, drive: RecordedDrive, trial: Trial, config: Config) -> None:
+        self._drive, self._trial = drive, trial
+        self._logger, self._stream = drive.film.tried_logger(config)
         self._reasons = drive.findings.reasons()
 
     def observe(self, result: FrameResult) -> None:
@@ -159,7 +176,8 @@ class _TrialObserver(Observer[FrameResult]):
         drive, trial, frame = self._drive, self._trial, result.frame
         before, truth = drive.objects(frame.index), drive.truth(frame)
         explainer = drive.explainer(result)
-        drive.draw_tried(self._logger, explainer)
+        if not drive.film.on_demand:  # Else a page tries the values on the frames that it shows.
+            drive.film.draw_tried(self._logger, explainer, trial.settings)
         side_effects = effects(before, result.objects, explainer.traces.truth)
         findings = list(difference_findings(explainer, side_effects, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
@@ -184,6 +202,11 @@ class _TrialObserver(Observer[FrameResult]):
         """Log the last scalars."""
         self._logger.flush()
         self._show()
+
+    def _show(self) -> None:
+        """Pass what was logged to the pages."""
+        self._trial.buffer.add(self._stream.read())
+        self._drive.news.tell()
 
 
 def difference_findings(

@@ -5,6 +5,7 @@ import { $, state } from "./page_state.js";
 import { kind, toViewer, viewerReady } from "./viewer.js";
 
 const RETRY = 1500; // ms between attempts to reach the server
+const LIMIT = 300e6; // bytes of frames on demand that the viewer holds, which take nearly three times the memory
 
 let questions = null; // socket of the questions and answers
 let number = 0; // of the newest question
@@ -13,38 +14,56 @@ const failures = new Map(); // what to do with the error of a message, by its nu
 export const on = (more) => Object.assign(handlers, more);
 
 const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
-const pieces = { film: 0, desk: 0 }; // number of pieces that the viewer has received of each recording
+const pieces = new Map(); // number of pieces that the viewer has received of each recording
+const counted = (lane) => pieces.get(lane) ?? 0;
 let early = 0; // number of frames that were requested out of order
-let recordings = []; // sockets: film (the run), then desk (answers and tried results; a robot has none)
+let held = 0; // bytes of frames on demand that the viewer holds
+let film = null; // socket of the run
+let desk = ""; // name of this page's answers and tried results; a robot has none
+const others = new Map(); // sockets of the desk, and of runs with other values
 
 // Request the frame of this stamp next, if the viewer does not have it yet.
 export function want(stamp) {
-  if (recordings[0]?.readyState !== WebSocket.OPEN) return;
-  early += 1;
-  recordings[0].send(String(stamp));
+  if (film?.readyState !== WebSocket.OPEN) return;
+  if (!state.demand) early += 1;
+  film.send(String(stamp));
+}
+
+// Receive the recording of a run with other values, because its settings are shown.
+export function follow(lane) {
+  if (counted("film") && !others.has(lane)) others.set(lane, receive(lane)); // The layout has to arrive first.
 }
 
 function receive(lane) {
-  const first = pieces[lane] - Math.min(pieces[lane], lane === "film" ? early : 0);
+  const first = counted(lane) - Math.min(counted(lane), lane === "film" ? early : 0);
   const socket = socketAt(`/film?lane=${lane}&from=${first}`);
   socket.binaryType = "arraybuffer";
+  let announced = null; // number of the frame on demand that comes next
   socket.onmessage = ({ data }) => {
-    if (!pieces.film) performance.mark("piece");
-    pieces[lane] += 1;
+    if (typeof data === "string") { announced = Number(data); return; }
+    if (!counted("film")) performance.mark("piece");
     toViewer({ type: "rrd" }, [new DataView(data)]);
-    for (const one of awaited.filter(([, count]) => pieces.desk >= count)) one[0]();
-    awaited = awaited.filter(([, count]) => pieces.desk < count);
-    if (recordings.length === 1 && kind !== "live") recordings.push(receive("desk")); // The layout has to arrive first.
-    if (lane === "film") nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
+    if (announced === null) pieces.set(lane, counted(lane) + 1);
+    else {
+      held += data.byteLength;
+      handlers.made(announced);
+      announced = null;
+      if (held > LIMIT) handlers.full();
+    }
+    for (const one of awaited.filter(([, count]) => counted(desk) >= count)) one[0]();
+    awaited = awaited.filter(([, count]) => counted(desk) < count);
+    if (desk) follow(desk);
+    if (!lane.startsWith("desk")) nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
+  if (lane === "film" && state.demand) socket.onopen = () => want(state.time);
   if (kind === "live") { // A page in the background draws nothing, and does not count as slow.
     socket.onopen = () => { if (document.hidden) socket.send("hidden"); };
   }
   return socket;
 }
 document.addEventListener("visibilitychange", () => {
-  if (kind === "live" && recordings[0]?.readyState === WebSocket.OPEN) {
-    recordings[0].send(document.hidden ? "hidden" : "seen");
+  if (kind === "live" && film?.readyState === WebSocket.OPEN) {
+    film.send(document.hidden ? "hidden" : "seen");
   }
 });
 
@@ -56,13 +75,15 @@ export function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
-      viewerReady.then(() => { recordings = [receive("film")]; });
+      desk = message.desk;
+      viewerReady.then(() => { film = receive("film"); });
     } else if (message.type === "failed") alarm(message.text);
     else if (message.type === "error") (failures.get(message.id) ?? handlers.error)(message);
     else handlers[message.type]?.(message);
   };
   questions.onclose = () => {
-    for (const socket of recordings) socket.close();
+    for (const socket of [film, ...others.values()]) socket?.close();
+    others.clear();
     handlers.gone?.();
     if (!$("gone").textContent) alarm("The server is gone: nothing is answered until it is back. Looking for it ...");
     setTimeout(async () => {
@@ -93,6 +114,6 @@ export function send(message, failed) {
 // Call a function once the viewer has so many pieces of the desk.
 let awaited = [];
 export function withPieces(count, then) {
-  if (pieces.desk >= count) then();
+  if (counted(desk) >= count) then();
   else awaited.push([then, count]);
 }

@@ -1,32 +1,30 @@
-// Ranked list of findings: missed and false objects, differences, anomalies and notes.
+// Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
 import { $, element, remember, seconds, state } from "./page_state.js";
+import { away, cause, csv, hasCause, KINDS, matches, offerFilters, severity, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
 const REMARKED = 10; // rows whose hint is searched without a click
 const PAUSE = 200; // ms between two updates of the page
-const KINDS = ["missed", "lost", "contradicted", "unmatched", "doubtful", "broken", "new false", "fixed", "false gone", "new", "gone",
-  "unnamed", "false", "anomaly", "note"];
-const RANK = new Map(KINDS.map((kind, row) => [kind, row]));
-RANK.set("unmatched", 0);
+const DOTS = 3; // most reasons of a severity
 
 const entries = new Map(); // findings by number, notes by stamp and text
-const hidden = new Set(); // kinds that the user has switched off
-let rows = []; // findings in the list, in order
-let current = null; // key of the chosen finding
+const hidden = new Set(["handled"]); // kinds that the user has switched off
+let handled = []; // findings that the user has marked as done or ignored
+let rows = []; // findings in the table, in order
+let current = null; // key of the newest finding that was chosen
+let isSubject = false; // what is asked about is the chosen finding
 let sight = 0; // index of the chosen frame of the finding
-let ask = () => {};
-let tryOut = () => {};
-let forget = () => {};
+const does = {}; // what the panel does: ask, tryOut, forget, remarks, unnote, handle, drawn
 
-export function start(asking, trying, forgetting) {
-  forget = forgetting;
-  ask = asking;
-  tryOut = trying;
+export function start(actions) {
+  Object.assign(does, actions);
   $("next").onclick = () => step(1);
   $("previous").onclick = () => step(-1);
-  $("here").onchange = draw;
+  for (const id of ["here", "grouped", "class", "reason", "within"]) $(id).onchange = draw;
+  $("find").oninput = draw;
+  $("csv").onclick = save;
 }
 
 export function restart() {
@@ -51,6 +49,7 @@ export function notes(message) {
     const sights = [[null, one.stamp, null, one.pick, false, one.text]];
     entries.set(key, { key, what: "note", name: one.about || "frame", sights, note: one });
   }
+  handled = message.findings;
   $("note-error").textContent = message.error;
   draw();
 }
@@ -64,50 +63,85 @@ export function explain(frame, pick, tried, sentence) {
   draw();
 }
 
+// Something else is asked about. The next finding is still the one after the chosen one.
+export function leave() {
+  if (!isSubject) return;
+  isSubject = false;
+  draw();
+}
+
 // --- drawing ------------------------------------------------------------------------------------
 
-const away = (one) => one[2] ?? 99;
 const nearest = (entry) => entry.sights.reduce((best, one, row) => (away(one) < away(entry.sights[best]) ? row : best), 0);
 const here = (entry) => entry.sights.findIndex((one) => Math.abs(Number(one[1]) - Number(state.time)) < 2000);
+const kindOf = (entry) => (entry.handled ? "handled" : entry.what);
+
+// A mark belongs to the finding that has its object at its frame.
+const marks = (entry) => (mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
+  one[1] === mark.stamp && one[3] === mark.pick && (one[2] === mark.distance || Math.abs(one[2] - mark.distance) < 0.5)));
 
 let waiting = 0;
 export function draw() {
-  if (!waiting) waiting = setTimeout(() => { waiting = 0; redraw(); }, PAUSE);
+  waiting ||= setTimeout(() => {
+    waiting = 0;
+    if (document.activeElement?.closest("#found input")) draw(); // The user is typing.
+    else redraw();
+  }, PAUSE);
 }
 
 function redraw() {
   const only = $("here").checked && state.time !== null;
-  const shown = [...entries.values()].filter((entry) => !only || here(entry) >= 0);
-  for (const entry of shown) entry.best = only ? here(entry) : nearest(entry);
-  rows = shown.filter((entry) => !hidden.has(entry.what)).sort((a, b) => (RANK.get(a.what) - RANK.get(b.what))
-    || (away(a.sights[a.best]) - away(b.sights[b.best])) || (Number(a.sights[0][1]) - Number(b.sights[0][1])));
+  for (const entry of entries.values()) {
+    entry.best = only && here(entry) >= 0 ? here(entry) : nearest(entry);
+    entry.handled = handled.find(marks(entry)) ?? null;
+  }
+  offerFilters([...entries.values()]);
+  const shown = [...entries.values()].filter((entry) => (!only || here(entry) >= 0) && matches(entry));
+  rows = sorted(shown.filter((entry) => !hidden.has(kindOf(entry))));
   $("found-none").hidden = rows.length > 0;
+  $("found-none").textContent = entries.size ? "No finding matches." : "None so far.";
   $("found-title").textContent = `Worth a look: ${rows.length}`;
-  filters(shown);
-  $("found").replaceChildren(...rows.slice(0, SHOWN).map(drawn));
+  kinds(shown);
+  let before = null;
+  replaceRows(rows.slice(0, SHOWN).flatMap((entry) => {
+    const head = $("grouped").checked && cause(entry) !== before;
+    before = cause(entry);
+    const number = head ? rows.filter((one) => cause(one) === before).length : 0;
+    return head ? [element("li", "group", `${before}: ${number}`), drawn(entry)] : [drawn(entry)];
+  }));
   requestRemarks();
+  does.drawn?.(rows);
+}
+
+// Replace the rows that differ. A row that is replaced while a mouse button is down on it misses the click.
+function replaceRows(items) {
+  const list = $("found");
+  for (const [row, item] of items.entries()) {
+    const known = list.children[row];
+    if (!known) list.append(item);
+    else if (known.dataset.key !== item.dataset.key || known.outerHTML !== item.outerHTML) known.replaceWith(item);
+  }
+  while (list.children.length > items.length) list.lastChild.remove();
 }
 
 // Ask for the sentences that the first rows lack. The server answers when it has nothing else to do.
 let requested = "";
-let bare = () => {};
-export const onBare = (send) => { bare = send; };
 function requestRemarks() {
   const lacking = rows.slice(0, REMARKED).map((entry) => entry.sights[entry.best])
     .filter((one) => one[3] && !one[4] && !one[6] && one[0] !== null).map((one) => [one[0], one[3]]);
   if (!lacking.length || JSON.stringify(lacking) === requested) return;
   requested = JSON.stringify(lacking);
-  bare(lacking);
+  does.remarks?.(lacking);
 }
 
-function filters(shown) {
+function kinds(shown) {
   const counts = new Map();
-  for (const { what } of shown) counts.set(what, (counts.get(what) ?? 0) + 1);
-  const kinds = KINDS.filter((kind) => counts.has(kind) || hidden.has(kind));
+  for (const entry of shown) counts.set(kindOf(entry), (counts.get(kindOf(entry)) ?? 0) + 1);
+  const offered = [...KINDS, "handled"].filter((kind) => counts.has(kind) || (hidden.has(kind) && kind !== "handled"));
   const text = (kind) => `${kind} ${counts.get(kind) ?? 0}`;
-  const same = [...$("kinds").children].map((one) => one.textContent).join() === kinds.map(text).join();
+  const same = [...$("kinds").children].map((one) => one.textContent).join() === offered.map(text).join();
   if (same) return;
-  $("kinds").replaceChildren(...kinds.map((kind) => {
+  $("kinds").replaceChildren(...offered.map((kind) => {
     const button = element("button", kind.replace(" ", "-"), text(kind));
     button.setAttribute("aria-pressed", !hidden.has(kind));
     button.onclick = () => {
@@ -130,25 +164,53 @@ function drawn(entry) {
   const one = entry.sights[entry.best];
   const where = one[2] === null ? "" : ` at ${one[2]} m`;
   const text = `${entry.name}${where}${one[5] ? `: ${one[5]}` : ""}`;
-  const button = element("button", "", "", element("span", "time", seconds(one[1])),
+  const reasons = severity(entry);
+  const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
+  const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
+  dots.title = reasons.join("; ") || "no reason to hurry";
+  const button = element("button", "", "", dots, element("span", "time", seconds(one[1])),
     element("span", entry.what.replace(" ", "-"), entry.what),
-    element("span", "", text, ...(one[6] ? [element("small", "", one[6])] : [])),
-    element("span", "faint", frames(entry)));
-  button.setAttribute("aria-current", entry.key === current);
-  button.onclick = () => choose(entry, entry.key === current ? sight + 1 : entry.best);
-  const item = element("li", "", "", button);
-  if (entry.note) {
-    const remove = element("button", "remove", "×");
-    remove.title = "remove this note";
-    remove.setAttribute("aria-label", "remove this note");
-    remove.onclick = () => removeNote(entry.note);
-    item.append(remove);
+    element("span", "what", text, ...[frames(entry), one[6]].filter(Boolean).map((more) => element("small", "", more))));
+  const isChosen = isSubject && entry.key === current;
+  button.setAttribute("aria-current", isChosen);
+  button.onclick = () => choose(entry, isChosen ? sight + 1 : entry.best);
+  const item = element("li", entry.handled ? "handled" : "", "", button);
+  item.dataset.key = entry.key;
+  if (entry.note) item.append(small("×", "remove this note", () => does.unnote(entry.note)));
+  else if (entry.handled) {
+    const { state: became, text: why } = entry.handled;
+    item.append(element("span", "faint", `${became}${why ? `: ${why}` : ""}`), small("reopen", "list it again", () => mark(entry, "")));
+  } else if (isChosen && does.handle && (hasCause(entry) || entry.what === "anomaly") && !one[4]) {
+    const why = element("input", "", "");
+    why.placeholder = "why (optional)";
+    why.setAttribute("aria-label", "why it is done or ignored");
+    item.append(why, small("done", "it is dealt with", () => mark(entry, "done", why.value)),
+      small("ignore", "it is of no concern", () => mark(entry, "ignored", why.value)));
   }
   return item;
 }
 
-let removeNote = () => {};
-export const onRemove = (remove) => { removeNote = remove; };
+function small(text, meaning, action) {
+  const button = element("button", "small", text);
+  button.title = meaning;
+  button.setAttribute("aria-label", meaning);
+  button.onclick = action;
+  return button;
+}
+
+function mark(entry, became, text = "") {
+  const one = entry.sights[entry.best];
+  const known = entry.handled ?? { stamp: one[1], what: entry.what, name: entry.name, pick: one[3], distance: one[2] };
+  does.handle({ ...known, state: became, text });
+}
+
+function save() {
+  const link = element("a", "", "");
+  link.href = URL.createObjectURL(new Blob([csv(rows)], { type: "text/csv" }));
+  link.download = `${state.bag}.findings.csv`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
 
 // --- choosing -----------------------------------------------------------------------------------
 
@@ -159,20 +221,19 @@ export function step(by) {
   choose(entry, entry.best);
 }
 
-function choose(entry, which) {
+export function choose(entry, which) {
   current = entry.key;
+  isSubject = true;
   sight = which % entry.sights.length;
   const [, stamp, , pick, tried] = entry.sights[sight];
-  for (const [row, item] of [...$("found").children].entries()) {
-    item.firstChild.setAttribute("aria-current", rows[row]?.key === current);
-  }
-  $("found").children[rows.indexOf(entry)]?.scrollIntoView({ block: "nearest" });
-  if (tried || entry.what.endsWith("gone")) tryOut(tried);
-  const from = { time: Number(stamp), set: tried ? tryOut.settings() : [] }; // The pick is valid there.
+  redraw();
+  [...$("found").children].find((item) => item.dataset.key === String(current))?.scrollIntoView({ block: "nearest" });
+  if (tried || entry.what.endsWith("gone")) does.tryOut(tried);
+  const from = { time: Number(stamp), set: tried ? does.tryOut.settings() : [] }; // The pick is valid there.
   seek(stamp);
   showSide();
   state.pick = "";
   remember();
-  if (pick) ask({ pick, from });
-  else forget();
+  if (pick) does.ask({ pick, from });
+  else does.forget();
 }

@@ -2,13 +2,17 @@
 
 import { $, element, seconds, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
-import { send } from "./connection.js";
+import { follow, send } from "./connection.js";
 
-let trial = null; // the newest trial, from the server
+let trials = []; // runs with other values, from the server, the newest last
+let use = () => {}; // shows the settings of a run
 
-export const settings = () => trial?.settings ?? null;
+export const settings = () => trials.at(-1)?.settings ?? null; // of the newest run, whose differences are listed
+const isShown = (run) => run.settings.join() === state.set.join();
+const shownRun = () => trials.find(isShown) ?? trials.at(-1);
 
-export function start() {
+export function start(using) {
+  use = using;
   const say = (id) => ({ text }) => { $(id).textContent = text; $(id).className = "alarm"; };
   $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
   $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
@@ -20,6 +24,7 @@ export function start() {
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value }, say("noted"));
   $("strip").onclick = (event) => {
+    const trial = shownRun();
     if (!trial?.strip.length) return;
     const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
     seek(trial.strip[Math.min(row, trial.strip.length - 1)][0]);
@@ -36,19 +41,27 @@ export function progress(message) {
   $("bar").max = message.total || 1;
   $("bar").value = message.done;
   $("bar").hidden = message.over;
-  const text = message.over ? `${message.done} frames` : `${message.done} of ${message.total} frames run`;
+  state.over = message.over;
+  const part = `${message.done} of ${message.total} frames`;
+  const run = { overview: `Overview: ${part}, all over the drive; then every frame in order`,
+    again: `The list is complete, from an earlier run; ${part} run again for tracks and plots` }[message.pass] ?? `${part} run in order`;
+  const text = message.over ? `${message.done} frames` : run;
   $("run").textContent = [text, message.error, ...message.warnings].filter(Boolean).join(" · ");
   $("run").className = message.error ? "alarm" : "faint";
-  drive(message.trial);
+  trials = message.trials;
+  showRuns();
   $("reports").replaceChildren(...message.reports.map(report));
 }
 
 // --- trial over the drive -----------------------------------------------------------------------
 
-function drive(message) {
-  trial = message;
-  $("trial").hidden = message === null;
-  if (message === null) return;
+// Show the run with the shown settings, else the newest one, and the table of all runs.
+export function showRuns() {
+  const message = shownRun();
+  $("trial").hidden = !message;
+  if (!message) return;
+  for (const run of trials.filter(isShown)) follow(run.lane);
+  $("runs").replaceChildren(...(trials.length > 1 ? [row(["", "values", "F1", "better", "worse"], "th"), ...trials.map(runRow)] : []));
   const going = message.state === "waiting" || message.state === "running";
   $("trial-bar").max = message.total || 1;
   $("trial-bar").value = message.done;
@@ -57,8 +70,25 @@ function drive(message) {
   $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: message.error }[message.state] ?? summary(message);
   $("trial-text").className = message.state === "failed" ? "alarm" : "";
   $("trial-set").textContent = message.settings.join(", ");
+  const newest = trials.at(-1);
+  $("trial-listed").hidden = message === newest;
+  $("trial-listed").textContent = `The table of findings has the differences of ${newest.settings.join(", ")}.`;
   $("strip").hidden = going || !message.strip.length;
   if (!$("strip").hidden) strip(message.strip);
+}
+
+function row(values, kind = "td") {
+  return element("tr", "", "", ...values.map((value) => element(kind, "", "", value)));
+}
+
+function runRow(run) {
+  const button = element("button", "", run.settings.join(", "));
+  button.onclick = () => use(run.settings);
+  const f1 = run.f1 ? run.f1.map((one) => one ?? "–").join(" → ") : "–";
+  const ended = { over: "", cancelled: " (cancelled)", failed: " (failed)" }[run.state] ?? " ...";
+  const made = row([isShown(run) ? "▸" : "", button, f1 + ended, String(run.better), String(run.worse)]);
+  made.setAttribute("aria-current", isShown(run));
+  return made;
 }
 
 function summary(message) {

@@ -5,7 +5,9 @@ export const $ = (id) => document.getElementById(id);
 export const state = {
   bag: "", run: "", time: null, pick: "", set: [], undo: [], flipped: false,
   opening: null, // stamp of the frame that is shown first
+  over: false, // the server has all frames
   first: 0, // stamp that seconds are counted from
+  demand: false, // whether the viewer gets a frame only when it is looked at
   answer: null, // frame and settings of the shown answer
 };
 const frames = []; // stamp and number of each frame that the server has, sorted
@@ -13,9 +15,30 @@ export function addFrames(message) {
   frames.push(...message.frames.map(([stamp, number]) => [Number(stamp), number, stamp]));
   frames.sort((a, b) => a[0] - b[0] || a[1] - b[1]);
 }
-const rowAt = (time) => frames.findLastIndex(([stamp]) => stamp <= Number(time) + 1000);
-export const shownFrame = () => frames[rowAt(state.time)]?.[1] ?? null; // number
-export const neighbour = (by) => frames[rowAt(state.time) + by]?.[2] ?? null; // stamp
+// Forget the frames before a stamp, which the server of a robot has no longer.
+export function dropFrames(before) {
+  const row = frames.findIndex(([stamp]) => stamp >= Number(before));
+  if (row > 0) frames.splice(0, row);
+}
+export const frameTimes = () => frames.map(([stamp]) => stamp); // sorted
+frameTimes.stamp = (row) => frames[row][2];
+const TOLERANCE = 1000; // ns, of the times of a viewer
+const rowAt = (time) => frames.findLastIndex(([stamp]) => stamp <= Number(time) + TOLERANCE);
+// Frames come in any order: the one that is shown first, then all. So the next one in the list need not be the next frame.
+const follows = (row, by) => state.over || frames[row + by]?.[1] === frames[row]?.[1] + by;
+
+// Number of the shown frame. null: the server does not have it yet.
+export function shownFrame() {
+  const row = rowAt(state.time);
+  const isKnown = row >= 0 && (follows(row, 1) || Number(state.time) - frames[row][0] <= TOLERANCE);
+  return isKnown ? frames[row][1] : null;
+}
+
+// Stamp of the next frame or the one before. null: there is none, or the server does not have it yet.
+export function neighbour(by) {
+  const row = rowAt(state.time);
+  return shownFrame() !== null && follows(row, by) ? frames[row + by]?.[2] ?? null : null;
+}
 
 // Times in ms: the pointer was released, the newest question began for the user, and it was sent.
 export const asked = { released: 0, at: 0, sent: 0 };

@@ -4,9 +4,13 @@ import { connect, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
 import { $, addFrames, asked, element, neighbour, remember, seconds, shownFrame, state, stated } from "./page_state.js";
+import * as parameters from "./parameters.js";
+import * as share from "./share.js";
+import * as timeline from "./timeline.js";
 import { drawnThen, isTried, kind, onViewer, seek, showSide } from "./viewer.js";
 
-let controls = [];
+const REQUESTS = 300; // ms between two requests of frames while the time goes on
+
 let opened = []; // controls of the configuration that the drive was opened with
 
 // --- questions and answers ----------------------------------------------------------------------
@@ -17,6 +21,7 @@ let askedTried = false; // the newest question is about the tried side
 
 const shownSet = () => (isTried() ? state.set : []);
 const shownKey = () => [shownFrame() ?? state.time, ...shownSet()].join();
+const frameName = (frame) => (frame === null ? `the frame at ${seconds(state.time)}` : `frame ${frame}`);
 const withValues = (set) => (set.length ? ` with ${set.join(", ")}` : "");
 
 function ask(what) {
@@ -31,6 +36,11 @@ function ask(what) {
     if (state.answer?.id === id) $("hints").textContent = text;
     else clear("missed", text);
   });
+}
+
+function askOther(what) {
+  list.leave();
+  ask(what);
 }
 
 // Row numbers differ between frames and values. The address of an answer's object is valid in all of them.
@@ -53,18 +63,30 @@ function forget() {
   clear("", "Click a box, a point, a pixel: it answers why it is what it is.");
 }
 
+// Frames on demand that the viewer has. While it plays, they are requested a few times in a second.
+const made = new Set();
+let lastRequest = 0;
+function requestOften() {
+  if (!state.demand || made.has(shownFrame()) || performance.now() - lastRequest < REQUESTS) return;
+  lastRequest = performance.now();
+  want(state.time);
+}
+
 // Tell which frame is shown, and mark an answer or an effect of another frame or of other values.
 function freshness() {
   const frame = shownFrame();
-  $("shown").textContent = frame === null ? seconds(state.time) : `Frame ${frame} at ${seconds(state.time)}`;
+  const making = state.demand && frame !== null && !made.has(frame) ? ", being made ..." : "";
+  $("shown").textContent = frame === null ? seconds(state.time) : `Frame ${frame} at ${seconds(state.time)}${making}`;
   const { answer } = state;
-  const isOld = answer !== null && (answer.frame !== frame || answer.set.join() !== shownSet().join());
+  const isOther = frame === null ? askedFor !== shownKey() : answer?.frame !== frame;
+  const isOld = answer !== null && (isOther || answer.set.join() !== shownSet().join());
   $("answer").classList.toggle("old", isOld);
   $("of").hidden = !isOld;
   $("of").textContent = isOld
-    ? `This is about frame ${answer.frame}${withValues(answer.set)}; frame ${frame}${withValues(shownSet())} is shown.` : "";
+    ? `This is about frame ${answer.frame}${withValues(answer.set)}; ${frameName(frame)}${withValues(shownSet())} is shown.` : "";
   for (const button of $("hints").querySelectorAll("button")) button.disabled = isOld;
   $("effect").classList.toggle("old", $("effect").dataset.frame !== String(frame));
+  timeline.draw();
 }
 
 function answer(message) {
@@ -88,7 +110,7 @@ function answer(message) {
   const from = { time: Number(state.time), set: message.set };
   $("beside").replaceChildren(...message.beside.map((other) => {
     const button = element("button", other.reported ? "" : "missed", `${other.name}: ${other.reason}`);
-    button.onclick = () => ask({ pick: other.pick, from });
+    button.onclick = () => askOther({ pick: other.pick, from });
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
@@ -162,7 +184,8 @@ function changed() {
   $("drive").disabled = !state.set.length;
   $("changes").replaceChildren(...state.set.map((one) => element("li", "", one)));
   $("save").href = `/config.yaml?${new URLSearchParams(state.set.map((one) => ["set", one]))}`;
-  showControls();
+  parameters.show();
+  jobs.showRuns();
   attempt();
 }
 
@@ -182,7 +205,7 @@ function attempt() {
     valid = [];
     $("effect").textContent = "As it was opened.";
     $("effect").dataset.frame = shownFrame();
-    offer({ controls: opened });
+    parameters.offer(opened);
   }
   askAgain();
 }
@@ -190,8 +213,9 @@ function attempt() {
 function tryHere() {
   const frame = shownFrame();
   triedFor = shownKey();
-  $("effect").textContent = `Frame ${frame}: running the stages ...`;
+  $("effect").textContent = `Running the stages on ${frameName(frame)} ...`;
   $("effect").dataset.frame = frame;
+  $("try-cancel").hidden = kind === "live";
   const set = state.set;
   trying = send({ type: "try", time: Number(state.time), set, pick: state.pick }, ({ id, text }) => {
     if (id !== trying) return;
@@ -202,12 +226,33 @@ function tryHere() {
     }
     $("effect").textContent = text;
     $("effect").className = "alarm";
-    trying = 0;
+    tryOver();
   });
+}
+
+function tryOver() {
+  trying = 0;
+  $("try-cancel").hidden = true;
+}
+
+// Go back to the values before the slow ones.
+function cancelTry() {
+  if (!trying) return;
+  send({ type: "cancel", what: "try" });
+  tryOver();
+  triedFor = "";
+  if (valid.join() !== state.set.join()) {
+    state.set = valid;
+    changed();
+  } else {
+    $("effect").textContent = `Cancelled: these values are not shown for ${frameName(shownFrame())}.`;
+    triedFor = shownKey();
+  }
 }
 
 function tried(message) {
   if (message.id !== trying) return;
+  tryOver();
   valid = message.set;
   const since = tryingSince;
   const took = () => (performance.now() - since).toFixed(0);
@@ -245,56 +290,16 @@ function tryOut(withThem) {
   if (state.flipped === withThem) flip();
 }
 
-// --- parameters ---------------------------------------------------------------------------------
-
-function showControls() {
-  const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const changes = new Map(state.set.map((one) => [one.slice(0, one.indexOf("=")), one.slice(one.indexOf("=") + 1)]));
-  const wanted = controls.filter((one) => changes.has(one.key) || (words.length
-    && words.every((word) => `${one.key} ${one.about} ${one.unit}`.toLowerCase().includes(word))));
-  // Changed parameters first, then those with the words in their name: 'eps' is also in 'keeps' of a description.
-  const rank = (one) => (changes.has(one.key) ? 0 : 1 + Number(!words.every((word) => one.key.includes(word))));
-  wanted.sort((a, b) => rank(a) - rank(b));
-  const focused = document.activeElement?.id;
-  $("controls").replaceChildren(...wanted.map((one) => control(one, changes)));
-  if (focused?.startsWith("control-")) $(focused)?.focus();
-}
-
-// Show new controls. A user's function that replaces a stage has parameters of its own.
-function offer(message) {
-  controls = message.controls;
-  showControls();
-}
-
-function control(one, changes) {
-  const label = element("label", "", one.key);
-  const input = document.createElement(one.kind === "choice" ? "select" : "input");
-  const value = changes.get(one.key) ?? (one.value ?? "");
-  input.id = `control-${one.key}`;
-  label.htmlFor = input.id;
-  const low = one.low === undefined ? "" : `from ${one.low}`;
-  const high = one.high === undefined ? "" : `up to ${one.high}`;
-  const about = element("small", "", [one.about, one.unit, `${low} ${high}`.trim(), `opened with ${one.value ?? "nothing"}`]
-    .filter(Boolean).join("; "));
-  if (one.kind === "choice") input.append(...one.choices.map((name) => new Option(name, name, false, name === value)));
-  else if (one.kind === "switch") { input.type = "checkbox"; input.checked = String(value) === "true"; }
-  else input.value = typeof value === "object" ? JSON.stringify(value) : value;
-  if (one.kind === "whole" || one.kind === "number") { input.inputMode = "decimal"; }
-  input.onchange = () => {
-    const text = one.kind === "switch" ? String(input.checked) : input.value;
-    change([`${one.key}=${text === "" ? "null" : text}`]);
-  };
-  return element("div", changes.has(one.key) ? "control changed" : "control", "", label, input, about);
-}
-
 // --- session state from the server --------------------------------------------------------------
 
-function open({ stamp, first }) {
+function open({ stamp, first, demand }) {
   if (state.opening !== null) return;
-  const same = stated.get("bag") === state.bag;
   state.first = first;
+  state.demand = demand;
+  const same = share.sameDrive();
   state.opening = (same && stated.get("at")) || stamp;
   seek(state.opening);
+  list.draw(); // An earlier run's list may be there already, without the time that seconds count from.
   if (!same) return;
   state.set = stated.getAll("set");
   state.pick = stated.get("pick") ?? "";
@@ -310,21 +315,34 @@ function welcome(message) {
   state.run = message.run;
   document.title = `${message.bag} · bevviz`;
   $("bag").textContent = message.bag;
-  controls = opened = message.controls;
+  opened = message.controls;
+  share.welcomed(message);
+  legend(message.classes);
   list.restart();
   $("detector").hidden = message.detector;
   if (kind === "live") $("changed-title").textContent = "In force on the robot, from the next frame on";
-  showControls();
+  parameters.offer(opened);
+}
+
+function legend(classes) {
+  $("classes").replaceChildren(...Object.entries(classes).map(([name, color]) => {
+    const swatch = element("span", "swatch", "");
+    swatch.style.background = color;
+    return element("li", "", "", swatch, name);
+  }));
 }
 
 on({
-  welcome, controls: offer, answer, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
+  welcome, controls: (message) => parameters.offer(message.controls), answer, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
   tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, notes: list.notes, noted: jobs.noted,
   remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text),
+  made: (frame) => { made.add(frame); freshness(); },
+  // The viewer frees nothing, and loses its layout where a recording is closed. The address shows the same again.
+  full: () => { remember(); location.reload(); },
 });
 onViewer({
-  clicked: ask,
-  moved: freshness,
+  clicked: askOther,
+  moved: () => { freshness(); requestOften(); },
   settled: () => {
     remember();
     want(state.time);
@@ -348,11 +366,16 @@ function undo() {
 function stepFrame(by) {
   const stamp = neighbour(by);
   if (stamp !== null) seek(stamp);
+  else if (!state.over && shownFrame() !== null && shownFrame() + by >= 0) {
+    freshness();
+    $("shown").textContent += `. Frame ${shownFrame() + by} has not been run yet.`;
+  }
 }
 
 const actions = {
   ",": () => stepFrame(-1),
   ".": () => stepFrame(1),
+  "?": () => { if ($("help").open) $("help").close(); else $("help").showModal(); },
   n: () => list.step(1),
   p: () => list.step(-1),
   u: undo,
@@ -364,7 +387,9 @@ $("undo").onclick = undo;
 $("flip").onclick = flip;
 $("reset").onclick = () => { state.undo.push(state.set); state.set = []; state.flipped = false; changed(); };
 $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `--set '${one}'`).join(" "));
-$("search").oninput = showControls;
+$("try-cancel").onclick = cancelTry;
+$("keys").onclick = actions["?"];
+$("help").onclick = () => $("help").close();
 window.addEventListener("keydown", (event) => {
   const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
   const typing = inPanel && ["INPUT", "SELECT"].includes(event.target.tagName);
@@ -375,10 +400,28 @@ window.addEventListener("keydown", (event) => {
   actions[event.key]();
 }, true);
 
-if (kind === "live") Object.assign(actions, (await import("./robot.js")).actions);
+if (kind === "live") {
+  const robot = await import("./robot.js");
+  Object.assign(actions, robot.actions);
+  on({ progress: (message) => { jobs.progress(message); robot.progress(message); } });
+}
 tryOut.settings = () => jobs.settings() ?? [];
-list.start(ask, tryOut, forget);
-if (kind !== "live") list.onBare((rows) => send({ type: "remarks", rows }));
-list.onRemove((note) => send({ type: "unnote", stamp: note.stamp, text: note.text }));
-jobs.start();
+const ofDrive = { // A robot has neither hints behind the list nor a bag to keep notes beside.
+  remarks: (rows) => send({ type: "remarks", rows }),
+  handle: (finding) => send({ type: "handle", ...finding }),
+};
+list.start({
+  ask, tryOut, forget, drawn: timeline.show, ...(kind === "live" ? {} : ofDrive),
+  unnote: (note) => send({ type: "unnote", stamp: note.stamp, text: note.text }),
+});
+parameters.start(change);
+timeline.start(list.choose);
+share.start();
+jobs.start((settings) => {
+  if (settings.join() === state.set.join()) return;
+  state.undo.push(state.set);
+  state.set = settings;
+  state.flipped = false;
+  changed();
+});
 connect();

@@ -37,11 +37,11 @@ function begun(ready) {
 // The viewer has drawn its current data once two more pictures have begun.
 export const drawnThen = (then) => nextPicture(() => nextPicture(then));
 export function toViewer(message, buffers) {
-  wake();
+  wake(buffers?.[0].byteLength);
   listeners["msg:custom"](message, buffers);
-  if (message.type === "rrd" && target !== null) { // It may hold the frame that the viewer has to go to.
+  if (message.type === "rrd" && isAway()) { // It may hold the frame that the viewer has to go to.
     tries = TRIES;
-    nextPicture(() => { if (target !== null) move(target); });
+    nextPicture(approach);
   }
 }
 export const onViewer = (more) => Object.assign(callbacks, more);
@@ -62,10 +62,26 @@ const move = (stamp) => toViewer({ type: "time_ctrl", timeline: timeline(), time
 
 // A viewer that opens a recording goes to its start by itself, and ignores any time before that.
 // A page that is reopened with other values gets their timeline only with the first tried result.
-const TRIES = 3; // attempts until new data arrives
+// The viewer goes to one time after another, each with a picture. So it is sent nowhere twice while it draws.
+const TRIES = 12; // attempts until new data arrives
+const AGAIN = 1500; // ms until the second attempt
+const LONGER = 1.2; // times longer until each further one, as a viewer that still reads its data is slow
 let target = null; // stamp that the viewer has to show, until the user moves it
 let tries = 0;
+let trying = 0;
 let current = null; // timeline of the viewer
+let at = null; // time of the viewer
+const isAway = () => target !== null && (at !== Number(target) || (current ?? timeline()) !== timeline());
+function approach() {
+  if (!isAway() || tries === 0) return;
+  tries -= 1;
+  move(target);
+  wait();
+}
+function wait() {
+  clearTimeout(trying);
+  trying = setTimeout(() => drawnThen(approach), AGAIN * LONGER ** (TRIES - tries));
+}
 for (const sign of ["pointerdown", "keydown", "wheel"]) {
   window.addEventListener(sign, (event) => { if ($("viewer").contains(event.target)) target = null; }, true);
 }
@@ -75,6 +91,7 @@ export function seek(stamp) {
   state.time = target;
   callbacks.sought(target);
   move(target);
+  wait();
   settle();
 }
 
@@ -106,12 +123,8 @@ function viewerEvent(event) {
 
 function moved(event) {
   if (event.type === "timeline_change") current = event.timeline;
-  const atTarget = Number(target) === event.time && (current ?? timeline()) === timeline();
-  if (target !== null && !atTarget && event.type === "time_update") { // a late event about the previous time
-    if (tries > 0) move(target);
-    tries -= 1;
-    return;
-  }
+  at = event.time ?? at;
+  if (isAway() && event.type === "time_update") return; // a late event about the previous time
   if (!drawn) {
     drawn = true;
     performance.mark("told");

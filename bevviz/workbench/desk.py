@@ -1,0 +1,97 @@
+"""Desk of a page: the buffer with the answers and the tried results that this page alone shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from bevviz.errors import UserError
+from bevviz.recording.frame_logger import FrameLogger
+from bevviz.support.contexts import Closable
+from bevviz.workbench.buffers import RecordingBuffer
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+NewLogger = Callable[[], tuple[FrameLogger, "rr.BinaryStream"]]  # a logger into the recording, and its stream
+
+
+class Attempt:
+    """One try of other values. A newer try of the page, or its user, stops it.
+
+    Args:
+        desk: desk of the page.
+        logger: logger of the tried results.
+        stream: stream of the logger.
+    """
+
+    def __init__(self, desk: Desk, logger: FrameLogger, stream: rr.BinaryStream) -> None:
+        self.desk, self.logger, self.stream = desk, logger, stream
+        self.stop = threading.Event()
+
+    def check(self) -> None:
+        """Check that the try goes on.
+
+        Raises:
+            UserError: it was stopped.
+        """
+        if self.stop.is_set():
+            raise UserError("the try was cancelled")
+
+
+class Desk(Closable):
+    """Desk of one page.
+
+    Args:
+        lane: name by which the page requests the buffer.
+        marker: returns the logger of the marks of answers.
+        tried: returns a logger of tried results.
+
+    Attributes:
+        buffer: pieces of the recording for this page.
+        known: entities that tried results of this page had.
+    """
+
+    def __init__(self, lane: str, marker: NewLogger, tried: NewLogger) -> None:
+        self.lane, self.buffer, self._tried = lane, RecordingBuffer(), tried
+        self.marker, self._marks = marker()
+        self._attempt = Attempt(self, *tried())
+        self.known: frozenset[str] = frozenset()
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        """Stop the try in progress and delete the buffer."""
+        with self._lock:
+            self._attempt.stop.set()
+            for stream in (self._marks, self._attempt.stream):
+                stream.read()  # Rerun warns about a binary stream with unread data.
+            self.buffer.close()
+
+    def attempt(self) -> Attempt:
+        """Return the attempt of the next try. It has a new logger if the last try was stopped."""
+        with self._lock:
+            if self._attempt.stop.is_set():
+                self._attempt = Attempt(self, *self._tried())
+            return self._attempt
+
+    def stop(self) -> None:
+        """Stop the try in progress. Nothing of it is shown."""
+        with self._lock:
+            self._attempt.stop.set()
+
+    def add_marks(self) -> None:
+        """Hand the marks that were logged to the page."""
+        self.buffer.add(self._marks.read())
+
+    def add_tried(self, attempt: Attempt) -> None:
+        """Hand the tried results that were logged to the page.
+
+        Raises:
+            UserError: the try was stopped.
+        """
+        piece = attempt.stream.read()
+        with self._lock:
+            attempt.check()
+            self.known |= attempt.logger.known
+            self.buffer.add(piece)
