@@ -31,12 +31,15 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import Dependency, Provenance
+from bevviz.report.cause import cause_of, explain_subject
 from bevviz.report.check import CheckResult
 from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
-from bevviz.report.pictures import ticks
+from bevviz.report.pictures import marked_pictures, ticks
 from bevviz.stages.detector import Detector
-from tests.support import bags
+from bevviz.why import FrameExplainer, Selection
+from bevviz.why.subject import projected_box
+from tests.support import bags, planted_faults
 from tests.support.commands import Capture, error_of
 from tests.support.recordings import Recording, verify
 
@@ -180,6 +183,37 @@ def test_the_model_is_named_without_its_folder(tmp_path: Path, small: Path, caps
     assert re.search(
         r"not as it was: detector\.model was net\.onnx \(SHA-256 \w+\), is net\.onnx \(SHA", said
     )
+
+
+def test_pictures_mark_the_subject_of_a_report() -> None:
+    """In the image at its place, in 3D in the middle, and from above on its side of the sensor."""
+    result = planted_faults.run("flat_car", "reference")
+    (row,) = planted_faults.planted("flat_car", "car", 10.0)
+    answer = FrameExplainer(result).about(Selection(truth=row))
+    image, space, above = (one.picture for one in marked_pictures(result, answer, 640))
+    white = [np.argwhere((picture >= 250).all(axis=2)) for picture in (image, space, above)]
+    assert answer.subject.box is not None
+    wanted = projected_box(answer.subject.box, result.cameras[0].camera)
+    assert wanted is not None
+    inside = image[int(wanted[1]) : int(wanted[3]), int(wanted[0]) - 4 : int(wanted[2]) + 4]
+    edge = np.asarray((inside[:, :6] >= 250).all(axis=2))  # the left one
+    assert edge.any(axis=1).mean() > 0.9
+    height, width = space.shape[:2]
+    assert np.abs(white[1].mean(axis=0) - (height / 2, width / 2)).max() < 60
+    down, right = white[2].mean(axis=0)
+    assert width / 2 < right < width and 0 < down < height / 2
+
+
+def test_a_report_opens_on_a_false_object_and_on_nothing() -> None:
+    """What is false is called false with ground truth and doubtful without; good frames have no cause."""
+    result = planted_faults.run("shared_box", "reference")
+    explainer = FrameExplainer(result)
+    (answer, *_) = explain_subject(explainer, Selection(object=explainer.false_objects()[0].subject.row))
+    cause = cause_of(result, 7.0, answer)
+    assert cause.what.startswith("False: the ")
+    assert cause.why == explainer.about(answer.selection or Selection()).verdict.text
+    blind = replace(result, frame=replace(result.frame, truth=None))
+    assert cause_of(blind, 7.0, answer).what.startswith("Doubtful: the ")
 
 
 # --- the check ---------------------------------------------------------------------------------

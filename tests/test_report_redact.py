@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from bevviz.bags.bag import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.model.frame import F32, U8
 from bevviz.report.pictures import shrink

@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_keep, load_config, parse_real
+from bevviz.cli.options import (
+    Commands,
+    add_bag,
+    add_config,
+    add_jobs,
+    add_keep,
+    add_subject,
+    load_config,
+    parse_real,
+    selected_subject,
+)
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
 from bevviz.support.files import CONFIG_LIMIT, read_text
@@ -22,13 +32,15 @@ def add(commands: Commands) -> None:
         "browser (bug.html) and the raw messages (bug.mcap) to send on. With --check: run a report again and "
         "compare.",
         epilog="examples:\n"
-        "  bevviz report drive.mcap --at 12.5 --model yolo11n.onnx --note 'no match for the pedestrian'\n"
+        "  bevviz report drive.mcap --at 12.5 --model yolo11n.onnx --class person --note 'no match for her'\n"
         "  bevviz report --check bug.rrd",
     )
     group = add_bag(report)
     group.add_argument("--at", metavar="TIME", help="the time that the report is about")
     group.add_argument("--before", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
+    add_jobs(group)
     group.add_argument("--after", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
+    add_subject(report, "The object that the report is about. Nothing: the worst of the frame.")
     add_config(report)
     content = report.add_argument_group("the report")
     content.add_argument(
@@ -81,6 +93,7 @@ def _report(options: argparse.Namespace) -> int:
             before=options.before,
             after=options.after,
             output=options.output,
+            selection=selected_subject(options),
             note=options.note if options.note_file is None else _read(options.note_file),
             topics=options.topics,
             redact=options.redact,
@@ -88,6 +101,7 @@ def _report(options: argparse.Namespace) -> int:
             include_model=options.include_model,
             force=options.force,
             notes=list(Notes(options.paths)),
+            jobs=options.jobs,
         )
     )
     warn(report.warnings)

@@ -115,13 +115,14 @@ def cut_bag(
     static: Collection[str],
     path: Path,
     edit: Edit = unchanged,
+    margin: int = MARGIN,
 ) -> CutContent:
     """Write the messages of a window to an MCAP file, byte for byte, with all that a run of it needs.
 
     The file also gets:
 
     - the calibration files of LiDARs,
-    - the messages within ``MARGIN`` on either side, which ``BagSource`` reads, too,
+    - the messages within ``margin`` on either side, which ``BagSource`` reads, too,
     - all messages of the ``static`` topics,
     - the earlier packets of a video that its first image is decoded from,
     - for a topic that is silent in the window, its last message before it, else its first one after it (a
@@ -134,11 +135,12 @@ def cut_bag(
         static: topics of static transforms.
         path: path of the MCAP file.
         edit: returns the connection and the bytes to write for a message. None: leave it out.
+        margin: nanoseconds.
 
     Raises:
         UserError: the file cannot be written.
     """
-    low, high = window.low - MARGIN, window.high + MARGIN
+    low, high = window.low - margin, window.high + margin
     chosen = [name for name in topics if name not in static]
     counts: Counter[str] = Counter()
     damage = UnusableMessages()

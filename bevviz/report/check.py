@@ -21,7 +21,7 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
-from bevviz.recording.provenance import differences, file_hash, model_path, provenance
+from bevviz.recording.provenance import differences, model_path, provenance
 from bevviz.recording.rerun_cli import check_decodes, reader_errors_as_user_errors
 from bevviz.report.bag_window import open_window
 from bevviz.report.facts import ReportInfo
@@ -36,6 +36,7 @@ from bevviz.report.fingerprints import (
 )
 from bevviz.report.make import replay
 from bevviz.stages.detector import DEMO_MODEL
+from bevviz.support.files import file_hash
 from bevviz.support.scratch_folder import ScratchFolder
 
 UNREADABLE = "cannot be read as a report"

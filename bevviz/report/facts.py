@@ -17,7 +17,7 @@ from bevviz.config import Config, ParameterChange, changes, load, with_object_fi
 from bevviz.recording.provenance import Dependency, Provenance, model_path
 from bevviz.report.bag_window import ReportWindow
 from bevviz.support.text import fenced, markdown
-from bevviz.support.version import __version__
+from bevviz.support.version import install_command
 
 TRACEBACKS = 5  # tracebacks that are listed
 _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
@@ -28,8 +28,52 @@ class AnswerText:
     """Answer to a question of the user: the verdict, and the decision of each stage."""
 
     verdict: str
-    reported: bool
     chain: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class TriedText:
+    """Values that were tried, what the subject is then, and the objects that get better and worse.
+
+    ``fixes`` and ``breaks`` are empty where they were not counted.
+    """
+
+    settings: str
+    result: str
+    fixes: str = ""
+    breaks: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """The first lines of a report: the object that it is about, where it is, and why.
+
+    Attributes:
+        what: what became of the object.
+        where: its place, and the frame.
+        why: the reason in a sentence.
+        chain: decision of each stage.
+        tried: values that were tried.
+        remark: one sentence where no values helped, or none could be tried.
+    """
+
+    what: str
+    where: str
+    why: str
+    chain: Sequence[tuple[str, str]]
+    tried: Sequence[TriedText]
+    remark: str = ""
+
+    def markdown(self) -> list[str]:
+        """Return the lines of the same in Markdown."""
+        lines = [f"## {markdown(self.what)}", "", f"**{markdown(self.why)}**", "", markdown(self.where)]
+        lines += ["", "## What was tried", ""]
+        for tried in self.tried:
+            effects = f"; fixes {tried.fixes}; breaks {tried.breaks}" if tried.fixes else ""
+            lines.append(f"- `{tried.settings}`: {markdown(tried.result + effects)}")
+        lines += [markdown(self.remark)] if self.remark else []
+        lines += ["", "## What became of it at each stage", ""]
+        return [*lines, *(f"- *{stage}*: {markdown(text)}" for stage, text in self.chain)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +83,8 @@ class Facts:
     title: str
     note: str
     notes: Mapping[str, str]  # notes of the drive within the window, by time
-    asked: Sequence[AnswerText]
+    cause: Cause | None  # None: there is no frame, or nothing in it went wrong
+    asked: Sequence[AnswerText]  # further answers
     where: str  # the bag, its window and the frame
     start: int  # log time of the recording's start, from which seconds are counted
     config: str  # one sentence about preset and changes
@@ -56,6 +101,8 @@ class Facts:
         lines = [f"# {markdown(self.title)}", "", markdown(self.where), ""]
         lines += [f"> {markdown(line)}" for line in self.note.splitlines()]
         lines += [f"- {markdown(when)}: {markdown(text)}" for when, text in self.notes.items()]
+        lines += ["", *self.cause.markdown()] if self.cause is not None else []
+        lines += ["", "## Also missed, or asked about"] if self.asked else []
         for answer in self.asked:
             lines += ["", f"**{markdown(answer.verdict)}**", ""]
             lines += [f"- *{stage}*: {markdown(text)}" for stage, text in answer.chain]
@@ -73,7 +120,9 @@ def window_text(name: str, window: ReportWindow) -> str:
     return f"{name}, {first:.1f} to {last:.1f} s of it, at {at:.3f} s ({iso(window.at)})"
 
 
-def commands(rrd: Path, window: ReportWindow, config: Config, redacted: bool) -> list[str]:
+def commands(
+    rrd: Path, window: ReportWindow, config: Config, redacted: bool, tried: Sequence[str] = ()
+) -> list[str]:
     """Return the commands that show, check and repeat the report, to be typed in the folder of its files.
 
     Args:
@@ -81,20 +130,23 @@ def commands(rrd: Path, window: ReportWindow, config: Config, redacted: bool) ->
         window: the scans.
         config: the configuration without folders of this machine.
         redacted: whether the images of the bag are redacted.
+        tried: settings to compare the run with.
     """
-    run = ["bevviz", "bag", rrd.with_suffix(".mcap").name]
+    run = [rrd.with_suffix(".mcap").name]
     run += ["--start", iso(window.low), "--end", iso(window.high)]
     run += ["--preset", config.preset] if config.preset != "default" else []
     for key, change in changes(load(preset=config.preset), config).items():
         run += ["--model", config.detector.model] if key == "detector.model" else []
         run += ["--set", f"{key}={json.dumps(change.after)}"] if key != "detector.model" else []
     note = ["# its images are redacted: here the network sees less than it did"] if redacted else []
+    other = [part for setting in tried for part in ("--set-b", setting)]
     return [
-        f"pip install bevviz=={__version__}",
+        install_command(),
         shlex.join(["rerun", rrd.name]),
         shlex.join(["bevviz", "report", "--check", rrd.name]),
         *note,
-        shlex.join(run),
+        shlex.join(["bevviz", "bag", *run]),
+        *([shlex.join(["bevviz", "compare", *run, *other])] if tried else []),
     ]
 
 
@@ -159,11 +211,13 @@ def shareable(config: Config) -> Config:
     """Return the configuration without folders of this machine."""
     detector, live, model = config.detector, config.live, model_path(config)
     calibrations = {topic: Path(file).name for topic, file in config.source.lidar_calibration.items()}
+    results = {name: Path(file).name for name, file in config.source.results.items()}
+    files = {"lidar_calibration": calibrations, "results": results}
     name = detector.model if model is None or detector.model == "demo" else model.name
     return with_object_files(config, lambda file: Path(file).name).model_copy(
         update={
             "detector": detector.model_copy(update={"model": name, "names": Path(detector.names).name}),
-            "source": config.source.model_copy(update={"lidar_calibration": calibrations}),
+            "source": config.source.model_copy(update=files),
             "live": live.model_copy(update={"flight_folder": ""}),
         }
     )

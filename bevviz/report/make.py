@@ -10,24 +10,26 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import megabytes
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, changes, load
 from bevviz.errors import UserError
-from bevviz.model.frame import Camera, Frame
+from bevviz.model.frame import Camera, Frame, Scene
 from bevviz.model.protocols import Observer
 from bevviz.model.results import Detections, FrameResult
+from bevviz.pipeline.frame_workers import working_ahead
 from bevviz.pipeline.notes import Note
 from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
-from bevviz.recording import entities
+from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.recording import blueprints, entities, views
 from bevviz.recording.primitives import document
-from bevviz.recording.provenance import Provenance, file_hash, model_path, names_path, provenance, versions
+from bevviz.recording.provenance import Provenance, model_path, names_path, provenance, versions
 from bevviz.recording.recorder import DiskWatch, Recorder
 from bevviz.recording.sinks import open_recording
 from bevviz.recording.source_lookup import Origin
@@ -42,8 +44,8 @@ from bevviz.report.bag_window import (
     open_window,
     unchanged,
 )
+from bevviz.report.cause import LISTED, TriedValues, answer_text, cause_of, explain_subject
 from bevviz.report.facts import (
-    AnswerText,
     Facts,
     ReportInfo,
     commands,
@@ -59,10 +61,9 @@ from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress
 from bevviz.support.files import atomic_write as write_beside
-from bevviz.support.files import claim_target, save_text
-
-if TYPE_CHECKING:
-    from bevviz.why import Answer
+from bevviz.support.files import claim_target, file_hash, save_text
+from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.log import clear_answers, log_answers
 
 DetectionsByImage = Mapping[tuple[str, int], Detections]  # by camera name and image stamp
 
@@ -84,9 +85,13 @@ class ReportRequest:
         unredacted: patterns of topics that are kept even if their content is unknown.
         include_model: copy the model file.
         force: overwrite files.
-        asked: answers to include.
-        asked_before: answers with the original configuration, if ``config`` has tried values.
+        selection: the object that the report is about. An empty selection means the worst of the frame.
+        answers: answers about the frame, its subject first. Empty: the report asks for itself.
+        result: result of the frame that the answers are about. None: the frame is run.
+        asked: answers about other frames.
+        tried: values that the user tried.
         notes: notes of the whole drive.
+        jobs: number of processes that run the networks ahead. 1: none.
     """
 
     paths: Sequence[Path]
@@ -101,9 +106,13 @@ class ReportRequest:
     unredacted: Sequence[str] = ()
     include_model: bool = False
     force: bool = False
+    selection: Selection = field(default_factory=Selection)
+    answers: Sequence[Answer] = ()
+    result: FrameResult | None = None
     asked: Sequence[Answer] = ()
-    asked_before: Sequence[Answer] = ()
+    tried: TriedValues | None = None
     notes: Sequence[Note] = ()
+    jobs: int = 1
 
 
 @dataclass(slots=True)
@@ -159,7 +168,10 @@ def make(
         if request.redact:
             detections = _detect(request, window)
         detect = None if detections is None else replay(detections)
-        session = Session(request.config, detect)
+        loader = StageLoader(store=not request.redact)  # Nothing of a redacted report is kept.
+        asked = _ask(request, whole_bag, loader)
+        answers = () if asked is None else asked.answers
+        session = Session(request.config, detect, loader=loader)
         content = _cut(whole_bag, window, topics, bag, redactor)
         cleanup.register(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
         stack.callback(cleanup.unregister, bag)
@@ -179,37 +191,82 @@ def make(
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
         origin = Origin.of(source.scene, request.config, rrd, folders=False, redacted=request.redact)
-        scene = replace(whole_bag.scene, bag=())  # The recording must not contain the path of the bag.
+        focus = None if not answers else answers[0].center
+        scene = replace(
+            whole_bag.scene, bag=(), focus=focus
+        )  # The recording must not contain the bag's path.
         sinks = stack.enter_context(
-            open_recording(scene, public, save=rrd, blueprint="bug_report", origin=origin)
+            open_recording(scene, public, save=rrd, blueprint=_layout(scene, public), origin=origin)
         )
         cleanup.unregister(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole_bag.scene.cameras))
         recorder = _ReportRecorder(
-            recording, public, summary, window.at, request.note, notes, session.stages.provider
+            recording, public, summary, window.at, request.note, notes, answers, session.stages.provider
         )
         watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
-        outcome = run(source, session, watchers, stop=stop)
+        jobs = 1 if request.redact else request.jobs
+        ahead = stack.enter_context(working_ahead(session, source, [request.config], jobs))
+        outcome = run(source, ahead, watchers, stop=stop)
         written.interrupted = outcome.interrupted or (stop is not None and stop.is_set())
         written.frames = len(summary.frames)
         written.warnings += [warning for warning in source.warnings if warning not in written.warnings]
         written.warnings = [_without_folders(warning, [*request.paths, bag]) for warning in written.warnings]
         made_with = provenance(request.config, session.stages.provider)
         facts = _facts(
-            request, public, window, content, written, made_with, summary, whole_bag.scene.name, notes
+            request,
+            public,
+            window,
+            content,
+            written,
+            made_with,
+            summary,
+            whole_bag.scene.name,
+            notes,
+            asked,
         )
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    save_text(html, page(facts, summary, file_hash(rrd)), "-o")
+    save_text(html, page(facts, summary, file_hash(rrd), answers[:1]), "-o")
     written.files.insert(1, html)
     return written
 
 
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Answers that the report opens on, about its frame in the whole drive."""
+
+    result: FrameResult
+    answers: Sequence[Answer]
+
+
+def _ask(request: ReportRequest, source: BagSource, loader: StageLoader) -> _Asked | None:
+    """Return the answers about the frame of a report. None: the scan cannot be read."""
+    session = Session(request.config, loader=loader)
+    result = request.result
+    if result is None:
+        frame = next(iter(source), None)
+        if frame is None:  # The run names what is wrong with the scan.
+            return None
+        result = session.run_explained(frame)
+    explainer = FrameExplainer(result, loader, session.stages.class_names)
+    return _Asked(result, explain_subject(explainer, request.selection, request.answers))
+
+
+def _layout(scene: Scene, config: Config) -> rrb.Blueprint:
+    """Return the layout of a report. It opens on the last frame of the timeline ``report``, its own frame."""
+    layout = blueprints.load("bug_report", scene, config)
+    layout.time_panel = views.time_panel(play=rrb.components.PlayState.Following, timeline=entities.REPORTED)
+    return layout
+
+
 class _ReportRecorder(Recorder):
-    """Recorder that also logs fingerprints and the note, and collects the summary for the page."""
+    """Recorder that also logs fingerprints, the note and the subject, and collects the summary for the page.
+
+    The timeline ``report`` ends with the frame that the report is about, so that a viewer opens on it.
+    """
 
     def __init__(
         self,
@@ -219,17 +276,35 @@ class _ReportRecorder(Recorder):
         at: int,
         note: str,
         notes: Sequence[Note],
+        answers: Sequence[Answer],
         network: str,
     ) -> None:
         super().__init__(recording, config, network)
         self._summary, self._at, self._note, self._notes = summary, at, note, notes
+        self._answers = answers
 
     def observe(self, result: FrameResult) -> None:
-        received = result.frame.received
-        lines = [f"note: {note}" for note in self._notes if note.received == received]
-        if self._note and received == self._at:
-            lines.insert(0, f"note: {self._note}")
-        self.logger.log(result, notes=[("INFO", line) for line in lines])
+        frame = result.frame
+        lines = [f"note: {note}" for note in self._notes if note.received == frame.received]
+        states: dict[str, str] = {}
+        is_reported = frame.received == self._at
+        if is_reported:
+            lines += [answer.text for answer in self._answers[:1]]
+            if self._note:
+                lines.insert(0, f"note: {self._note}")
+            subject = self._answers[0] if self._answers else None
+            if subject is not None:
+                states[entities.state("report")] = f"{subject.subject.name}: {subject.verdict.kind.value}"
+
+        def mark() -> None:
+            """Mark the subject in its frame alone."""
+            if is_reported:
+                log_answers(self.recording, frame, self._answers, 1, result.config.bev)
+            else:
+                clear_answers(self.recording)
+
+        self.logger.sequences = {entities.REPORTED: frame.index} if frame.received <= self._at else {}
+        self.logger.log(result, notes=[("INFO", line) for line in lines], states=states, log_more=mark)
         lines, block = pack(digest(result))
         self.recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))
         self._summary.add(result)
@@ -340,8 +415,10 @@ def _facts(
     summary: WindowSummary,
     name: str,
     notes: Sequence[Note],
+    frame: _Asked | None,
 ) -> Facts:
     """Return the text of the report."""
+    answers = () if frame is None else frame.answers
     sizes = {
         path.name: f"{description}, {megabytes(path.stat().st_size)}"
         for path, description in (
@@ -358,14 +435,15 @@ def _facts(
     stem = request.output.stem
     changed = changes(load(preset=public.preset), public)
     differs = f"with {len(changed)} parameter{'s' * (len(changed) > 1)} changed" if changed else "unchanged"
+    headline = request.note.splitlines()[0] if request.note else answers[0].subject.name if answers else ""
     return Facts(
-        title=f"{stem}: {request.note.splitlines()[0]}" if request.note else stem,
+        title=f"{stem}: {headline}" if headline else stem,
         note=request.note,
         notes={f"{(note.received - window.start) / SECOND:.3f} s": str(note) for note in notes},
-        asked=[
-            *(_asked(answer) for answer in request.asked),
-            *(_asked(answer, "Before other values were tried: ") for answer in request.asked_before),
-        ],
+        cause=None
+        if frame is None or not answers
+        else cause_of(frame.result, (window.at - window.start) / SECOND, answers[0], request.tried),
+        asked=[answer_text(answer) for answer in (*answers[1 : 1 + LISTED], *request.asked)],
         where=where,
         start=window.start,
         config=f"Preset {public.preset}, {differs}.",
@@ -375,15 +453,15 @@ def _facts(
         warnings=written.warnings,
         tracebacks=traceback_texts(summary.tracebacks),
         files=file_lines(sizes, content.counts, made_with.dependencies.get("detector.model")),
-        commands=commands(request.output, window, public, request.redact),
+        commands=commands(request.output, window, public, request.redact, _helpful(request, answers)),
     )
 
 
-def _asked(answer: Answer, when: str = "") -> AnswerText:
-    """Return an answer as text, with ``when`` before its verdict."""
-    text = answer.verdict.text
-    steps = [(step.stage, step.text) for step in answer.steps]
-    return AnswerText(f"{when}{text}", answer.verdict.reported, steps)
+def _helpful(request: ReportRequest, answers: Sequence[Answer]) -> Sequence[str]:
+    """Return the settings to compare with: those that the user tried, else the best hint's."""
+    if request.tried is not None:
+        return request.tried.settings
+    return answers[0].hints[0].settings if answers and answers[0].hints else ()
 
 
 def _class_names(config: Config) -> str:

@@ -10,12 +10,13 @@ from bevviz.bags.source import SECOND
 from bevviz.model.results import Explanation, FrameResult
 from bevviz.recording import entities
 from bevviz.report.facts import Facts
-from bevviz.report.pictures import Plot, Series, camera_picture, jpeg, plot, shrink
+from bevviz.report.pictures import Plot, Series, camera_picture, jpeg, marked_pictures, plot, shrink
 from bevviz.report.summary import WindowSummary
 from bevviz.support.html import render
-from bevviz.why import FrameExplainer
+from bevviz.why import Answer, FrameExplainer
 
 PICTURE_WIDTH = 960
+SUBJECT_WIDTH = 800
 COMMON = 5  # problems that are listed
 
 _QUIET = {"below_threshold", "suppressed", "not_kept", "out_of_view", "too_small", "too_large"}
@@ -60,8 +61,15 @@ class DecisionTotal:
     frames: str
 
 
-def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
-    """Return the HTML text. ``seal`` is the SHA-256 of the recording."""
+def page(facts: Facts, summary: WindowSummary, seal: str, answers: Sequence[Answer] = ()) -> str:
+    """Return the HTML text.
+
+    Args:
+        facts: text beside the results.
+        summary: results of the window.
+        seal: SHA-256 of the recording.
+        answers: the answer about the report's subject, to mark in pictures.
+    """
     bad = [frame for frame in summary.frames if frame.problems]
     common = Counter(problem for frame in bad for problem in frame.problems).most_common(COMMON)
     return render(
@@ -69,6 +77,12 @@ def page(facts: Facts, summary: WindowSummary, seal: str) -> str:
         title=facts.title,
         facts=facts,
         seal=seal,
+        marked=[
+            Picture(jpeg(one.picture, 88), one.caption)
+            for answer in answers
+            if summary.result is not None
+            for one in marked_pictures(summary.result, answer, SUBJECT_WIDTH)
+        ],
         frame=None if summary.result is None else _frame(summary.result, facts),
         frames=len(summary.frames),
         bad_frames=len(bad),

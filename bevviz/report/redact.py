@@ -21,7 +21,7 @@ from bevviz.bags.reader import normalized
 from bevviz.config import DetectorConfig
 from bevviz.drivers.video import decode_packet
 from bevviz.errors import UserError
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_compressed_image
 from bevviz.messages.foxglove import foxglove_type
