@@ -102,7 +102,7 @@ class Soak:
         full = np.array([now > filled for now, _ in self._looks])
         growth = memory[full][-10:].mean() / memory[full][:10].mean() if full.sum() >= 20 else float("nan")
         (before, first), (now, last) = self._looks[0], self._looks[-1]
-        drops = {place: count - first.drops[place] for place, count in last.drops.items()}
+        drops = {place: count - first.drops.get(place, 0) for place, count in last.drops.items()}
         print(f"\n{last.frames - first.frames} frames in {now - before:.0f} s, dropped: {drops}")
         print(f"arrival to logged: p50 {p50} ms, p90 {p90} ms, p99 {p99} ms; period {1e3 * period:.0f} ms")
         print(f"memory: most {memory.max():.0f} MB, at the end {growth:.3f} of when the recorder was full")

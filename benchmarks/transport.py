@@ -1,7 +1,7 @@
 """Clouds and images between two processes of one machine: Fast DDS as it comes, and with profiles.
 
 A publisher and a subscriber of rclpy, without bevviz: 120,000 points (1.9 MB), an image of 640 x 360 (0.7 MB)
-and one of 1280 x 720 (2.8 MB) at 10 Hz. Prints, for each side that has the profile of docs/live.md, how long
+and one of 1280 x 720 (2.8 MB) at 10 Hz. Prints, for each side that has ros/config/fastdds.xml, how long
 messages take from their stamp to the middleware having them whole, and how many never came.
 """
 
@@ -11,10 +11,8 @@ import argparse
 import array
 import json
 import os
-import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -26,7 +24,7 @@ from tqdm import tqdm
 
 from benchmarks.measure import machine
 
-DOCS = Path(__file__).parents[1] / "docs" / "live.md"
+PROFILE = Path(__file__).parents[1] / "ros" / "config" / "fastdds.xml"
 POINTS, RATE = 120_000, 10.0
 IMAGES = {"/small": (640, 360), "/large": (1280, 720)}
 CLOUD = "/points"
@@ -51,30 +49,21 @@ def main() -> int:
         return 0
     print(machine())
     cases = [(side, best) for best in (False, True) for side in SIDES] * options.turns
-    with tempfile.TemporaryDirectory() as folder:
-        profile = Path(folder, "profile.xml")
-        profile.write_text(profile_of_docs())
-        print("quality, who has the profile: p50, p99, missing, of each topic")
-        for side, best in tqdm(cases, unit="run", disable=None):
-            found = exchange(options, SIDES[side], best, profile)
-            tqdm.write(f"{'best effort' if best else 'reliable'}, {side}: {'; '.join(found)}")
+    print("quality, who has the profile: p50, p99, missing, of each topic")
+    for side, best in tqdm(cases, unit="run", disable=None):
+        found = exchange(options, SIDES[side], best)
+        tqdm.write(f"{'best effort' if best else 'reliable'}, {side}: {'; '.join(found)}")
     return 0
 
 
-def profile_of_docs() -> str:
-    """Return the profile that the documentation gives."""
-    (profile,) = re.findall(r"```xml\n(.*?)```", DOCS.read_text(), re.DOTALL)
-    return str(profile)
-
-
-def exchange(options: argparse.Namespace, profiled: tuple[str, ...], best: bool, profile: Path) -> list[str]:
+def exchange(options: argparse.Namespace, profiled: tuple[str, ...], best: bool) -> list[str]:
     """One run of two processes, in words by topic."""
     env = {name: value for name, value in os.environ.items() if name != "FASTRTPS_DEFAULT_PROFILES_FILE"}
     env |= {"ROS_DOMAIN_ID": str(options.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
     def start(part: str, seconds: float) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "benchmarks.transport", "--part", part, f"--seconds={seconds}"]
-        given = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profile)} if part in profiled else {}
+        given = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)} if part in profiled else {}
         command += ["--best-effort"] if best else []
         return subprocess.Popen(command, env=env | given, stdout=subprocess.PIPE, text=True)
 

@@ -179,3 +179,32 @@ def test_an_interrupt_at_any_line_ends_an_open_recording(tmp_path: Path) -> None
     done = python(script, tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert int(done.stdout) > 30
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_a_live_run_at_once(tmp_path: Path, number: signal.Signals) -> None:
+    """SIGHUP does not: a closed terminal sends it to a process that ends already."""
+    script = (
+        "import os, time; from contextlib import suppress\n"
+        "from bevviz.cli import interrupts\n"
+        "interrupts.ECHO = 0; interrupts.install()\n"
+        "with suppress(KeyboardInterrupt), interrupts.interruptible(twice=True):\n"
+        f"    os.kill(os.getpid(), {signal.SIGTERM})\n"
+        f"os.kill(os.getpid(), {signal.SIGHUP}); print('closing', flush=True)\n"
+        f"os.kill(os.getpid(), {number}); print('went on')\n"
+    )
+    done = python(script, tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "closing\n", "")
+
+
+def test_a_request_to_save_during_imports_ends_nothing(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys\n"
+        "class Ask:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'bevviz.cli': os.kill(os.getpid(), signal.SIGUSR1)\n"
+        "sys.meta_path.insert(0, Ask())\n"
+        "import bevviz.__main__; print('went on')\n"
+    )
+    done = python(script, tmp_path)
+    assert (done.returncode, done.stdout) == (0, "went on\n"), done.stderr

@@ -21,15 +21,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rerun.chunk import RrdReader
 
 from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import INDEX, Indexer, RecordingSaver, remove_leftovers, unused_names
+from bevviz.live.files import RecordingSaver, unused_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
 from bevviz.live.frames import Replay, ThinnedSource, thin
+from bevviz.live.indexing import INDEX, Indexer, add_index, remove_leftovers
 from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.status import Notes
@@ -43,11 +45,12 @@ from bevviz.model.results import (
     Pairs,
 )
 from bevviz.pipeline.session import Session
+from bevviz.recording import blueprints
 from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
-from tests.support.recordings import Recording, verify
+from tests.support.recordings import Recording, verify, verify_when_indexed
 from tests.support.ros_graphs import alone
 from tests.support.waiting import until
 
@@ -118,10 +121,9 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         observe: bool = False,
         on_result: Callable[[FrameResult], None] | None = None,
         said: list[str] | None = None,
-        index: bool = False,
         **outputs: Any,
     ) -> Outcome:
-        monkeypatch.setattr("bevviz.live.runtime.Indexer", Indexer if index else NoIndexer)
+        monkeypatch.setattr("bevviz.live.runtime.Indexer", NoIndexer)
         said = [] if said is None else said
         if source is None and rate is not None:
             source = Replay(frames, drive.scene, rate=rate, total=total)
@@ -427,7 +429,8 @@ def test_leftover_indexes_are_removed_and_those_in_work_are_not(tmp_path: Path) 
 
 
 def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
-    outcome = run(total=30, save=Path("out.rrd"), index=True)
+    outcome = run(total=30, save=Path("out.rrd"))
+    add_index(Path("out.rrd"))
     recording = Recording(Path("out.rrd"))
     assert numbers(Path("out.rrd")) == list(range(30)) and sum(outcome.live.status.drops.values()) == 0
     p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
@@ -550,7 +553,9 @@ def test_the_flight_recorder_holds_the_last_seconds(
         saved = [flight.save(), flight.save(tmp_path / "second.rrd")]
         with pytest.raises(UserError, match="already there"):
             flight.save(tmp_path / "second.rrd")
-    indexer.close()
+    written = [path.stat().st_ino for path in saved]
+    assert indexer.close()  # a process that nobody waits for has begun
+    until(lambda: all(path.stat().st_ino != inode for path, inode in zip(saved, written, strict=True)))
     for path in saved:
         verify(path)
         recording = Recording(path)
@@ -607,11 +612,13 @@ def test_a_recording_may_start_at_any_whole_packet(
     path.write_bytes(encoder.prelude(packets[1].context) + packets[1].data)
     encoder.close()
     assert [p.whole for p in packets] == [True, True]
+    application = blueprints.application_id("live", drive.scene, config)
+    assert {store.application_id for store in RrdReader(path).recordings()} == {application}
     recording = Recording(path)
     assert recording.cleared("/world/rslidar/clusters") == {1}
     assert recording.column("/world/zed/image", "EncodedImage:blob")
     assert ["something was said"] in recording.column("/explain/log", "TextLog:text")
-    assert recording.column("/explain/states/pipeline", "StateChange:state") == [["ok"]]
+    assert recording.column("/explain/states/pipeline", "StateChange:state") == [["no detector"]]
 
 
 # --- triggers ----------------------------------------------------------------------------------
@@ -1017,7 +1024,18 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
     environment |= alone(tmp_path)
     command = [sys.executable, "-m", "bevviz.cli"]
     run = subprocess.Popen(
-        [*command, "live", "--synthetic", "4", "--flight", "20 s", "--save", "all.rrd"],
+        [
+            *command,
+            "live",
+            "--synthetic",
+            "2",
+            "--flight",
+            "20 s",
+            "--save",
+            "all.rrd",
+            "--set",
+            "live.max_rate=4",
+        ],
         stderr=subprocess.PIPE,
         text=True,
         cwd=tmp_path,
@@ -1051,7 +1069,7 @@ def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
     assert "no 'bevviz live' of yours with process id 1" in other.stderr
     (signalled,) = tmp_path.glob("flight_*.rrd")
     for path in (saved, signalled, tmp_path / "mine.rrd"):
-        verify(path)
+        verify_when_indexed(path)
         assert len(numbers(path)) >= 2
     assert f"flight recorder saved in {signalled.name} (SIGUSR1)" in said
     assert " frames in all.rrd" in said
@@ -1100,7 +1118,7 @@ def test_a_run_killed_twice_loses_nothing(tmp_path: Path) -> None:
     """Start the same command again after each kill, as systemd does with Restart=always."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     environment |= alone(tmp_path)
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "4", "--save", "drive.rrd"]
+    command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "2", "--save", "drive.rrd"]
     before: dict[str, bytes] = {}
     said = ""
     for number, name in enumerate(["drive.rrd", "drive-2.rrd", "drive-3.rrd"]):

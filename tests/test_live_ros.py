@@ -22,7 +22,7 @@ import pytest
 from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
 from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import read_header
+from bevviz.messages.decoders import read_header
 from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
 from bevviz.messages.encode import (
@@ -38,7 +38,7 @@ from bevviz.pipeline.session import Session
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
-from tests.support.recordings import Recording, verify
+from tests.support.recordings import Recording, verify_when_indexed
 from tests.support.ros_graphs import alone, own_domain, own_graph, playing
 from tests.support.ros_player import Play
 from tests.support.waiting import PATIENCE, until
@@ -58,6 +58,7 @@ from bevviz.live.publish import (
     SPEED,
     TRACKS,
     Publisher,
+    RosTopics,
 )
 from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.live.requests import RosRequests
@@ -185,13 +186,13 @@ def test_stated_topic_is_waited_for(robot: str) -> None:
     settings = ["source.lidar_topics=[/rosout]", "source.camera_topics=[/elsewhere]"]
     with LiveSource(load(settings=settings), tell=said.append) as source:
         absent = "nobody publishes /elsewhere, which source.camera_topics states"
-        wrong = "/rosout is a rcl_interfaces/msg/Log, but source.lidar_topics takes PointCloud2"
+        wrong = "/rosout is a rcl_interfaces/msg/Log, but source.lidar_topics takes PointCloud2 or LaserScan"
         until(lambda: source.missing == f"{wrong}; {absent}", "both")
         until(lambda: {absent, wrong} <= set(said), "both are told")
         assert not source.wait(0)
 
 
-def test_info_says_what_is_missing() -> None:
+def test_info_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first command that a user runs: no LiDAR yet, then one without messages."""
 
     def describe(config: Config, missing: str) -> info.LiveInfo:
@@ -201,10 +202,13 @@ def test_info_says_what_is_missing() -> None:
                 break
         return made
 
+    said: list[str] = []
+    monkeypatch.setattr("bevviz.support.progress._say", said.append)
     with Node(name="half_a_robot") as robots:
         robots.start()
         made = describe(load(settings=["source.lidar_topics=[/points]"]), "nobody publishes /points")
         assert made.missing[0] == "nobody publishes /points, which source.lidar_topics states"
+        assert any(line.startswith("waiting 2 s at most: nobody publishes /points") for line in said)
         cloud = typesupport.message_type("sensor_msgs/msg/PointCloud2")
         robots.node.create_publisher(cloud, "/points", 5)
         made = describe(load(), "no message on /points yet")
@@ -243,7 +247,7 @@ def test_stopped_topics_are_reported_and_so_is_their_return() -> None:
         for _ in range(6):
             publish(whole)
             time.sleep(0.05)
-        until_told("no cloud for 2 s on /points")
+        until_told("no cloud for 1.5 s on /points")
         until(lambda: source.states == {"/points": "silent"}, "the state")
         until_told("the clouds are back", whole)
         with Node(name="second_driver") as second:
@@ -363,8 +367,16 @@ def test_topics_that_cannot_be_received_are_reported(robot: str, monkeypatch: py
 
 
 def test_what_helps_against_losses_depends_on_the_size() -> None:
-    assert "segment" in remedy(1.9e6) and "docs/live.md" in remedy(1.9e6)
-    assert "segment" not in remedy(300) and "queue" in remedy(300)
+    assert "segment" in remedy(1.9e6, 1.9e6) and "docs/live.md" in remedy(1.9e6, 1.9e6)
+    assert "clouds or images fill the transport" in remedy(300, 1.9e6)
+    assert "segment" not in remedy(300, 300) and "queue" in remedy(300, 300)
+
+
+@pytest.mark.parametrize("domain", ["500", "one"])
+def test_a_wrong_domain_is_refused(domain: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    with pytest.raises(UserError, match=f"ROS_DOMAIN_ID={domain}: a domain is a number from 0 to 232"):
+        Node()
 
 
 def test_wrong_arguments_are_refused() -> None:
@@ -516,7 +528,8 @@ def test_published_results_are_not_read_back(result: FrameResult) -> None:
     kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
     kinds |= {DETECTIONS: "Detection2DArray", TRACKS: "Detection3DArray", MARKERS: "MarkerArray"}
     with LiveSource(load()) as source, Node(name="rviz") as rviz:
-        publisher = Publisher(source.node, load())
+        topics = RosTopics(source.node)
+        publisher = Publisher(load(), [topics])
         publisher.publish(result)  # for nobody
         for topic, short in kinds.items():
             kind = TOPICS_PUBLISHED[topic]
@@ -623,7 +636,9 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
         "clustering.max_cluster_points=null",
     ]
     refused = set_to("voxel_size", -1.0)
-    assert not refused.successful and "voxel.size" in refused.reason
+    assert not refused.successful and "voxel_size out of range" in refused.reason
+    (allowed,) = robot.node.describe_parameter("clustering.eps").floating_point_range
+    assert 0 == allowed.from_value < allowed.to_value < 1000
     assert robot.node.get_parameter("voxel_size").value == 0.05
 
     orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
@@ -712,7 +727,7 @@ def test_the_command_runs_beside_a_robot(robot: str, tmp_path: Path) -> None:
     assert run.returncode == 0, said
     assert "configuration: bev.range_x 12.0 -> 6.0" in said and "Traceback" not in said
     for path in (tmp_path / "all.rrd", tmp_path / answer.message):
-        verify(path)
+        verify_when_indexed(path)
         recording = Recording(path)
         assert recording.rows["/bev"]  # of what was saved at once there may be one frame
         configs = recording.static["/config"] or recording.rows["/config"]

@@ -164,33 +164,23 @@ def test_a_stopped_process_is_told_within_seconds(tmp_path: Path) -> None:
         snap()
 
 
-def test_saving_may_take_longer_than_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_during_a_save_waits_for_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "ANSWER", 0.3)
+    disk = threading.Lock()
 
     def slow(path: Path | None) -> Path:
-        time.sleep(1)
-        return Path("/slow.rrd")
+        with disk:
+            time.sleep(0.5)
+            return Path("/slow.rrd")
 
+    saved: list[Path] = []
     with Control(slow, never):
-        assert snap() == Path("/slow.rrd")
-
-
-def test_simultaneous_requests_are_served_in_turn() -> None:
-    busy: list[int] = []
-
-    def save(path: Path | None) -> Path:
-        busy.append(len(busy))
-        time.sleep(0.2)
-        return Path(f"/{len(busy)}.rrd")
-
-    found: list[Path] = []
-    with Control(save, never):
-        threads = [threading.Thread(target=lambda: found.append(snap())) for _ in range(3)]
+        threads = [threading.Thread(target=lambda: saved.append(snap())) for _ in range(3)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    assert len(found) == 3
+    assert saved == 3 * [Path("/slow.rrd")]
 
 
 def test_the_client_imports_little() -> None:

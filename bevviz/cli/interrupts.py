@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Event
@@ -13,8 +14,11 @@ from threading import Event
 from bevviz.support import cleanup
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+INSISTING = (signal.SIGINT, signal.SIGTERM)  # signals that end at once the second time
 
+ECHO = 0.3  # seconds; a launcher may pass on the Ctrl-C that a terminal sends to all its processes
 
+_first_signal: list[float] = []  # seconds, monotonic
 _came = Event()  # Set by every signal, even if its exception got lost.
 
 
@@ -67,17 +71,32 @@ def _interrupt(number: int, stack: object) -> None:
     raise KeyboardInterrupt
 
 
+def _end_at_once(number: int, stack: object) -> None:
+    """End the process with nothing written or closed, unless the signal is an echo of the first one."""
+    if time.monotonic() - _first_signal[0] > ECHO:
+        cleanup.remove_all()
+        os._exit(128 + number)
+
+
 @contextmanager
-def interruptible() -> Iterator[Event]:
+def interruptible(*, twice: bool = False) -> Iterator[Event]:
     """Raise KeyboardInterrupt and set the yielded event when a signal comes.
 
     The event is needed because an exception can get lost while a library calls back into Python. After
     ``install``, later signals are ignored: they would leave an incomplete file.
+
+    Args:
+        twice: a second Ctrl-C or SIGTERM ends the process at once, also after this context.
     """
     ended = Event()
 
     def interrupt(number: int, stack: object) -> None:
+        if twice and ended.is_set():
+            if number in INSISTING:
+                _end_at_once(number, stack)
+            return
         ended.set()
+        _first_signal.append(time.monotonic())
         if _interrupt in previous.values():  # This process is a command.
             _came.set()
         raise KeyboardInterrupt
@@ -91,8 +110,10 @@ def interruptible() -> Iterator[Event]:
         yield ended
     finally:
         for number, handler in previous.items():
-            ignores = ended.is_set() and handler is _interrupt
-            signal.signal(number, signal.SIG_IGN if ignores else handler)
+            if ended.is_set() and handler is _interrupt:
+                insists = twice and number in INSISTING
+                handler = _end_at_once if insists else signal.SIG_IGN
+            signal.signal(number, handler)
 
 
 def wait_for_interrupt() -> None:

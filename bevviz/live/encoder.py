@@ -25,7 +25,6 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
 from bevviz.recording.cloud import ColoredPoints
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
-from bevviz.recording.sinks import APPLICATION
 from bevviz.support.contexts import Closable
 
 WHOLE = 1.0  # seconds from one whole packet to the next
@@ -53,10 +52,12 @@ class Packet:
 class _Stream(Closable):
     """Recording in a memory file whose bytes are read back as they are written."""
 
-    def __init__(self, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None) -> None:
+    def __init__(
+        self, application: str, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None
+    ) -> None:
         self._file = os.memfd_create("recording")
         self._end = 0
-        self.recording = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        self.recording = rr.RecordingStream(application, recording_id=recording_id)
         self.recording.set_log_time_enabled(False)
         # A footer would keep a list of every logged chunk in memory.
         sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)
@@ -129,7 +130,8 @@ class Encoder:
         self._step = whole
         blueprints.load(blueprint, scene)  # reports a wrong blueprint at the start
         self._config, self._scene = config, scene
-        self._stream = _Stream()
+        self.application = blueprints.application_id(blueprint, scene, config)
+        self._stream = _Stream(self.application)
         self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
         self._whole = float("-inf")
         self._lock = threading.Lock()
@@ -220,7 +222,7 @@ class Encoder:
     def prelude(self, context: RecordingContext, *, blueprint: bool = True) -> bytes:
         """Return the beginning of a recording whose first packet has this context. Any thread may call it."""
         layout = blueprints.load(self._blueprint, context.scene, context.config) if blueprint else None
-        with _Stream(self.recording_id, layout) as stream:
+        with _Stream(self.application, self.recording_id, layout) as stream:
             logger = FrameLogger(stream.recording, context.config, context.scene, network=self._network)
             logger.log_context(context)
             if self._against is not None:

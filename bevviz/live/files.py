@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
-import subprocess
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -21,16 +18,14 @@ from bevviz.bags.rescue.completion import CHUNK_SIZE, complete
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
+from bevviz.live.indexing import Indexer, remove_leftovers
 from bevviz.live.outputs import Output
 from bevviz.live.raw_recorder import MEGABYTE, RawMessage, RawRecorder
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import definition
-from bevviz.recording import rerun_cli
 from bevviz.support.contexts import Closable
-from bevviz.support.files import create_file, is_locked, lock_file, rename_new, write_all
+from bevviz.support.files import create_file, is_locked, rename_new, write_all
 
-INDEX = ".bevviz-index-"  # followed by eight hex digits: suffix of a file while its index is made
-INDEXED = 1000 * MEGABYTE  # bytes; the index is made in memory, so a larger file gets none
 WAITING = 200 * MEGABYTE  # bytes of messages that may wait for a slow disk
 
 
@@ -199,67 +194,6 @@ class RecordingSaver(Output):
         os.close(self._file)
 
 
-class Indexer:
-    """Worker that gives finished recordings an index and merges their small chunks, in the background.
-
-    A recording without an index opens too, but slowly. If the work fails, the file stays as it is. The work
-    ends with this process. The next process removes the leftovers of a killed one in the same folder.
-    """
-
-    def __init__(self) -> None:
-        self._worker = ThreadPoolExecutor(1, "index")
-        self._waiting = 0
-
-    @property
-    def waiting(self) -> int:
-        """Number of files that are not done."""
-        return self._waiting
-
-    def add(self, path: Path) -> None:
-        """Queue a file, unless it is too large."""
-        if path.stat().st_size <= INDEXED:
-            with suppress(RuntimeError):  # the indexer is closed, so the file stays as it is
-                self._worker.submit(self._index, path)
-                self._waiting += 1
-
-    def close(self) -> None:
-        """Finish the queued files."""
-        self._worker.shutdown()
-
-    def _index(self, path: Path) -> None:
-        indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
-        optimize = ["nice", "-n", "19", rerun_cli.rerun_program(), "rrd", "optimize", str(path)]
-        handle = create_file(indexed)
-        try:
-            lock_file(handle, f"{indexed}: another process is writing it")
-            done = subprocess.run(
-                rerun_cli.ending_with_parent([*optimize, "-o", str(indexed)]),
-                capture_output=True,
-                check=False,
-                env=rerun_cli.environment(),
-                start_new_session=True,
-            )
-            if done.returncode == 0 and indexed.stat().st_size:
-                indexed.replace(path)
-            else:
-                indexed.unlink(missing_ok=True)
-        finally:
-            os.close(handle)
-            self._waiting -= 1
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete unfinished index files of ended processes. Their recordings are complete without them."""
-    for path in folder.glob(f"*{INDEX}????????"):
-        with suppress(OSError, UserError):
-            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            try:
-                lock_file(handle, "")
-                path.unlink()
-            finally:
-                os.close(handle)
-
-
 # --- bags --------------------------------------------------------------------------------------
 
 
@@ -378,15 +312,15 @@ class BagSaver(Closable):
             part.__exit__(None, None, None)
 
 
-def write_bag(path: Path, messages: Sequence[RawMessage]) -> None:
-    """Write messages as an MCAP file. The file appears when it is complete.
+def write_bag(path: Path, messages: Sequence[RawMessage], *, compress: bool = True) -> None:
+    """Write messages as an MCAP file, compressed or not. The file appears when it is complete.
 
     Raises:
         UserError: the file exists already, or cannot be written.
     """
     if path.exists():
         raise UserError(f"{path}: is already there")
-    with McapWriter(path, define, replace=False) as bag:
+    with McapWriter(path, define, compress=compress, replace=False) as bag:
         for message in messages:
             bag.write(message.connection, message.received, message.data, message.sent)
 

@@ -15,7 +15,8 @@ from bevviz.anomalies import Onsets
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.files import Indexer, remove_leftovers, write_bag
+from bevviz.live.files import write_bag
+from bevviz.live.indexing import Indexer, remove_leftovers
 from bevviz.live.raw_recorder import MEGABYTE, RawMessage, RawRecorder
 from bevviz.live.status import Notes, give_way
 from bevviz.model.results import FrameResult

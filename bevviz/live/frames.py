@@ -85,6 +85,13 @@ class ThinnedSource:
         marks = getattr(self._source, "marks", None)
         return () if marks is None else tuple(marks(index))
 
+    def mark(self, text: str) -> bool:
+        """Pass a user's mark to the source. Return whether it takes marks."""
+        mark = getattr(self._source, "mark", None)
+        if mark is not None:
+            mark(text)
+        return mark is not None
+
     def stop(self) -> None:
         """End the iteration of the source."""
         stop = getattr(self._source, "stop", None)

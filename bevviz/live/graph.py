@@ -28,20 +28,40 @@ class PublishedTopic:
 
     name: str
     type: str
-    publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo of other nodes
+    publishers: tuple[Any, ...]  # rclpy's TopicEndpointInfo of other nodes, of this type
+    others: tuple[Any, ...] = ()  # the same of publishers with another type, which are not received
+
+    @property
+    def clash(self) -> str:
+        """One sentence about publishers with another type. Empty: there are none."""
+        if not self.others:
+            return ""
+        used, unused = (
+            ", ".join(f"{full_name(p)} ({p.topic_type})" for p in publishers)
+            for publishers in (self.publishers, self.others)
+        )
+        return f"{self.name} has two types: {used} is received, {unused} is not; remap one of them"
 
 
-def published_topics(session: Node) -> dict[str, PublishedTopic]:
+def published_topics(session: Node, rank: Callable[[str, str], int]) -> dict[str, PublishedTopic]:
     """Return every topic that another node publishes.
 
     In a namespace these are its own topics. Topics outside are added for types that it lacks.
+
+    Args:
+        session: the nodes of bevviz.
+        rank: returns a number for name and type of a topic. If it has several types, the lowest is taken.
     """
     topics = {}
     for name, _ in session.input.get_topic_names_and_types():
         publishers = session.input.get_publishers_info_by_topic(name)
-        others = tuple(p for p in publishers if not session.owns(p))
-        if others:
-            topics[name] = PublishedTopic(name, others[0].topic_type, others)
+        foreign = [p for p in publishers if not session.owns(p)]
+        if foreign:
+            kind = min({p.topic_type for p in foreign}, key=lambda kind: (rank(name, kind), kind))
+            of_kind = tuple(p for p in foreign if p.topic_type == kind)
+            topics[name] = PublishedTopic(
+                name, kind, of_kind, tuple(p for p in foreign if p.topic_type != kind)
+            )
     inside = session.namespace.rstrip("/") + "/"
     types = {topic.type for topic in topics.values() if topic.name.startswith(inside)}
     return {n: t for n, t in topics.items() if n.startswith(inside) or t.type not in types}
@@ -89,6 +109,26 @@ def full_name(publisher: Any) -> str:
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
+def open_publisher(node: Any, kind: str, topic: str) -> Any:
+    """Return a publisher of serialised messages.
+
+    Raises:
+        UserError: the type is unknown, or another node publishes the topic with another type.
+    """
+    message_class = message_type(kind)
+    name = node.resolve_topic_name(topic)
+    others = [p for p in node.get_publishers_info_by_topic(name) if p.topic_type != kind]
+    if others:
+        raise UserError(
+            f"{full_name(others[0])} publishes {name} as {others[0].topic_type}, ours is {kind}; "
+            f"--ros-args -r {topic}:=/bevviz{topic} gives ours another name"
+        )
+    try:
+        return node.create_publisher(message_class, topic, 10)
+    except Exception as error:  # the middleware refuses a type beside another one
+        raise UserError(f"the middleware refuses {kind} on {name}: {' '.join(str(error).split())}") from None
+
+
 # --- subscriptions -----------------------------------------------------------------------------
 
 Receive = Callable[[PublishedTopic, bytes, dict[str, Any]], None]  # topic, message, rclpy's message info
@@ -129,13 +169,17 @@ class Subscriptions:
         """Names of the subscribed topics."""
         return self._by_topic.keys()
 
+    def type_of(self, name: str) -> str | None:
+        """Return the type with which a topic is subscribed, or None."""
+        return self._by_topic[name].type if name in self._by_topic else None
+
     def listen(self, topic: PublishedTopic, *, decoded: bool = True) -> str | None:
         """Subscribe to a topic, or again if the offered type or quality of service has changed.
 
         ``decoded``: the definition of the type is needed, too, unless a decoder reads the bytes.
 
         Returns:
-            None, or the reason why the type is not known. It is empty while a publisher may answer.
+            None, or the reason why the topic is not received. It is empty while a publisher may answer.
         """
         try:
             kind = message_type(topic.type)
@@ -153,9 +197,12 @@ class Subscriptions:
         def receive(data: bytes, info: dict[str, Any]) -> None:
             self._receive(topic, data, info)
 
-        handle = self._node.input.create_subscription(
-            kind, topic.name, receive, qos, event_callbacks=self._events(topic.name), raw=True
-        )
+        try:
+            handle = self._node.input.create_subscription(
+                kind, topic.name, receive, qos, event_callbacks=self._events(topic.name), raw=True
+            )
+        except Exception as error:  # this process still has an endpoint of another type on that name
+            return f"the middleware refuses {topic.type}: {' '.join(str(error).split())}"
         self._by_topic[topic.name] = _Subscription(handle, topic.type, qos)
         return None
 

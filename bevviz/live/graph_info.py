@@ -20,6 +20,7 @@ from bevviz.pipeline.bag_info import (
     network_providers,
     render_contents,
 )
+from bevviz.support import progress
 
 LISTEN = 3.0  # seconds
 PATIENCE = 10.0  # seconds until the topics found so far are shown
@@ -50,7 +51,7 @@ def describe(
     # A separate node name, so that the topics of another bevviz are shown too.
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         with suppress(KeyboardInterrupt):
-            source.wait(patience)
+            _wait(source, patience)
         before, volume = source.received, source.volume
         start = time.monotonic()
         frame = _last_frame(source, seconds)
@@ -79,6 +80,15 @@ def describe(
             missing=tuple(missing),
             warnings=tuple(source.warnings),
         )
+
+
+def _wait(source: LiveSource, patience: float) -> None:
+    """Wait for the roles of the topics. Tell what is waited for."""
+    end, told = time.monotonic() + patience, ""
+    while not source.wait(max(0.0, min(1.0, end - time.monotonic()))) and time.monotonic() < end:
+        if (missing := source.missing) and missing != told:
+            told = missing
+            progress.say(f"waiting {patience:.0f} s at most: {missing}")
 
 
 def _last_frame(source: LiveSource, seconds: float) -> Frame | None:

@@ -20,12 +20,13 @@ from bevviz.messages.decoders import declared_decoder
 from bevviz.messages.foreign_boxes import holds_boxes
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import STAGE_KINDS, Roles, find_roles
-from bevviz.messages.topics import Topic, unsupported_reason
+from bevviz.messages.topics import CLOUDS, Topic, unsupported_reason
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.report import UnusableMessages
 from bevviz.sync.synchronizer import Synchronizer
 
-SILENCE = 2.0  # seconds without a message that are reported, unless five usual steps are longer
+SILENCE = 1.5  # seconds without a message that are reported, unless five usual steps are longer
+STALL = 0.5  # the same after which another LiDAR drives the frames
 STREAM = 5  # messages after which a topic counts as a stream that should continue
 AGAIN = 10  # unusable messages in a row that are reported once more
 
@@ -102,14 +103,19 @@ class TopicWatch:
         if self._damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
             self.report(f"{topic} unusable", f"a message cannot be used: {reason}")
 
-    def silent_for(self, topic: str) -> float:
-        """Return the seconds since the last message of a stream, or 0 if that is a usual time."""
+    def silent_for(self, topic: str, least: float = SILENCE) -> float:
+        """Return the seconds since the last message of a stream, or 0 if that is a usual time.
+
+        ``least``: shortest time in seconds that is not usual.
+        """
         if topic not in self._topics or len(self._topics[topic].times) < STREAM:
             return 0.0
         times = self._topics[topic].times
-        steps = [after - before for before, after in zip(times, list(times)[1:], strict=False)]
         silent = self._clock() - times[-1]
-        return silent if silent > max(SILENCE, 5 * median(steps)) else 0.0
+        if silent <= least:  # Most are: this is asked many times in a second.
+            return 0.0
+        steps = [after - before for before, after in zip(times, list(times)[1:], strict=False)]
+        return silent if silent > 5 * median(steps) else 0.0
 
     def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
         """Return the state of each topic, given whether it has a publisher."""
@@ -160,7 +166,7 @@ class Inputs:
     ) -> None:
         self._config, self._resolve, self._watch, self._results = config, resolve, watch, results
         self.roles = Roles()
-        self.sync = Synchronizer(self.roles, config)
+        self.sync = Synchronizer(self.roles, config, lapse=SILENCE)
         self.handlers: dict[str, Handler[LiveMessage]] = {}
         self.frame_ids: dict[str, str] = {}  # topic -> frame id of its first message
         self.changed = time.monotonic()  # seconds, last change of roles
@@ -172,7 +178,7 @@ class Inputs:
         source, images = self._source, ("Image", "CompressedImage")
         stated: dict[str, tuple[str, tuple[str, ...]]] = {}
         for key, names, kinds in (
-            ("source.lidar_topics", source.lidar_topics, ("PointCloud2",)),
+            ("source.lidar_topics", source.lidar_topics, CLOUDS),
             ("source.camera_topics", source.camera_topics, images),
             ("source.camera_info_topics", source.camera_info_topics, images),
             ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
@@ -217,6 +223,12 @@ class Inputs:
                 problems[name] = f"{name} is a {topic.type}, but {key} takes {' or '.join(kinds)}"
         return problems
 
+    def rank(self, name: str, kind: str) -> int:
+        """Return 0 if the configuration asks for this type of a topic, 1 if it may have a role, else 2."""
+        if name in self.stated and kind.rpartition("/")[2] in self.stated[name][1]:
+            return 0
+        return 1 if _concerns(PublishedTopic(name, kind, ())) else 2
+
     def candidates(self, topics: Mapping[str, PublishedTopic]) -> dict[str, PublishedTopic]:
         """Return the topics that may have a role, or may hold sensor data in an unsupported form."""
         packets = [name for name, topic in topics.items() if ouster.is_packet(topic.type)]
@@ -240,7 +252,7 @@ class Inputs:
         if replace(roles, notes={}) != replace(self.roles, notes={}):
             self.changed = time.monotonic()
             results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
-            former, self.sync = self.sync, Synchronizer(roles, self._config, beside=results)
+            former, self.sync = self.sync, Synchronizer(roles, self._config, results, SILENCE)
             self.sync.take_over(former)
             self.handlers = make_handlers(self.sync, roles, self._decode)
             for name in self._ousters.packets & self.handlers.keys():
@@ -304,7 +316,7 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     """
     names = {topic.name for topic in topics}
     changes: dict[str, Any] = {}
-    for key, kinds in (("lidar_topics", {"PointCloud2"}), ("camera_topics", {"Image", "CompressedImage"})):
+    for key, kinds in (("lidar_topics", {*CLOUDS}), ("camera_topics", {"Image", "CompressedImage"})):
         stated_names = getattr(config, key)
         changes[key] = tuple(name for name in stated_names if name in names)
         if stated_names and not changes[key]:

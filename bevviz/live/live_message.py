@@ -12,8 +12,7 @@ from typing import Any
 from bevviz.drivers import ouster
 from bevviz.drivers.packets import read_calibration
 from bevviz.errors import UserError
-from bevviz.messages.decoders import Serialization
-from bevviz.messages.decoding import MessageError, read_header
+from bevviz.messages.decoders import MessageError, Serialization, read_header
 from bevviz.messages.definitions import deserialize_cdr, store_of
 from bevviz.messages.guard import decode_message, guard
 from bevviz.messages.topics import NOT_LIDAR, Topic

@@ -27,6 +27,8 @@ MEETING = (
     "run in an environment that has that middleware"
 )
 
+LAST_DOMAIN = 232  # the ports of higher ones would lie beyond 65535
+
 # The wheels set it after they have restarted the interpreter with their library path. A child process of
 # another environment inherits the variable, but needs another path.
 BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
@@ -58,6 +60,7 @@ class Node(Closable):
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
+        _check_domain()
         self.error: BaseException | None = None  # the exception that ended a thread
         self._on_end = on_end
         self._context: Any = rclpy.Context()
@@ -199,6 +202,17 @@ def _check_middleware() -> None:
             f"RMW_IMPLEMENTATION={selected} is not installed for this Python, there is "
             f"{', '.join(sorted(installed))}: unset RMW_IMPLEMENTATION where the robot speaks DDS; {MEETING}"
         )
+
+
+def _check_domain() -> None:
+    """Check ROS_DOMAIN_ID. The middleware prints lines of its own about a wrong one.
+
+    Raises:
+        UserError: it is not a number that the ports of DDS allow.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID", "")
+    if domain and not (domain.isdecimal() and int(domain) <= LAST_DOMAIN):
+        raise UserError(f"ROS_DOMAIN_ID={domain}: a domain is a number from 0 to {LAST_DOMAIN}")
 
 
 def middlewares() -> set[str]:

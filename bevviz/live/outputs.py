@@ -133,14 +133,14 @@ def server(port: int, bind: str, memory: float) -> tuple[Program, str]:
     )
 
 
-def remote(url: str, recording_id: str) -> Program:
-    """Return the program that relays to a remote viewer.
+def remote(url: str, application: str, recording_id: str) -> Program:
+    """Return the program that relays a recording to a remote viewer.
 
     Raises:
         UserError: the URL is wrong, or no viewer answers there.
     """
     host, port = check_viewer(url)
-    command = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, recording_id]
+    command = [sys.executable, "-P", "-m", "bevviz.live.viewer_relay", url, application, recording_id]
     return Program("remote", command, framed=True, is_ready=lambda: is_listening(host, port))
 
 

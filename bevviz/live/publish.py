@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence, Set
+from typing import Any, Protocol
 
 import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.live.graph import open_publisher
 from bevviz.live.status import Notes
-from bevviz.live.typesupport import message_type
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
     encode_boxes_2d,
@@ -18,6 +18,7 @@ from bevviz.messages.encode import (
     encode_cloud,
     encode_image,
     encode_markers,
+    encode_transforms,
 )
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image
@@ -31,6 +32,7 @@ DETECTIONS = "/detection/camera_2d"
 FUSED = "/detection/fused_3d"
 TRACKS = "/detection/tracks_3d"
 MARKERS = "/visualization/tracks"
+TRANSFORMS = "/tf"
 SPEED = "speed_m_s"  # class of a track's second result; the score of that result is the speed
 TOPICS = {
     BEV: "sensor_msgs/msg/Image",
@@ -40,30 +42,70 @@ TOPICS = {
     FUSED: "vision_msgs/msg/Detection3DArray",
     TRACKS: "vision_msgs/msg/Detection3DArray",
     MARKERS: "visualization_msgs/msg/MarkerArray",
+    TRANSFORMS: "tf2_msgs/msg/TFMessage",
 }
 
 
+class ResultSink(Protocol):
+    """Receiver of serialised results by topic."""
+
+    def wants(self, topic: str) -> bool:
+        """Return whether anybody receives a topic."""
+        ...
+
+    def send(self, topic: str, data: bytes, stamp: int) -> None:
+        """Send a message in CDR with its stamp in nanoseconds."""
+        ...
+
+
+class RosTopics:
+    """Publishers of a ROS node.
+
+    Args:
+        node: an rclpy node, whose remaps apply.
+        tell: called with one sentence for each topic that cannot be published.
+    """
+
+    def __init__(self, node: Any, tell: Callable[[str], None] = lambda text: None) -> None:
+        self._publishers: dict[str, Any] = {}
+        for topic, kind in TOPICS.items():
+            if topic == TRANSFORMS:  # The robot publishes its own.
+                continue
+            try:
+                self._publishers[topic] = open_publisher(node, kind, topic)
+            except UserError as error:
+                tell(f"{topic} is not published: {error}")
+
+    @property
+    def topics(self) -> Set[str]:
+        """Topics that are published."""
+        return self._publishers.keys()
+
+    def wants(self, topic: str) -> bool:
+        """Return whether anybody receives a topic."""
+        publisher = self._publishers.get(topic)
+        return publisher is not None and publisher.get_subscription_count() > 0
+
+    def send(self, topic: str, data: bytes, stamp: int) -> None:
+        """Publish a message."""
+        self._publishers[topic].publish(data)
+
+
 class Publisher:
-    """Publisher of each result that has a subscriber, with the header of its cloud or image.
+    """Publisher of each result that somebody receives, with the header of its cloud or image.
 
     Clusters are the kept ones, with ``cluster_<row>`` as their class. Fused boxes are the objects with a
     class. Their class is the second result, after ``cluster_<row>``, where the tutorial's nodes look for it.
     Tracks have their number as ``id``, and their speed as the second result. Any RViz shows them as markers.
 
     Args:
-        node: an rclpy node, whose remaps apply.
         config: selects the boxes of the clusters.
-        tell: called with one sentence for each topic that cannot be published.
+        sinks: receivers of the messages.
     """
 
-    def __init__(self, node: Any, config: Config, tell: Callable[[str], None] = lambda text: None) -> None:
-        self._config = config
-        self._publishers: dict[str, Any] = {}
-        for topic, kind in TOPICS.items():
-            try:
-                self._publishers[topic] = node.create_publisher(message_type(kind), topic, 10)
-            except UserError as error:
-                tell(f"{topic} is not published: {error}")
+    def __init__(self, config: Config, sinks: Sequence[ResultSink]) -> None:
+        self._config, self._sinks = config, sinks
+        self._stamp = 0
 
     def configure(self, config: Config) -> None:
         """Set the configuration."""
@@ -73,6 +115,7 @@ class Publisher:
         """Publish the results of a frame. Several cameras take turns on one topic."""
         frame = result.frame
         stamp, frame_id = frame.stamp, frame.points_frame
+        self._stamp = stamp
         back = None if frame.upright is None else geometry.inverse(frame.upright)
         if result.bev is not None and self._wanted(BEV):
             self._send(BEV, encode_image(Image(stamp, frame_id, result.bev.image)))
@@ -90,7 +133,8 @@ class Publisher:
             scored = zip(objects.cluster.tolist(), objects.names, objects.score.tolist(), strict=True)
             results = [[(f"cluster_{row}", 1.0), (name, score)] for row, name, score in scored]
             self._send(FUSED, encode_boxes_3d(stamp, frame_id, objects.boxes, results, back))
-
+        if self._wanted(TRANSFORMS):
+            self._send_pose(result, back)
         if result.tracks is not None:
             self._send_tracks(result, result.tracks, back)
 
@@ -121,13 +165,25 @@ class Publisher:
                 DETECTIONS, encode_boxes_2d(image.stamp, image.frame_id, detections.xyxy[rows], results)
             )
 
+    def _send_pose(self, result: FrameResult, back: F64 | None) -> None:
+        """Publish the pose of the points in the fixed frame, and of the frame of the tracks."""
+        frame = result.frame
+        if frame.world_from_points is None or frame.world_frame == frame.points_frame:
+            return
+        pose = frame.pose if back is None else frame.pose @ geometry.inverse(back)
+        self._send(
+            TRANSFORMS, encode_transforms(frame.stamp, [(frame.world_frame, frame.points_frame, pose)])
+        )
+
     def _wanted(self, topic: str) -> bool:
-        publisher = self._publishers.get(topic)
-        return publisher is not None and publisher.get_subscription_count() > 0
+        return any(sink.wants(topic) for sink in self._sinks)
 
     def _send(self, topic: str, message: Any) -> None:
-        """Serialise a message and publish it."""
-        self._publishers[topic].publish(bytes(typestore().serialize_cdr(message, TOPICS[topic])))
+        """Serialise a message and pass it to everyone who receives its topic."""
+        data = bytes(typestore().serialize_cdr(message, TOPICS[topic]))
+        for sink in self._sinks:
+            if sink.wants(topic):
+                sink.send(topic, data, self._stamp)
 
 
 def _moved(points: F32, pose: F64 | None) -> F32:

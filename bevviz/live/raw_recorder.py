@@ -103,7 +103,7 @@ class RawRecorder:
         self.left_out: dict[str, str] = {}  # published topic that is not recorded -> reason
         self._messages: deque[tuple[float, RawMessage]] = deque()  # with the monotonic time of ``put``
         self._latched = LatchedMessages()
-        self._size = 0
+        self._size = self._since = 0
         self._sink: Sink | None = None
         self._lock = threading.RLock()
 
@@ -117,6 +117,11 @@ class RawRecorder:
         """Seconds from the oldest to the newest message."""
         with self._lock:
             return self._messages[-1][0] - self._messages[0][0] if self._messages else 0.0
+
+    @property
+    def since(self) -> int:
+        """Time of receipt from which on all messages are in the buffer, nanoseconds. 0: none was dropped."""
+        return self._since
 
     def put(self, message: RawMessage) -> None:
         """Add a message, drop old ones, and pass it to the attached sink."""
@@ -139,6 +144,7 @@ class RawRecorder:
             or (self._size > config.raw_size * MEGABYTE and self._messages[0][0] <= now - lead)
         ):
             _, message = self._messages.popleft()
+            self._since = message.received + 1
             self._size -= len(message.data)
             self._latched.add(message)
 
@@ -228,6 +234,11 @@ class RawTopics:
         sent = info.get("source_timestamp") or received
         self._recorder.put(RawMessage(connection, received, sent, data))
 
+    def make_room(self, topic: PublishedTopic) -> None:
+        """Unsubscribe from a topic of another type. A process can have one type on a name only."""
+        if self._further.type_of(topic.name) not in (None, topic.type):
+            self._leave(topic.name)
+
     def follow(self, topics: Mapping[str, PublishedTopic], taken: Set[str]) -> None:
         """Subscribe to topics that are not ``taken`` by the source, if they have little data."""
         wanted = self._recorder.config.raw_topics
@@ -243,7 +254,7 @@ class RawTopics:
                 left_out[name] = "it plays no role and is no small one"
             elif name in self._refused:
                 left_out[name] = self._refused[name]
-            elif name not in self._further.topics:
+            elif self._further.type_of(name) != topic.type:
                 self._listen(topic)
             if name in left_out:
                 self._leave(name)

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, get_args
 
 from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
@@ -43,6 +43,7 @@ class Control(Closable):
         self.save = save  # public, because it may be replaced later
         self._path: Path | None = None
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self._answers: list[threading.Thread] = []  # each answers one request
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         reasons: list[str] = []
         for folder in folders():
@@ -66,7 +67,9 @@ class Control(Closable):
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._socket.close()
-        self._thread.join(PATIENCE)  # a save may be in progress
+        self._thread.join(PATIENCE)
+        for thread in self._answers:
+            thread.join(PATIENCE)  # a save may be in progress
 
     def _listen(self, folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -78,20 +81,26 @@ class Control(Closable):
         self._path = path
 
     def _serve(self) -> None:
-        """Answer one request after another until the socket is closed."""
+        """Answer each request in a thread of its own until the socket is closed: a save takes time."""
         while True:
             try:
                 connection, _ = self._socket.accept()
             except OSError:
                 return
-            with connection, suppress(OSError), connection.makefile("rb") as lines:
-                connection.settimeout(ANSWER)
-                request = _line(lines)
-                if request is None:  # the client only tested whether a process listens
-                    continue
-                connection.sendall(b'{"heard": true}\n')
-                connection.settimeout(PATIENCE)
-                connection.sendall(json.dumps(self._answer(request)).encode() + b"\n")
+            answer = threading.Thread(target=self._converse, args=(connection,), name="answer", daemon=True)
+            self._answers = [thread for thread in self._answers if thread.is_alive()] + [answer]
+            answer.start()
+
+    def _converse(self, connection: socket.socket) -> None:
+        """Read one request and answer it."""
+        with connection, suppress(OSError), connection.makefile("rb") as lines:
+            connection.settimeout(ANSWER)
+            request = _line(lines)
+            if request is None:  # the client only tested whether a process listens
+                return
+            connection.sendall(b'{"heard": true}\n')
+            connection.settimeout(PATIENCE)
+            connection.sendall(json.dumps(self._answer(request)).encode() + b"\n")
 
     def _answer(self, request: bytes) -> dict[str, str]:
         try:
@@ -242,6 +251,10 @@ class RosRequests:
         ]
         if settings := self._settings(parameters):
             change(settings)
+        # Ranges come after the first change, so that a wrong value given with ``-p`` gets our sentence.
+        for name, key in self._keys.items():
+            if (descriptor := _descriptor_with_range(about[key], key, config)) is not None:
+                node.set_descriptor(name, descriptor)
         node.add_on_set_parameters_callback(self._set)
         if save is not None:
             from std_srvs.srv import Trigger
@@ -320,3 +333,24 @@ def _descriptor(about: str) -> Any:
 
     # The configuration checks the type. `ros2 param set` takes 20 for an integer where 20.0 is meant.
     return ParameterDescriptor(description=about, dynamic_typing=True)
+
+
+def _descriptor_with_range(about: str, key: str, config: Config) -> Any:
+    """Return the descriptor of a number with a range, for the sliders of rqt. None: the key has no range."""
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange
+
+    from bevviz.config import field_of, limits_of, values
+
+    info, value = field_of(key, config), values(config)[key]
+    if info is None or isinstance(value, bool) or type(None) in get_args(info.annotation):
+        return None
+    descriptor, (low, high) = _descriptor(about), limits_of(info)
+    if low is None or high is None:
+        return None
+    if isinstance(value, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+    elif isinstance(value, float):
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        ]
+    return descriptor

@@ -16,9 +16,10 @@ from bevviz.config import Config
 from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import BagSaver, Indexer, RecordingSaver, free_names
+from bevviz.live.files import BagSaver, RecordingSaver, free_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
 from bevviz.live.frames import ThinnedSource, warm_up
+from bevviz.live.indexing import Indexer
 from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
 from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
@@ -34,6 +35,8 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording import entities
 
 LOOK = 1.0  # seconds between two checks of the configuration file and the clock
+PAUSE = 1.0  # seconds without a frame after which the states of the topics are shown without one
+GLANCE = 0.2  # seconds between two looks at them then
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -106,7 +109,7 @@ class Live:
         self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
-        self._looked = self._logged = 0.0  # seconds, monotonic
+        self._looked = self._logged = self._glanced = 0.0  # seconds, monotonic
         self._lag_watch = LagWatch(notes)
         self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
@@ -114,7 +117,7 @@ class Live:
         self._set_nice(live.nice)
         self._observes = observe
         self.session = (
-            ObservingSession(settings.config) if observe else Session(settings.config, loader=loader)
+            ObservingSession(settings.config) if observe else LiveSession(settings.config, loader=loader)
         )
         self.against = None if robot is None else RobotComparison(robot, live)
         self._robot_problem = ""  # as last reported
@@ -126,12 +129,13 @@ class Live:
         self._indexer = Indexer()
         self._watchers: list[Callable[[FrameResult], None]] = []
         self.flight = FlightRecorder(live, self.encoder, self._indexer, notes, raw)
-        self._raw = raw
+        self.raw = raw
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = DropPolicy()
 
-        programs = [remote(url, self.encoder.recording_id) for url in outputs.connect]
+        encoder = self.encoder
+        programs = [remote(url, encoder.application, encoder.recording_id) for url in outputs.connect]
         if outputs.serve is not None:
             program, address = server(outputs.serve, outputs.bind, live.viewer_memory)
             programs.append(program)
@@ -168,6 +172,14 @@ class Live:
         return Status(self.frames, p50, p99, self.health.cpu, self.health.memory, self._drops())
 
     @property
+    def silence(self) -> str:
+        """One sentence with the silent topics if no frame comes. Empty: frames come, or none has come yet."""
+        if not self.frames or time.monotonic() - self._logged < PAUSE:
+            return ""
+        silent = [f"{topic} ({state})" for topic, state in self._source.states.items() if state != "ok"]
+        return f"no frame comes: {', '.join(silent) or 'every topic is late'}"
+
+    @property
     def scene(self) -> Scene:
         """Names of the sensors."""
         return self._source.scene
@@ -201,6 +213,10 @@ class Live:
         """Save the last seconds, see ``FlightRecorder.save``. Any thread may call it."""
         return self.flight.save(path)
 
+    def mark(self, text: str) -> bool:
+        """Mark the next frame, as a message on the topic of marks does. Return whether the source can."""
+        return self._source.mark(text)
+
     def stop(self) -> None:
         """End ``run``. Any thread may call it."""
         self._over.set()
@@ -221,6 +237,9 @@ class Live:
             if self._asked_to_save:
                 self._asked_to_save = False
                 self.flight.save_soon("SIGUSR1")
+            if time.monotonic() - self._glanced >= GLANCE:
+                self._glanced = time.monotonic()
+                self._log_meanwhile()
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
                 self._check()
@@ -235,8 +254,8 @@ class Live:
             if self._control is None:
                 stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(answer_sigusr1(ask_to_save))
-            # A second Ctrl-C must not leave half a file or a viewer. Closing takes a limited time.
-            stack.callback(_handle, dict.fromkeys(ENDING, signal.SIG_IGN))
+            # Closing takes a limited time. Whoever cannot wait for it sends the signal once more.
+            stack.callback(_handle, dict.fromkeys(ENDING[2:], signal.SIG_IGN))
             try:
                 drops, stop = self._dropping, self._over
                 run(self._source, self.session, observers, dropping=drops, stop=stop, tick=tick)
@@ -251,7 +270,6 @@ class Live:
             self._reload()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
-        self._log_meanwhile()
         self._lag_watch.check(self._outputs)
         if self._shown is not self.config:
             self._shown = self.config
@@ -264,9 +282,8 @@ class Live:
         if self.raw_saver is not None:
             self.raw_saver.close()
         self.flight.close()
-        if self._indexer.waiting:
-            self.notes.info("the recording gets its index; it is complete already")
-        self._indexer.close()
+        if self._indexer.close():
+            self.notes.info("the recording gets its index in the background; it is complete already")
         self.encoder.close()
 
     def warm_up(self) -> None:
@@ -325,7 +342,7 @@ class Live:
     def _log_meanwhile(self) -> None:
         """Log messages and topic states while no frame comes."""
         since, states = time.monotonic() - self._logged, self._topic_states()
-        if not self.frames or since < LOOK:
+        if not self.frames or since < PAUSE:
             return
         if (notes := self.notes.take()) or states != self._states:
             self._states = states
@@ -380,8 +397,8 @@ class Live:
         changed = self.session.configure(config)
         self._settings.keep(config)
         self.flight.config = self._triggers.config = config.live
-        if self._raw is not None:
-            self._raw.config = config.live
+        if self.raw is not None:
+            self.raw.config = config.live
         if self.against is not None:
             self.against.config = config.live
         if config.live.nice != nice:
@@ -421,6 +438,12 @@ class LoggingObserver(Observer[FrameResult]):
     def observe(self, result: FrameResult) -> None:
         """Log a result."""
         self._live.log(result)
+
+
+class LiveSession(Session):
+    """Session that leaves the robot's motion to its transforms: an estimate would delay each result."""
+
+    estimates_motion = False
 
 
 class ObservingSession(Session):

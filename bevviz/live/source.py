@@ -12,12 +12,13 @@ from typing import Any
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests, full_name, published_topics
-from bevviz.live.inputs import SILENCE, Inputs, TopicWatch
+from bevviz.live.inputs import SILENCE, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer
 from bevviz.live.raw_recorder import RawRecorder, RawTopics
+from bevviz.messages.definitions import typestore
 from bevviz.messages.roles import MARK, Roles
-from bevviz.messages.topics import Topic
+from bevviz.messages.topics import CLOUDS, Topic
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.pipeline.run import MAX_BURST
 from bevviz.support.contexts import Closable
@@ -30,6 +31,7 @@ LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two checks for clouds that have waited long enough
 SETTLE = 1.0  # seconds without a change of roles after which the scene is complete
 PATIENCE = 3.0  # seconds that missing topics may delay the scene
+LASTING = 5  # frames with a missing transform or CameraInfo from which on it is reported
 CHANGING = "the topics are still changing"
 PIECE = 65_000  # bytes, largest message that DDS sends in one piece
 
@@ -222,6 +224,14 @@ class LiveSource(Closable):
                 self._marks.popleft()
         return marks
 
+    def mark(self, text: str) -> None:
+        """Take in a mark as if it came on the topic of marks. Any thread may call it."""
+        kind, now = self._mark.type, time.time_ns()
+        message = typestore().types[kind](data=text)
+        data = bytes(typestore().serialize_cdr(message, kind))
+        with self._lock:
+            self._receive(self._mark, data, {"received_timestamp": now, "source_timestamp": now})
+
     def __iter__(self) -> Iterator[Frame]:
         if self._dropped_before is None:
             self._dropped_before = self._handover.dropped
@@ -255,11 +265,11 @@ class LiveSource(Closable):
         topic, inputs = published.name, self._inputs
         message = LiveMessage(topic, published.type, info["received_timestamp"] or time.time_ns(), data)
         if self._raw is not None:
-            self._raw.put(self._known[topic], message.received, info, data)
+            self._raw.put(self._known.get(topic, published), message.received, info, data)
         first = self._watch.count(topic, len(data))
         before = inputs.sync.cameras.intrinsics.get(topic)
         try:
-            if first and Topic(topic, published.type).kind.endswith(("PointCloud2", "Image")):
+            if first and Topic(topic, published.type).kind.endswith((*CLOUDS, "Image")):
                 inputs.frame_ids[topic] = message.header()[1]
                 self._assign()
             if inputs.handle(message):
@@ -280,7 +290,20 @@ class LiveSource(Closable):
 
     def _tick(self) -> None:
         """Deliver the frames whose clouds have waited long enough."""
+        self._inputs.sync.absent = frozenset(self._not_delivering())
         self._deliver(self._inputs.sync.ready(time.time_ns()))
+
+    def _not_delivering(self) -> Iterator[str]:
+        """Yield the topics for which no frame waits: without a publisher, silent, or not begun in time."""
+        received, lidars = self.received, self.roles.lidars
+        published = self._subscriptions.topics & self.topics.keys()
+        for name in self._inputs.handlers:
+            missed = not received[name] and (self._complete or name in lidars)
+            if missed or name not in published or self._watch.silent_for(name):
+                yield name
+        stalled = [name for name in lidars if self._watch.silent_for(name, STALL)]
+        if len(stalled) < len(lidars):  # else this process or the whole robot has paused
+            yield from stalled
 
     def _deliver(self, frames: Iterable[Frame]) -> None:
         """Queue frames for the consumer, with consecutive indices."""
@@ -297,7 +320,7 @@ class LiveSource(Closable):
 
     def _follow_graph(self) -> None:
         """Look at the graph: assign roles, subscribe, and report changes."""
-        self.topics = published_topics(self._node)
+        self.topics = published_topics(self._node, self._inputs.rank)
         received = self.received
         known = {name: topic for name, topic in self._known.items() if received[name]}
         known.setdefault(self._mark.name, self._mark)
@@ -305,8 +328,6 @@ class LiveSource(Closable):
         self._assign()
         if self._raw is not None:
             self._raw.follow(self.topics, self._subscriptions.topics)
-        subscribed = self._subscriptions.topics & self.topics.keys()
-        self._inputs.sync.absent = frozenset(self._inputs.handlers.keys() - subscribed)
         for name in self._subscriptions.topics:
             if name in self.topics or not any(name == shown for shown, _, _ in self.roles.around):
                 self._report_topic(name)  # topics shown around the robot come and go
@@ -320,10 +341,12 @@ class LiveSource(Closable):
         topic, watch = self.topics.get(name), self._watch
         gone = f"{name} has no publisher any more; waiting for it to come back"
         watch.report(f"{name} gone", gone if topic is None else "", f"{name} is published again")
+        watch.report(f"{name} types", topic.clash if topic is not None else "", f"{name} has one type")
         unheard = "; ".join(self._subscriptions.mismatches(topic)) if topic is not None else ""
         watch.report(f"{name} quality", unheard, f"{name}: every publisher is received")
-        silent = topic is not None and name not in self.roles.lidars and watch.silent_for(name) > 0
-        quiet = f"no message on {name} for {SILENCE:.0f} s, though it has a publisher"
+        silent = topic is not None and watch.silent_for(name) > 0
+        silent = silent and not (name in self.roles.lidars and self._is_without_clouds)
+        quiet = f"no message on {name} for {SILENCE:g} s, though it has a publisher"
         watch.report(f"{name} silence", quiet if silent else "", f"{name} is back")
         sensors = {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
         several = topic is not None and name in sensors and len(topic.publishers) > 1
@@ -332,7 +355,9 @@ class LiveSource(Closable):
         watch.report(f"{name} publishers", mixed if several else "", f"{name} has one publisher")
         if self.lost[name]:
             size = watch.volume[name] / max(1, watch.received[name])
-            watch.report_once(f"messages of {name} are lost on the way: {remedy(size)}")
+            sizes = (watch.volume[other] / count for other, count in watch.received.items())
+            largest = max(sizes, default=0.0)
+            watch.report_once(f"messages of {name} are lost on the way: {remedy(size, largest)}")
 
     def _report_frames(self) -> None:
         """Report problems that the synchroniser found."""
@@ -343,6 +368,11 @@ class LiveSource(Closable):
             watch.report_once(f"{name}: no stamp in the header, time of receipt is used instead")
         for camera, reason in report.first_undecodable.items():
             watch.report_once(f"camera '{camera}': an image could not be decoded: {reason}")
+        for text in report.oddities.values():
+            watch.report_once(text)
+        for text, frames in report.problems.items():
+            if frames >= LASTING:
+                watch.report_once(text)
         if report.resets > self._clock_resets:
             watch.tell("the stamps of the clouds jumped back: a simulation or a bag that began anew")
             self._clock_resets = report.resets
@@ -353,15 +383,23 @@ class LiveSource(Closable):
         watch.report(
             "name", "" if self._node.is_alone else twin, "no other node has the name of this one now"
         )
-        silent = self._complete and time.monotonic() - self._last_cloud > SILENCE
-        quiet = f"no cloud for {SILENCE:.0f} s on {', '.join(self.roles.lidars)}"
-        watch.report("silence", quiet if silent else "", "the clouds are back")
+        quiet = f"no cloud for {SILENCE:g} s on {', '.join(self.roles.lidars)}"
+        watch.report("silence", quiet if self._is_without_clouds else "", "the clouds are back")
+        first, driver = self.roles.driver, self._inputs.sync.driver
+        deputy = f"{first} does not deliver: the frames follow {driver} until it does"
+        changed = self._complete and driver != first
+        watch.report("driver", deputy if changed else "", f"the frames follow {first} again")
         begun = time.monotonic() - self._begun > SETTLE + LOOK
         misstated = self._inputs.misstated(self.topics.values()) if begun else {}
         for name in self._inputs.stated:
             watch.report(
                 f"{name} stated", misstated.get(name, ""), f"{name} is there, as the configuration states"
             )
+
+    @property
+    def _is_without_clouds(self) -> bool:
+        """Whether no LiDAR delivers."""
+        return self._complete and time.monotonic() - self._last_cloud > SILENCE
 
     def _is_settled(self) -> bool:
         """Return whether the roles are stable and every sensor delivers, or the patience is over."""
@@ -380,13 +418,20 @@ class LiveSource(Closable):
         for name in self._subscriptions.topics - handlers.keys():
             self._subscriptions.drop(name)
         for name in handlers:
+            if self._raw is not None:
+                self._raw.make_room(self._known[name])
             problem = self._subscriptions.listen(self._known[name])
             text = f"{name} is not received: {problem}" if problem else ""
             self._watch.report(f"{name} type", text, f"{name} can be received now" if problem is None else "")
 
 
-def remedy(size: float) -> str:
-    """Return advice for lost messages of this size in bytes."""
+def remedy(size: float, largest: float) -> str:
+    """Return advice for lost messages, given their size and that of the largest messages here, in bytes."""
     if size > PIECE:
         return "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
+    if largest > PIECE:
+        return (
+            "clouds or images fill the transport, which a larger segment of their publishers mends, see "
+            "'Clouds were lost on the way' in docs/live.md"
+        )
     return "small ones are where a machine is too busy; a longer queue (depth) of the publisher's helps"

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.live.graph import open_publisher
 from bevviz.live.node import add_timer
-from bevviz.live.typesupport import message_type
 from bevviz.messages.definitions import typestore
 from bevviz.messages.surroundings import LEVELS
 from bevviz.model.results import FrameResult
@@ -149,12 +149,12 @@ class Diagnostics:
         node: an rclpy node, whose remaps apply.
 
     Raises:
-        UserError: the message type is unknown.
+        UserError: the message type is unknown, or another node publishes the topic with another type.
     """
 
     def __init__(self, node: Any) -> None:
         self._node, self._name = node, node.get_name()
-        self._publisher = node.create_publisher(message_type(TYPE), DIAGNOSTICS, 10)
+        self._publisher = open_publisher(node, TYPE, DIAGNOSTICS)
         self._result: FrameResult | None = None
         self._at = 0.0
 

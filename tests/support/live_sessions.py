@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.frames import Replay
+from bevviz.live.raw_recorder import RawMessage as RecordedMessage
+from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
@@ -15,14 +18,25 @@ from bevviz.workbench.running_robot import RunningRobot
 
 
 @contextmanager
-def live_bench(results: Sequence[FrameResult], *settings: str) -> Iterator[RunningRobot]:
-    """Yield the workbench's side of a run over the frames of these results, with ``key=value`` settings."""
+def live_bench(
+    results: Sequence[FrameResult], *settings: str, messages: Sequence[RawMessage] = ()
+) -> Iterator[RunningRobot]:
+    """Yield the workbench's side of a run over the frames of these results, with ``key=value`` settings.
+
+    ``messages`` are those that the frames were made of.
+    """
+    values = ReloadableConfig(None, ["detector.model=demo", *settings])
+    raw = RawRecorder(values.config.live) if messages else None
+    for message in messages:
+        assert raw is not None
+        raw.put(RecordedMessage(message.connection, message.received, message.received, bytes(message.data)))
     source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
     live = Live(
         source,
-        ReloadableConfig(None, ["detector.model=demo", *settings]),
+        values,
         Outputs(),
         Notes(lambda line: None),
+        raw=raw,
     )
     with RunningRobot(live) as bench:
         yield bench

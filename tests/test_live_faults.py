@@ -1,0 +1,140 @@
+"""No single sensor or topic freezes or ends a live session. The robot is a process made of rclpy alone."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import pytest
+
+from bevviz.config import load
+from bevviz.model.frame import Frame
+from tests.support.faulty_robot import FaultyRobot, faulty_robot
+from tests.support.ros_graphs import own_graph
+from tests.support.waiting import PATIENCE, until
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+
+from bevviz.live.publish import FUSED, OBSTACLES, TOPICS, TRANSFORMS, RosTopics
+from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.source import LiveSource
+
+# A frame that waits for a silent sensor comes after 20 s, and its test fails.
+PATIENT = ["sync.max_wait=20", "sync.queue=1000"]
+
+
+@dataclass
+class Session:
+    """Running source, its frames and its messages to the user."""
+
+    source: LiveSource
+    said: list[str]
+    frames: list[Frame] = field(default_factory=list)
+
+    def until_told(self, *texts: str) -> None:
+        """Wait until each text is part of a message after the last call."""
+        until(lambda: all(any(text in line for line in self.said) for text in texts), f"{texts}")
+        self.said.clear()
+
+    def until_frames(self, lidar: str) -> None:
+        """Wait for new frames that a LiDAR drives."""
+        self.frames.clear()
+        until(lambda: sum(f.clouds[0].topic == lidar for f in self.frames) > 3, f"frames of {lidar}")
+
+
+@contextmanager
+def running() -> Iterator[Session]:
+    """Run a source, and take its frames in a thread."""
+    said: list[str] = []
+    config = load(settings=PATIENT)
+    with LiveSource(config, tell=said.append, raw=RawRecorder(config.live)) as source:
+        session = Session(source, said)
+
+        def take() -> None:
+            if source.wait(PATIENCE):
+                for frame in source:
+                    session.frames.append(frame)
+
+        thread = threading.Thread(target=take, daemon=True)
+        thread.start()
+        try:
+            yield session
+        finally:
+            source.stop()
+            thread.join()
+
+
+@pytest.fixture
+def robot() -> Iterator[FaultyRobot]:
+    with own_graph(), faulty_robot() as robot:
+        yield robot
+
+
+def test_a_silent_sensor_stops_no_frame_and_is_named(robot: FaultyRobot) -> None:
+    robot.set("/a", kind="PointCloud2", frame="a")
+    robot.set("/b", kind="PointCloud2", frame="b")  # of the same frame they would be taken for one sensor
+    robot.set("/camera", kind="Image")
+    with running() as session:
+        session.until_frames("/a")
+        robot.set("/a", silent=True)
+        session.until_told("/a does not deliver: the frames follow /b", "no message on /a")
+        session.until_frames("/b")
+        robot.set("/a", silent=False)
+        session.until_told("the frames follow /a again", "/a is back")
+        session.until_frames("/a")
+        robot.set("/a", kind="")
+        session.until_told("/a has no publisher any more", "the frames follow /b")
+        session.until_frames("/b")
+        robot.set("/a", kind="PointCloud2")
+        session.until_told("/a is published again")
+        session.until_frames("/a")
+        robot.set("/camera", silent=True)
+        session.until_told("no message on /camera")
+        session.until_frames("/a")
+
+
+def test_the_only_lidar_is_told_silent_within_two_seconds(robot: FaultyRobot) -> None:
+    robot.set("/a", kind="PointCloud2", frame="a")
+    with running() as session:
+        session.until_frames("/a")
+        robot.set("/a", silent=True)
+        silent = time.monotonic()
+        session.until_told("no cloud for 1.5 s on /a")
+        assert time.monotonic() - silent < 4, "2 s, and this machine may be busy"
+        robot.set("/a", silent=False)
+        session.until_frames("/a")
+
+
+def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> None:
+    robot.set("/a", kind="String", node="stranger")
+    robot.set(FUSED, kind="String")
+    with running() as session:
+        until(lambda: {"/a", FUSED} <= session.source.topics.keys(), "the strings")
+        refused: list[str] = []
+        publisher = RosTopics(session.source.node, refused.append)
+        assert len(refused) == 1 and f"/robot publishes {FUSED} as std_msgs/msg/String" in refused[0]
+        robot.set("/a", kind="PointCloud2", frame="a")
+        clash = "/a has two types: /robot (sensor_msgs/msg/PointCloud2) is received, /stranger (std_msgs"
+        session.until_told(clash)
+        session.until_frames("/a")
+        robot.set("/a", kind="", node="stranger")
+        session.until_told("/a has one type")
+        robot.set("/a", kind="String", node="stranger")
+        robot.set(OBSTACLES, kind="String")  # which this process publishes already
+        session.until_told("/a has two types")
+        until(lambda: OBSTACLES in session.source.topics, "a topic of another type than ours")
+        session.until_frames("/a")
+        assert TOPICS.keys() - publisher.topics == {FUSED, TRANSFORMS}
+
+
+def test_a_changed_frame_and_millimetres_are_told_at_once(robot: FaultyRobot) -> None:
+    robot.set("/a", kind="PointCloud2", frame="a")
+    with running() as session:
+        session.until_frames("/a")
+        robot.set("/a", frame="odd")
+        session.until_told("/a: its frame_id changed from 'a' to 'odd'")
+        robot.set("/a", scale=1000.0)
+        session.until_told("coordinates in millimetres")
