@@ -29,6 +29,7 @@ from bevviz.support import progress
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
+    from bevviz.live.foxglove_server import FoxgloveServer
     from bevviz.live.frames import Replay
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
@@ -54,6 +55,14 @@ def add(commands: Commands) -> None:
     )
     choice.add_argument(
         "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
+    )
+    choice.add_argument(
+        "--foxglove",
+        nargs="?",
+        type=port,
+        const=8765,
+        metavar="PORT",
+        help="serve the results to Foxglove on this machine (default: 8765)",
     )
     choice.add_argument(
         "--diagnostics",
@@ -137,6 +146,8 @@ def _live(options: argparse.Namespace) -> int:
     _, messages = _files(options.save)
     if options.split is not None and not options.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
+    if options.observe and options.foxglove is not None:
+        raise UserError("--observe makes no results that --foxglove could serve: leave one of them out")
     if options.observe and options.publish:
         raise UserError("--observe makes no results that --publish could send: leave one of them out")
     if messages is not None and options.synthetic:
@@ -151,16 +162,47 @@ def _live(options: argparse.Namespace) -> int:
     if not options.observe:
         loader.load(settings.config)
     notes = Notes(say)
+    with _foxglove(options) as server:
+        return _run(settings, options, notes, loader, server)
+
+
+def _run(
+    settings: ReloadableConfig,
+    options: argparse.Namespace,
+    notes: Notes,
+    loader: StageLoader,
+    server: FoxgloveServer | None,
+) -> int:
+    """Run on the synthetic drive or beside a robot."""
     if options.synthetic:
-        return _watch(_replay(options.synthetic), settings, options, notes, loader)
+        source = _replay(options.synthetic)
+        if server is None:
+            return _watch(source, settings, options, notes, loader)
+        from bevviz.live.publish import Publisher
+
+        publisher = Publisher(settings.config, [server])
+        return _watch(
+            source, settings, options, notes, loader, publisher.publish, lambda live: publisher.configure
+        )
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.source import LiveSource
 
     raw = RawRecorder(settings.config.live)
     with LiveSource(
         settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.observe
-    ) as source:
-        return _watch_robot(source, settings, options, notes, loader, raw)
+    ) as robot:
+        return _watch_robot(robot, settings, options, notes, loader, raw, server)
+
+
+def _foxglove(options: argparse.Namespace) -> AbstractContextManager[FoxgloveServer | None]:
+    """Return the server for Foxglove, if it is requested."""
+    if options.foxglove is None:
+        return nullcontext()
+    from bevviz.live.foxglove_server import FoxgloveServer
+
+    server = FoxgloveServer(options.foxglove)
+    say(f"Foxglove: open the connection {server.address}", always=True)
+    return server
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -173,6 +215,8 @@ def _check_outputs(options: argparse.Namespace) -> None:
     if options.serve is not None:
         own_address(options.bind)
         check_port(options.serve)
+    if options.workbench:
+        check_port(options.workbench, "--workbench")
     if options.connect is not None:
         check_viewer(options.connect)
     blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
@@ -185,10 +229,11 @@ def _watch_robot(
     notes: Notes,
     loader: StageLoader,
     raw: RawRecorder,
+    server: FoxgloveServer | None,
 ) -> int:
     """Wait for the robot, then run. Publish results and take requests as the options say."""
     from bevviz.live.frames import warm_up
-    from bevviz.live.publish import Publisher
+    from bevviz.live.publish import Publisher, ResultSink, RosTopics
     from bevviz.live.requests import Control, RosRequests, answer_sigusr1
     from bevviz.live.status import Diagnostics
 
@@ -212,7 +257,7 @@ def _watch_robot(
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
         reported_missing = ""
-        with suppress(KeyboardInterrupt), interruptible() as ended:
+        with suppress(KeyboardInterrupt), interruptible(twice=True) as ended:
             while not source.wait(1.0):
                 missing = source.missing
                 if missing and missing != reported_missing:
@@ -220,8 +265,15 @@ def _watch_robot(
                     say(f"waiting: {reported_missing}")
         if ended.is_set():
             return 1
-        publisher = Publisher(source.node, settings.config, notes.warn) if options.publish else None
-        diagnostics = Diagnostics(source.node) if options.publish or options.diagnostics else None
+        sinks: list[ResultSink] = [RosTopics(source.node, notes.warn)] if options.publish else []
+        sinks += [server] if server is not None else []
+        publisher = Publisher(settings.config, sinks) if sinks else None
+        diagnostics: Diagnostics | None = None
+        if options.publish or options.diagnostics:
+            try:
+                diagnostics = Diagnostics(source.node)
+            except UserError as error:
+                notes.warn(f"/diagnostics is not published: {error}")
 
         def on_result(result: FrameResult) -> None:
             if publisher is not None:
@@ -297,7 +349,7 @@ def _watch(
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
-        interruptible(),
+        interruptible(twice=True),
         _page(options, live),
         progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
@@ -335,14 +387,13 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
     if options.workbench is None:
         return nullcontext()
     try:
-        from bevviz.workbench.running_robot import RunningRobot
+        from bevviz.workbench.running_robot import robot_session
         from bevviz.workbench.server import LivePage
-        from bevviz.workbench.session import WorkbenchSession
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    page = LivePage(WorkbenchSession(RunningRobot(live)), options.workbench or None)
+    page = LivePage(robot_session(live), options.workbench or None)
     say(f"workbench at {page.address}", always=True)
     return page
 
