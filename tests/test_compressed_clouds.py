@@ -20,7 +20,7 @@ from bevviz.drivers import cloudini
 from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from tests.support import bags
 from tests.support.compressed_clouds import CLOUDINI, DRACO, compressed, draco, messages, packed, points
 

@@ -20,7 +20,7 @@ from bevviz.drivers import velodyne
 from bevviz.drivers.hesai import NOMINAL
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from tests.support import bags
 from tests.support.lidar_packets import LAYOUTS, MODELS_BY_NAME, SCAN, VELODYNE, messages, packet, scan
 

@@ -14,7 +14,7 @@ from bevviz.cli import main
 from bevviz.config import Config
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from tests.support import bags
 from tests.support.livox_messages import POINT, messages, scan
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from backports import zstd
 
-from bevviz.drivers import cloudini
 from bevviz.errors import first_line
 from bevviz.messages.clouds import MOST_POINTS, SCALARS
 from bevviz.messages.decoders import Decoder
@@ -62,6 +61,8 @@ def _from_cloudini(msg: Any, data: bytes) -> Any:
 
     The size is that of the data's own header. The message may state more points.
     """
+    from bevviz.drivers import cloudini  # It compiles loops: numba takes a quarter of a second to import.
+
     header, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
     fields = [
         make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)

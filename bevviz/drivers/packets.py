@@ -6,6 +6,7 @@ A serialised message is read as an array. Deserialising up to 9,000 packets a se
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -114,6 +115,28 @@ def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> Sc
         sizes=np.minimum(rows["size"], size).astype(np.int64) if sized else np.full(complete, size, np.int64),
         lost=count - complete,
     )
+
+
+def encode_scan(
+    frame_id: str, received: Sequence[int], packets: Sequence[bytes], size: int, *, sized: bool
+) -> bytes:
+    """Serialise a scan as CDR, as ``split`` reads it. Its stamp is the time of its first packet.
+
+    Args:
+        frame_id: frame of the header.
+        received: nanoseconds of each packet.
+        packets: the packets, of ``size`` bytes or fewer.
+        size: bytes of the packet field.
+        sized: whether a field with the number of used bytes follows each packet.
+    """
+    name = frame_id.encode() + b"\0"
+    head = struct.pack("<4sIII", b"\0\1\0\0", *divmod(received[0], SECOND), len(name)) + name
+    parts = [head + bytes(-len(head) % 4), struct.pack("<I", len(packets))]
+    for time, packet in zip(received, packets, strict=True):
+        used = struct.pack("<I", len(packet)) if sized else b""
+        data = struct.pack("<II", *divmod(time, SECOND)) + packet.ljust(size, b"\0") + used
+        parts.append(data + bytes(-len(data) % 4))
+    return b"".join(parts)
 
 
 def read_calibration(path: Path) -> str:

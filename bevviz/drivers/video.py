@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from bevviz.messages.decoders import Decoder
-from bevviz.messages.decoding import MessageError, frame_name, stamp_ns
+from bevviz.messages.decoders import Decoder, MessageError, frame_name, stamp_ns
 
 DEFINITIONS = {  # bags of older releases do not define these types
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
