@@ -22,17 +22,16 @@ from bevviz.bags import mcap
 from bevviz.bags.file_types import BagFile, find_saved_bag, open_file
 from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1
 from bevviz.bags.reader import normalized
+from bevviz.bags.remote import address_of, beside, open_bytes
 from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
-from bevviz.datasets.dataset import describe_unread
-from bevviz.datasets.reader import DatasetReader
+from bevviz.datasets.dataset import DatasetReader, describe_unread
 from bevviz.drivers import ouster
 from bevviz.drivers.packets import read_calibration
 from bevviz.drivers.video import VideoPacket, decode_packet, is_video
 from bevviz.errors import UserError
-from bevviz.messages.decoders import Serialization, reads_bytes
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError, Serialization, reads_bytes
 from bevviz.messages.definitions import deserialize_cdr
 from bevviz.messages.guard import decode_message, guard
 from bevviz.messages.surroundings import decode_mark
@@ -67,6 +66,8 @@ class Recording(Closable):
         is_dataset: the messages are made from data set files. An unreadable file gives an empty message
             and a line in ``warnings``.
         types: message types.
+        sample_stamps: as of ``Dataset``.
+        folder: folder of the data set's drive, else the first path.
 
     Raises:
         UserError: a path does not exist, cannot be read, is empty, or is neither a bag nor a data set.
@@ -77,6 +78,8 @@ class Recording(Closable):
             raise UserError("no bag given")
         self.paths = tuple(map(find_saved_bag, paths))
         self.single_frames = self.is_dataset = False
+        self.sample_stamps: dict[str, int] = {}
+        self.folder = self.paths[0]
         self._config = config or SourceConfig()
         self._aside: dict[str, str] = {}
         self._scan_times: dict[str, I64] = {}
@@ -103,13 +106,16 @@ class Recording(Closable):
     @property
     def name(self) -> str:
         """Name of the first path without its folder."""
-        return path_text(self.paths[0].resolve().name)
+        return path_text(beside(self.paths[0]).name)
 
     @cached_property
     def size(self) -> int:
         """Size on disk in bytes."""
-        files = [f for p in self.paths for f in (drive_files(p) if p.is_dir() else [p])]
-        return sum(f.stat().st_size for f in files)
+        local = [p for p in self.paths if not address_of(p)]
+        files = [f for p in local for f in (drive_files(p) if p.is_dir() else [p])]
+        return sum(f.stat().st_size for f in files) + sum(
+            open_bytes(p).size for p in self.paths if address_of(p)
+        )
 
     @cached_property
     def start(self) -> int:
@@ -435,6 +441,8 @@ class Recording(Closable):
         self.files.append(BagFile(folder, dataset.about, lambda: reader))
         self.single_frames |= dataset.single_frames
         self.is_dataset = True
+        self.sample_stamps |= dataset.sample_stamps
+        self.folder = dataset.path
         self._aside |= reader.aside
         return True
 

@@ -12,6 +12,7 @@ import numpy as np
 from rosbags.interfaces import Connection
 
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message, unpack
+from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
 
 ChunkMessage = tuple[int, int, bytes | memoryview]
@@ -86,7 +87,7 @@ class ChunkReader:
 
     def __init__(self, path: Path, form: ChunkFormat, index: FileIndex | None = None) -> None:
         self._form, self._index = form, index or form.read_index(path)
-        self._bytes = FileBytes(path)
+        self._bytes = open_bytes(path)
         self.compression = ", ".join(sorted({c.compression for c in self._index.chunks} - {"", "none"}))
 
     @property

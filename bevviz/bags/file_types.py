@@ -10,7 +10,7 @@ from pathlib import Path
 from backports import zstd
 from rosbags.interfaces import Connection
 
-from bevviz.bags import mcap, ros1, sqlite
+from bevviz.bags import mcap, pcap, ros1, sqlite
 from bevviz.bags.chunks import ChunkReader
 from bevviz.bags.reader import (
     LAST_TIME,
@@ -23,6 +23,7 @@ from bevviz.bags.reader import (
     UnindexedError,
     megabytes,
 )
+from bevviz.bags.remote import address_of, name_of, open_bytes
 from bevviz.bags.rescue import rescue
 from bevviz.bags.rescue.report import RescuedReader
 from bevviz.bags.sqlite import SqliteReader
@@ -62,6 +63,10 @@ FORMATS = (
     FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path, _: ChunkReader(path, mcap.FORM)),
     FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path, _: ChunkReader(path, ros1.FORM)),
     SQLITE,
+    *(
+        FileFormat("network capture", magic, ".pcap", lambda path, _: pcap.PcapReader(path))
+        for magic in (*pcap.MAGICS, pcap.NEXT_GENERATION)
+    ),
 )
 HEAD_SIZE = 16  # bytes read to recognise a format
 OTHER_FORMATS = {
@@ -70,7 +75,6 @@ OTHER_FORMATS = {
     b"\x1f\x8b": "a gzip archive: unpack it first",
     b"BZh": "a bzip2 archive: unpack it first",
     b"\xfd7zXZ": "an xz archive: unpack it first",
-    b"\xd4\xc3\xb2\xa1": "a packet capture, not a bag: record the driver's topics instead",
     LFS_POINTER[:HEAD_SIZE]: LFS_HINT,
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
@@ -178,6 +182,10 @@ class BagFile:
         """Open the damaged file. Messages that are being read from the former reader still come from it."""
         if self.rescued is None:
             _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
+            if not self._magic:
+                raise UserError(
+                    f"{self.path}: {error}: download it, then what is there is rescued"
+                ) from error
             is_whole = isinstance(error, UnindexedError)
             how = "it is read from end to end" if is_whole else "what is there was rescued"
             self._notes.append(f"{error}: {how}")
@@ -211,6 +219,8 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
         OSError: the file does not exist or cannot be read.
         UserError: the file is no bag or is empty.
     """
+    if address_of(path):
+        return _open_remote(path)
     if path.exists() and not path.is_file():  # Reading a pipe would block.
         raise UserError(f"{path}: no bag: it is no file")
     with path.open("rb") as file:
@@ -235,9 +245,21 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
         problem = f"one cloud or image, no drive: give the folder that it is in ({path.parent})"
     if not problem and (hint := UNREAD.get(path.suffix.lower())):
         problem = f"{path.suffix.lower()} files are not read: {hint}"
-    raise UserError(
-        f"{path}: {problem or 'not a bag: neither MCAP, nor sqlite3, nor ROS 1 by its first bytes'}"
-    )
+    known = ", ".join(dict.fromkeys(kind.name for kind in FORMATS))
+    raise UserError(f"{path}: {problem or f'not a bag: by its first bytes none of {known}'}")
+
+
+def _open_remote(path: Path) -> BagFile:
+    """Open a bag at an address. It needs an index, and it must not be damaged: it is not read as a whole."""
+    file = open_bytes(path)
+    head = file.read(0, HEAD_SIZE)
+    file.close()
+    name = Path(name_of(path))
+    kind = next((kind for kind in FORMATS[:2] if head.startswith(kind.magic)), None)
+    if kind is None:
+        known = " and ".join(kind.name for kind in FORMATS[:2])
+        raise UserError(f"{name}: only {known} are read from an address: download it")
+    return BagFile(name, kind.name, lambda: kind.sound(path, path))
 
 
 def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:

@@ -23,6 +23,7 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, as_damage
+from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -103,7 +104,7 @@ def read_index(path: Path) -> FileIndex:
     Raises:
         DamageError: there is no index, it ends early, or it disagrees with the statistics.
     """
-    file = FileBytes(path)
+    file = open_bytes(path)
     try:
         end = file.size - _FOOTER.size
         if file.read(0, len(MAGIC)) != MAGIC:
@@ -143,7 +144,7 @@ def read_attachments(path: Path) -> dict[str, bytes]:
 
     ``McapWriter.attach`` writes them there. A damaged attachment is left out.
     """
-    file, attachments = FileBytes(path), dict[str, bytes]()
+    file, attachments = open_bytes(path), dict[str, bytes]()
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
             return attachments

@@ -19,7 +19,7 @@ from rosbags.typesys.stores import empty
 from bevviz.bags.reader import LONGEST, ZSTD, normalized
 from bevviz.errors import first_line
 from bevviz.messages import definitions, foxglove
-from bevviz.messages.decoding import MessageError, read_header
+from bevviz.messages.decoders import MessageError, read_header
 from bevviz.messages.guard import guard
 
 

@@ -13,6 +13,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefiniti
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, normalized
+from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -158,7 +159,7 @@ def read_index(path: Path) -> FileIndex:
     Raises:
         DamageError: there is no index, it ends early, or it contradicts itself.
     """
-    file = FileBytes(path)
+    file = open_bytes(path)
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
             raise DamageError("it does not begin as a ROS 1 bag does")

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
 from bevviz.bags.bag import Recording
 from bevviz.bags.message import RawMessage
+from bevviz.bags.remote import address_of
 from bevviz.config import Config, stage_topics
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error
+from bevviz.datasets.result_files import ResultFile, open_results
 from bevviz.errors import UserError
-from bevviz.messages.decoding import MessageError
+from bevviz.messages.decoders import MessageError
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import find_roles
+from bevviz.messages.topics import CLOUDS
 from bevviz.messages.transforms import decode_transforms
-from bevviz.model.frame import F64, I64, Frame, Scene
+from bevviz.model.frame import F64, I64, Frame, LabelledBoxes3D, Scene
 from bevviz.support.contexts import Closable
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.report import UnusableMessages, why_no_images
+from bevviz.sync.report import LARGE_LOSS, UnusableMessages, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
@@ -89,9 +93,12 @@ class BagSource(Closable):
     ) -> None:
         self.config = config
         self.selection = FrameSelection(start, end, every, frames)
+        self._paths = tuple(paths)
         self.recording = Recording(paths, config.source)
         try:
-            self.roles = find_roles(self.recording.topics, config.source, stage_topics(config))
+            self.results = self._open_results()
+            topics = [*self.recording.topics, *(file.described for file in self.results)]
+            self.roles = find_roles(topics, config.source, stage_topics(config))
             self._driver = self._find_driver()
             self._low = self._time(start, self.recording.start)
             self._high = self._time(end, self.recording.end + 1)
@@ -103,6 +110,7 @@ class BagSource(Closable):
             self.close()
             raise
         self._state: ReadingState | None = None  # state of the latest read
+        self._checked: set[str] = set()  # see VerticalEstimate; for single frames
 
     def close(self) -> None:
         """Close the recording."""
@@ -112,7 +120,9 @@ class BagSource(Closable):
     def scene(self) -> Scene:
         """Static scene with the bag paths and the topics in use."""
         scene = self.roles.scene(self.recording.name)
-        return replace(scene, bag=self.recording.paths, topics=self.roles.settings)
+        # An address may hold a signature, and a recording is handed on.
+        local_paths = tuple(path for path in self.recording.paths if not address_of(path))
+        return replace(scene, bag=local_paths, topics=self.roles.settings)
 
     @property
     def total(self) -> int:
@@ -132,6 +142,24 @@ class BagSource(Closable):
     def _damage(self) -> Sequence[str]:
         """Unusable messages, one sentence for each topic."""
         return self._state.damage.sentences if self._state else ()
+
+    @property
+    def noun(self) -> str:
+        """Name of a message that makes a frame: a scan, or an image without a LiDAR."""
+        return "scan" if self.roles.lidars else "image"
+
+    def large_losses(self) -> Iterator[str]:
+        """Yield a sentence for each large loss among the messages read so far that should make frames."""
+        if self._state is None:
+            return
+        report, damaged = self._state.sync.report, self._state.damage.count(self._driver)
+        read = report.queued + damaged
+        heard = f"of the first {read} {self.noun}s"
+        if report.stale > LARGE_LOSS * read:
+            helps = ": --set sync.by=received" if report.receipt_helps() else ""
+            yield f"a run drops {report.stale} {heard}, whose stamps repeat or go back{helps}"
+        if damaged > LARGE_LOSS * read:
+            yield f"a run cannot use {damaged} {heard}, see the warnings"
 
     @property
     def doubts(self) -> Sequence[str]:
@@ -170,7 +198,7 @@ class BagSource(Closable):
             UserError: the text is no time, or the time is outside the recording.
         """
         if not len(self.scans):
-            raise UserError(f"{self.recording.name}: {self._driver} has no scan that can be read")
+            raise UserError(f"{self.recording.name}: {self._driver} has no {self.noun} that can be read")
         return int(np.abs(self.scans - self._time(str(time), 0)).argmin())
 
     def checked(self, number: int) -> int:
@@ -181,7 +209,7 @@ class BagSource(Closable):
         """
         if not 0 <= number < len(self.scans):
             raise UserError(
-                f"frame {number}: {self.recording.name} has {len(self.scans)} scans, counted from 0"
+                f"frame {number}: {self.recording.name} has {len(self.scans)} {self.noun}s, counted from 0"
             )
         return number
 
@@ -192,18 +220,46 @@ class BagSource(Closable):
             UserError: there is no scan with this number.
         """
         low = int(self.scans[self.checked(number)])
-        return next(self._frames(low, low + 1, number, range(1)), None)
+        return next(self._frames(low, low + 1, number, range(1), self._checked), None)
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the selected frames."""
+        chosen = self._chosen
+        return range(self._first + chosen.start, self._first + chosen.stop, chosen.step)
+
+    @property
+    def opener(self) -> Callable[[], BagSource]:
+        """Function that opens the same frames again, also in another process."""
+        return partial(self.selection.source, self._paths, self.config)
+
+    def part(self, first: int, stop: int) -> Iterator[Frame]:
+        """Yield a part of the selected frames without reading those before it.
+
+        Args:
+            first: place of the first frame among the selected ones.
+            stop: place after the last one.
+        """
+        part = self._chosen[first:stop]
+        scans = self.scans[int(np.searchsorted(self.scans, self._low)) :]
+        low, high = int(scans[part[0]]), int(scans[part[-1]]) + 1
+        return self._frames(low, high, self._first + part[0], range(0, len(part) * part.step, part.step))
 
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)
 
-    def _frames(self, low: int, high: int, first: int, chosen: range) -> Iterator[Frame]:
+    def _frames(
+        self, low: int, high: int, first: int, chosen: range, checked: set[str] | None = None
+    ) -> Iterator[Frame]:
         """Yield the chosen frames of the scans with low <= log time < high, numbered from ``first``."""
         sync = Synchronizer(self.roles, self.config)
+        sync.upright.checked = checked
+        sync.absent = frozenset(file.topic for file in self.results)  # No message comes on these topics.
         state = self._state = ReadingState(sync)
         handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
         self._feed_latched(state, handlers, low)
-        return self._deliver(state, handlers, low, high, first, chosen)
+        frames = self._deliver(state, handlers, low, high, first, chosen)
+        return map(self._with_results, frames) if self.results else frames
 
     def _deliver(
         self,
@@ -281,12 +337,44 @@ class BagSource(Closable):
                 with suppress(MessageError):  # The error is counted when the message itself is handled.
                     handlers[topic](info)
 
+    def _open_results(self) -> list[ResultFile]:
+        """Open the result files that the configuration names."""
+        results = self.config.source.results
+        if not results:
+            return []
+        driver = find_roles(self.recording.topics, self.config.source).driver
+        scans = len(self.recording.scan_times(driver)) if driver else 0
+        return open_results(results, self.recording.folder, scans, self.recording.sample_stamps)
+
+    def _with_results(self, frame: Frame) -> Frame:
+        """Return a frame with the boxes of the result files."""
+        boxes, detections, problems = [*frame.robot_boxes], [*frame.robot_detections], [*frame.problems]
+        for file in self.results:
+            try:
+                labelled = file.of(frame)
+            except UserError as error:
+                problems.append(str(error))
+                continue
+            except NOT_AS_DOCUMENTED as error:
+                problems.append(f"{file.path}: not as documented ({describe_error(error)})")
+                continue
+            if isinstance(labelled, LabelledBoxes3D):
+                boxes.append(labelled)
+            elif labelled is not None:
+                detections.append(labelled)
+        return replace(
+            frame,
+            robot_boxes=tuple(boxes),
+            robot_detections=tuple(detections),
+            problems=tuple(problems),
+        )
+
     def _find_driver(self) -> str:
         """Return the first LiDAR topic, or else the first camera topic. Its messages make the frames."""
         driver = self.roles.driver
         if not driver:
             raise UserError(f"{self.recording.name}: {self.roles.no_lidar}")
-        counts = {t.name: t.count for t in self.recording.topics if t.kind == "PointCloud2"}
+        counts = {t.name: t.count for t in self.recording.topics if t.kind in CLOUDS}
         if self.roles.lidars and not counts[driver]:
             others = [name for name, count in counts.items() if count]
             helps = (
@@ -327,10 +415,10 @@ class BagSource(Closable):
         chosen = scans[slice(*frames)][:: max(every, 1)]
         if not chosen:
             raise UserError(
-                f"{self.recording.name}: {self._driver} has {len(scans)} scans in the time asked for, "
+                f"{self.recording.name}: {self._driver} has {len(scans)} {self.noun}s in the time asked for, "
                 "and none of them is among --frames"
                 if scans
-                else f"{self.recording.name}: {self._driver} has no scan in the time asked for"
+                else f"{self.recording.name}: {self._driver} has no {self.noun} in the time asked for"
             )
         return chosen
 

@@ -1,0 +1,151 @@
+"""Bags at an address: what is read of them, by which requests, and what is said when that fails."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bevviz.bags import remote
+from bevviz.bags.bag import Recording
+from bevviz.bags.source import BagSource
+from bevviz.cli import main
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.synthetic import SyntheticSource, write_bag
+
+pytest.importorskip("aiohttp", reason="needs fsspec's HTTP: pip install 'bevviz[remote]'")
+
+
+@dataclass
+class WebServer:
+    """Files of a folder, by ranges unless told otherwise."""
+
+    address: str
+    loaded: list[int] = field(default_factory=list)  # bytes of each answer
+    ranges: bool = True
+    failures: int = 0  # answers that fail from now on
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("web")
+    source = SyntheticSource(frames=6)
+    write_bag(source, folder / "drive.mcap", source)
+    whole = (folder / "drive.mcap").read_bytes()
+    (folder / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    (folder / "page.html").write_text("<!doctype html>" * 9)
+    return folder
+
+
+@pytest.fixture
+def web(folder: Path) -> Iterator[WebServer]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_HEAD(self) -> None:
+            self.answer(body=False)
+
+        def do_GET(self) -> None:
+            self.answer(body=True)
+
+        def answer(self, *, body: bool) -> None:
+            path = folder / self.path.lstrip("/").partition("?")[0]
+            if site.failures and body:
+                site.failures -= 1
+                self.send_error(503)
+                return
+            if not path.is_file():
+                self.send_error(404)
+                return
+            data = path.read_bytes()
+            asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+            if asked and site.ranges:
+                first, last = int(asked[1]), min(int(asked[2]), len(data) - 1)
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {first}-{last}/{len(data)}")
+                data = data[first : last + 1]
+            else:
+                self.send_response(200)
+            self.send_header("Accept-Ranges", "bytes" if site.ranges else "none")
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            if body:
+                site.loaded.append(len(data))
+                self.wfile.write(data)
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    site = WebServer(f"http://127.0.0.1:{server.server_port}")
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield site
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_a_bag_at_an_address_gives_the_same_messages(web: WebServer, folder: Path) -> None:
+    def messages(path: str | Path) -> list[tuple[str, int, bytes]]:
+        with Recording([Path(path)]) as recording:
+            topics = [topic.name for topic in recording.topics]
+            return [(m.topic, m.received, bytes(m.data)) for m in recording.messages(topics)]
+
+    assert messages(f"{web.address}/drive.mcap") == messages(folder / "drive.mcap")
+
+
+def test_only_the_needed_parts_are_loaded(web: WebServer, folder: Path) -> None:
+    with BagSource([Path(f"{web.address}/drive.mcap")], load()) as source:
+        opened = sum(web.loaded)
+        assert source.frame(5) is not None and sum(web.loaded) > opened
+        assert source.recording.size == (folder / "drive.mcap").stat().st_size
+    assert opened < source.recording.size
+
+
+def test_names_and_recordings_hold_no_signature(
+    web: WebServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    address = f"{web.address}/drive.mcap?X-Amz-Signature=c0ffee"
+    assert main(["bag", address, "--frames", ":2", "--save", "out.rrd"]) == 0
+    assert b"c0ffee" not in Path("out.rrd").read_bytes() and "c0ffee" not in capsys.readouterr().err
+    assert remote.name_of(Path(address)) == "drive.mcap"
+    assert remote.beside(Path(address)) == tmp_path / "drive.mcap"
+
+
+def test_a_failure_of_the_network_is_tried_again(web: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "PAUSE", 0.01)
+    with Recording([Path(f"{web.address}/drive.mcap")]) as recording:
+        web.failures = remote.TRIES - 1
+        assert recording.first(recording.topics[0].name) is not None and not web.failures
+        web.failures = 99
+        with pytest.raises(UserError, match=r"^drive\.mcap: cannot be read over the network"):
+            list(recording.messages([topic.name for topic in recording.topics]))
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("absent.mcap", "absent.mcap: there is no such file at this address"),
+        ("cut.mcap", "cut.mcap: the file ends early (no footer): download it"),
+        ("page.html", "page.html: only MCAP and ROS 1 bag are read from an address: download it"),
+    ],
+)
+def test_a_file_that_cannot_be_read_by_parts_is_one_line(
+    web: WebServer, file: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", f"{web.address}/{file}"]) != 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"bevviz: error: {text}")
+
+
+def test_a_server_without_ranges_is_told(web: WebServer) -> None:
+    web.ranges = False
+    with pytest.raises(UserError, match="download it"):
+        Recording([Path(f"{web.address}/drive.mcap")])
