@@ -18,7 +18,7 @@ import zstandard
 from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
 from bevviz.bags.reader import LEAST, DamageError, FileBytes, unpack
-from bevviz.bags.rescue.sqlite_pages import checksum_of
+from bevviz.bags.rescue.sqlite import checksum_of
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
@@ -303,17 +303,18 @@ def test_a_file_cut_during_reading_is_reported(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("name", ["mcap", "mcap, flat", "mcap, no checksums", "ros1", "sqlite3"])
-@pytest.mark.parametrize("number", [2**64 - 1, 2**62])
-def test_no_number_in_a_file_leads_to_a_traceback(tmp_path: Path, name: str, number: int) -> None:
+def test_no_number_in_a_file_leads_to_a_traceback(tmp_path: Path, name: str) -> None:
+    """The places take turns with two numbers, one of which is negative where it is read as signed."""
     path = FORMATS[name](tmp_path)
     data = path.read_bytes()
     places = range(4096, len(data), 30_011) if "mcap" not in name else []
     for kind in (mcap.MESSAGE, mcap.CHUNK, mcap.CHUNK_INDEX, mcap.STATISTICS, mcap.FOOTER, mcap.SCHEMA):
         if "mcap" in name:
             places = [*places, *(at + 9 + step for at in records(data, kind)[:1] for step in range(0, 32, 8))]
-    for at in places:
+    first = name != "mcap"  # the formats of MCAP share their records, which so get both numbers
+    for number, at in enumerate(places, start=first):
         path.write_bytes(data)
-        change(path, at, struct.pack("<Q", number))
+        change(path, at, struct.pack("<Q", 2**62 if number % 2 else 2**64 - 1))
         try:
             read(path)
             render_bag_info(describe_bag([path], Config()))

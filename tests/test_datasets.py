@@ -142,9 +142,9 @@ def test_a_tracking_sequence_is_read(tmp_path: Path, capsys: Capture) -> None:
 def test_tracking_is_evaluated_and_swept(tmp_path: Path, capsys: Capture) -> None:
     root = str(datasets.kitti_tracking(tmp_path))
     report = tmp_path / "found.json"
-    assert main(["evaluate", root, "--sequence", "0001", "--json", str(report)]) in (0, 1)
+    assert main(["evaluate", root, "--model", "demo", "--sequence", "0001", "--json", str(report)]) in (0, 1)
     metrics = json.loads(report.read_text())["metrics"]
-    assert metrics["missed"] == 3  # of each scan its car: no detector is there to name it
+    assert metrics["missed"] == 3  # of each scan its car: no image shows one
     assert main(["sweep", root, "--sequence", "0001", "--set", "clustering.eps=0.4:0.6:0.2"]) == 0
     assert "recall" in capsys.readouterr().out
 
@@ -181,7 +181,7 @@ def test_semantic_kitti_has_objects_and_ground(tmp_path: Path, capsys: Capture) 
     mine = frame.fields["label"] >> 16 == 5
     grown = Boxes3D(truth.boxes.center, truth.boxes.size + np.float32(1e-3), truth.boxes.yaw)
     assert geometry.inside(frame.points[mine], grown, 0).all()
-    assert main(["evaluate", str(tmp_path)]) == 0
+    assert main(["evaluate", str(tmp_path), "--model", "demo"]) == 0
     said = capsys.readouterr().out
     assert re.search(r"^car +3 +0 +3", said, re.MULTILINE)
     assert "ground" in said
@@ -271,7 +271,7 @@ def test_a_part_of_nuscenes_is_read_and_missing_files_counted(tmp_path: Path, ca
     assert "1 of 2 scenes have no LiDAR scan here: scene-0061 has" in capsys.readouterr().out
     first = sorted(root.glob("samples/LIDAR_TOP/*"))[0]
     first.unlink()
-    assert main(["evaluate", str(root)]) == 0
+    assert main(["evaluate", str(root), "--model", "demo"]) == 0
     said = capsys.readouterr()
     assert "1 of 6 files of scene-0061 are not there, 1 of its 2 samples lack one" in " ".join(
         (said.out + said.err).split()
@@ -283,8 +283,11 @@ def test_a_part_of_nuscenes_is_read_and_missing_files_counted(tmp_path: Path, ca
 def test_nuscenes_is_evaluated(tmp_path: Path, capsys: Capture) -> None:
     root = datasets.nuscenes(tmp_path)
     report = tmp_path / "found.json"
-    assert main(["evaluate", str(root), "--sequence", "scene-0061", "--json", str(report)]) == 0
-    assert json.loads(report.read_text())["metrics"]["missed"] == 2  # no detector
+    assert (
+        main(["evaluate", str(root), "--model", "demo", "--sequence", "scene-0061", "--json", str(report)])
+        == 0
+    )
+    assert json.loads(report.read_text())["metrics"]["missed"] == 2  # no image shows one
     assert "2 frames, 1 without truth left out" in capsys.readouterr().out
 
 
@@ -477,7 +480,7 @@ def test_a_label_that_is_cut_costs_that_scan_its_labels(tmp_path: Path, capsys: 
     sequence = datasets.kitti_odometry(tmp_path)
     label = sequence / "labels/000001.label"
     label.write_bytes(label.read_bytes()[:-4])
-    assert main(["evaluate", str(sequence)]) == 0
+    assert main(["evaluate", str(sequence), "--model", "demo"]) == 0
     said = capsys.readouterr()
     assert "000001.label: 399 labels for 400 points" in said.err
 
@@ -493,3 +496,39 @@ def test_the_kind_of_data_set_can_be_forced(tmp_path: Path, capsys: Capture) -> 
         "a folder without a bag (no .mcap, .db3 or .bag file), and no data set that is recognised"
         in capsys.readouterr().err
     )
+
+
+def test_a_drive_below_wins_over_crops_of_its_objects(tmp_path: Path, capsys: Capture) -> None:
+    """A detector's training leaves folders of cut-out objects beside ``training``."""
+    root = tmp_path / "kitti"
+    datasets.kitti_object(root / "training")
+    (root / "kitti_gt_database").mkdir()
+    for number in range(3):
+        datasets.scan(number).tofile(root / f"kitti_gt_database/00000{number}_Car_0.bin")
+    assert main(["info", str(root)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "no drive itself: its folder training is taken (KITTI object benchmark)" in out
+    assert "/velodyne_points" in out and "gt_database" not in out.replace(str(root), "")
+    datasets.kitti_object(root / "testing")
+    assert main(["info", str(root)]) == 2
+    message = capsys.readouterr().err
+    assert "no drive itself, and 2 below it; give one of them, or --sequence NAME" in message
+    assert "testing (KITTI object benchmark), training (KITTI object benchmark)" in message
+    assert main(["info", str(root), "--sequence", "training"]) == 0
+    capsys.readouterr()
+    assert main(["info", str(root / "kitti_gt_database")]) == 0  # who asks for the crops gets them
+
+
+def test_two_drives_in_one_folder_are_two(tmp_path: Path, capsys: Capture) -> None:
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            datasets.scan(number).tofile(tmp_path / name / f"{number:06}.bin")
+            datasets.image(tmp_path / name / f"{number:06}.png", 60)
+    assert main(["info", str(tmp_path)]) == 2
+    assert "2 drives; choose with --sequence NAME; there are monday, tuesday" in capsys.readouterr().err
+    assert main(["info", str(tmp_path), "--sequence", "tuesday"]) == 0
+    (tmp_path / "calibration.yaml").write_text("rate: 10")  # says that the folders are sensors of one drive
+    capsys.readouterr()
+    assert main(["info", str(tmp_path)]) == 0
+    assert "/monday/points" in capsys.readouterr().out

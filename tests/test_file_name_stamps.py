@@ -176,11 +176,11 @@ def test_a_table_states_the_stamps(stamps: list[str], seconds: list[float], tmp_
     [
         ("# stamp x y z qx qy qz qw\n1700000001.5 1 2 3 0 0 0 1\n", 1700000001.5),
         ("1700000001500000000 1 2 3 0 0 0 1\n", 1700000001.5),
-        ("1 0 0 4 0 1 0 5 0 0 1 6\n", "line 1 has 12 numbers, not 8 (stamp x y z qx qy qz qw)"),
+        ("1 0 0 4 0 1 0 5 0\n", "line 1 has 9 numbers, not 8 (stamp x y z qx qy qz qw)"),
     ],
 )
 def test_poses_of_other_programs_are_read(line: str, expected: float | str, tmp_path: Path) -> None:
-    """KITTI's twelve numbers were read as a stamp and a quaternion."""
+    """Nine numbers are not read as a stamp and a pose."""
     (tmp_path / "poses.txt").write_text(line)
     if isinstance(expected, str):
         with pytest.raises(UserError) as error:

@@ -187,9 +187,9 @@ def test_kitti_with_other_names_of_frames(name: str, tmp_path: Path) -> None:
     (tmp_path / f"calib/{name}.txt").write_text(rows)
     drive = open_dataset(tmp_path)
     assert drive and drive.name == "kitti-object"
-    (tmp_path / f"calib/{name}.txt").write_text(rows.replace("cam:", "cam_0:"))  # Waymo's, which is none
+    (tmp_path / f"calib/{name}.txt").write_text(rows.replace("cam:", "cam_0:"))  # of a converted Waymo
     drive = open_dataset(tmp_path)
-    assert drive and drive.name == "folder"
+    assert drive and drive.name == "kitti-object"
 
 
 @pytest.mark.parametrize(("label", "name"), [("scalar_Intensity", "intensity"), ("I", "i")])

@@ -19,7 +19,7 @@ from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
 from bevviz.model.geometry import has_distortion
 from bevviz.synthetic.sensors import load_open3d
-from tests.support.datasets import cloud
+from tests.support.datasets import cloud, kitti_raw
 
 
 @given(st.integers(3, 7), st.integers(0, 1000), st.integers(500, 5000))
@@ -384,3 +384,40 @@ def test_a_folder_of_cameras_has_one_for_each(tmp_path: Path) -> None:
         "/lidar/points",
         *(f"/{name}/image_rect/compressed" for name in ("front", "left", "images_left")),
     }
+
+
+def test_twelve_numbers_are_no_poses_with_stamps(tmp_path: Path) -> None:
+    """KITTI's poses lie beside clouds in public folders, which are shown without them."""
+    cloud(4).tofile(tmp_path / "000000.bin")
+    (tmp_path / "poses.txt").write_text("1 0 0 4 0 1 0 5 0 0 1 6\n")
+    folder = Folder(tmp_path, "")
+    assert any("poses.txt has 12 numbers in a line, as KITTI's" in text for text in folder.warnings)
+    assert all(stream.topic != "/tf" for stream in folder.streams)
+
+
+def test_a_scan_as_pcd_and_as_bin_is_one_scan(tmp_path: Path) -> None:
+    points = cloud(4, 300)
+    points.tofile(tmp_path / "000000.bin")
+    head = "VERSION 0.7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 300\nHEIGHT 1\n"
+    head += "POINTS 300\nDATA binary\n"
+    (tmp_path / "000000.pcd").write_bytes(head.encode() + points.tobytes())
+    (scans,) = (stream for stream in Folder(tmp_path, "").streams if stream.topic.endswith("/points"))
+    assert [file.suffix for file in scans.files] == [".pcd"]
+
+
+def test_range_images_beside_clouds_are_no_lidar(tmp_path: Path) -> None:
+    cloud(4).tofile(tmp_path / "000000.bin")
+    (tmp_path / "residuals").mkdir()
+    np.save(tmp_path / "residuals/000000.npy", np.zeros((64, 2048), np.float32))
+    folder = Folder(tmp_path, "")
+    assert any("of the shape (64, 2048), no points" in text for text in folder.warnings)
+    assert [s.topic for s in folder.streams if s.topic.endswith("/points")] == ["/lidar/points"]
+
+
+def test_a_piece_of_a_kitti_drive_is_a_plain_folder(tmp_path: Path) -> None:
+    """Without stamps and calibration it was refused."""
+    root = kitti_raw(tmp_path)
+    for file in (*root.rglob("timestamps.txt"), *root.parent.glob("calib_*.txt")):
+        file.unlink()
+    drive = bevviz.open(root)
+    assert len(drive) == 3 and [camera.name for camera in drive.raw(0).cameras] == ["image_00", "image_02"]

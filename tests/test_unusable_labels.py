@@ -96,7 +96,7 @@ def test_a_label_file_that_is_none_is_told_by_every_command(
     folder: Path, tmp_path: Path, line: str, said: str, capsys: Capture
 ) -> None:
     (folder / "label_2/000000.txt").write_text(f"{line}\n")
-    commands = (["info"], ["bag", "--save", str(tmp_path / "out.rrd")], ["evaluate"])
+    commands = (["info"], ["bag", "--save", str(tmp_path / "out.rrd")], ["evaluate", "--model", "demo"])
     for command, *options in commands:
         assert main([command, str(folder), *options]) == 0
         out, err = capsys.readouterr()
@@ -107,7 +107,7 @@ def test_a_label_file_that_is_none_is_told_by_every_command(
 def test_evaluate_says_how_many_labels_were_left_out(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     for name in ("000000", "000001"):
         (folder / f"label_2/{name}.txt").write_text(f"{label(x='nan')}\n{label(height='0')}\n")
-    assert main(["evaluate", str(folder), "--json", str(tmp_path / "found.json")]) == 0
+    assert main(["evaluate", str(folder), "--model", "demo", "--json", str(tmp_path / "found.json")]) == 0
     out, err = capsys.readouterr()
     file = folder / "label_2/000000.txt"
     assert f"4 labels are left out, the first: frame 0: {file}: line 1 (Car): its x is nan" in out
@@ -121,7 +121,7 @@ def test_evaluate_says_how_many_labels_were_left_out(folder: Path, tmp_path: Pat
 def test_labels_beside_a_bag_are_counted(folder: Path, shared: Path, capsys: Capture) -> None:
     bag = bags.write(folder / "bag", bags.small_items(scans=2))
     (folder / "label_2/000001.txt").write_text(f"{label(y='nan')}\n")
-    assert main(["evaluate", str(bag), "--kitti-labels", str(folder / "label_2")]) == 0
+    assert main(["evaluate", str(bag), "--model", "demo", "--kitti-labels", str(folder / "label_2")]) == 0
     assert "1 label is left out, the first: frame 1: " in capsys.readouterr().out
 
 

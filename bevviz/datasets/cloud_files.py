@@ -125,7 +125,7 @@ def why_no_points(file: Path) -> str:
     if suffix == ".bin":
         return "whole numbers, no points of float32" if are_whole(read_head(file, SAMPLE_BYTES)) else ""
     shape = array_shape(file) if suffix == ".npy" else ()
-    if shape and (len(shape) != 2 or (shape[0] in (3, 4) and shape[1] in (3, 4))):
+    if shape and (len(shape) != 2 or shape[1] > MAX_COLUMNS or (shape[0] in (3, 4) and shape[1] in (3, 4))):
         return f"of the shape {shape}, no points"
     return ""
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from bevviz.config.files import parse_yaml
+from bevviz.datasets.calibrations import find_calibrations
 from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_cloud, why_no_points
 from bevviz.datasets.dataset import (
     BASE,
-    HIDDEN,
     IMAGES,
     Dataset,
     Stream,
@@ -26,6 +26,7 @@ from bevviz.datasets.dataset import (
     mounting_stream,
     pose_stream,
     read_table,
+    subfolders,
 )
 from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
 from bevviz.errors import UserError
@@ -46,7 +47,9 @@ SENSOR_FOLDER = re.compile(  # folders that contain one folder per camera or LiD
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
 )
 DRIVE_FOLDER = re.compile(
-    r"(\d{3,}|(train|test)(ing)?|val(idation)?)$", re.IGNORECASE
+    r"(\d{3,}|(train|test)(ing)?|val(idation)?"
+    r"|(seq(uence)?|run|drive|scene|scenario|clip|session|log)[-_ ]?\d+)$",
+    re.IGNORECASE,
 )  # folders of a drive or a split, not of a sensor
 # Nearest types that a PointCloud2 can hold.
 NEAREST_TYPES = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}
@@ -80,9 +83,20 @@ class Folder(Dataset):
         """Tell whether a folder or a sensor folder in it has clouds."""
         return any(files_in(folder, CLOUDS) for folder in _sensor_folders(path))
 
+    @classmethod
+    def states(cls, path: Path) -> bool:
+        """Tell whether a calibration, stamps or poses make the folder a drive."""
+        return any((path / name).is_file() for name in (CALIBRATION, STAMPS, POSES))
+
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        """Return the subfolders with clouds and images of their own, where there are several."""
+        inner = [f for f in subfolders(path) if files_in(f, CLOUDS) and files_in(f, IMAGES)]
+        return inner if len(inner) > 1 and not files_in(path, CLOUDS) and not cls.states(path) else [path]
+
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
-        self.choose_folder()
+        path = self.path = self.choose_folder()
         about = self._calibration()
         others = describe_unread(path)
         lidars, cameras = self._sensors(about)
@@ -90,8 +104,9 @@ class Folder(Dataset):
             raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
         if others:
             self.warn(others)
+        about, read = self._with_found(about, lidars, cameras)
         if bare := [name for name in cameras if "K" not in about.get("cameras", {}).get(name, {})]:
-            self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_unread_notes(path)}")
+            self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_unread_notes(path, read)}")
         for kind, sensors in (("lidars", lidars), ("cameras", cameras)):
             if unknown := sorted(about.get(kind, {}).keys() - sensors.keys()):
                 names = f"there are {', '.join(sensors)}" if sensors else "there is none"
@@ -110,11 +125,13 @@ class Folder(Dataset):
         for name, files in cameras.items():
             files, times = _in_order(files, stamped)
             stated = about.get("cameras", {}).get(name, {})
+            # Of a folder with clouds and images both have its name. Their frames must differ.
+            frame = f"{name}_camera" if name in lidars else name
             if "pose" in stated:
-                edges.append((BASE, name, self._pose(stated["pose"], name)))
+                edges.append((BASE, frame, self._pose(stated["pose"], name)))
             if "K" in stated:
-                streams.append(self._camera_info(name, times, stated))
-            streams.append(image_stream(name, times, files, rectified=not LENS_KEYS & stated.keys()))
+                streams.append(self._camera_info(frame, times, stated))
+            streams.append(image_stream(frame, times, files, rectified=not LENS_KEYS & stated.keys()))
         for name, files in lidars.items():
             files, times = _in_order(files, stamped)
             stated = about.get("lidars", {}).get(name, {})
@@ -126,6 +143,29 @@ class Folder(Dataset):
             streams.append(_cloud_stream(name, times, files, fields))
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
+    def _with_found(
+        self, about: Mapping[str, Any], lidars: Collection[str], cameras: Collection[str]
+    ) -> tuple[Mapping[str, Any], Sequence[Path]]:
+        """Add to ``calibration.yaml`` what calibrations of other tools state. Return their files, too."""
+        stated = about.get("cameras", {})
+        if all({"K", "pose"} <= stated.get(name, {}).keys() for name in cameras):
+            return about, ()
+        found = find_calibrations(self.path, lidars, cameras)
+        for text in found.warnings:
+            self.warn(text)
+        if found.files:
+            files = ", ".join(str(file.relative_to(self.path)) for file in found.files[:3])
+            more = f" and {len(found.files) - 3} more" if len(found.files) > 3 else ""
+            self.warn(f"calibrated by {files}{more}")
+        merged = {
+            kind: {
+                name: {**sensors.get(name, {}), **about.get(kind, {}).get(name, {})}
+                for name in {*sensors, *about.get(kind, {})}
+            }
+            for kind, sensors in (("lidars", found.lidars), ("cameras", found.cameras))
+        }
+        return {**about, **{kind: sensors for kind, sensors in merged.items() if sensors}}, found.files
+
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""
         sensors: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
@@ -135,7 +175,8 @@ class Folder(Dataset):
                 name = names[folder] or default
                 if name in sensors[kind] or (folder == self.path and name in names.values()):
                     name = f"{(folder if folder == self.path else folder.parent).name}_{name}"
-                sensors[kind] |= self._split_by_sensor(name, files_in(folder, suffixes), about.get(kind, ()))
+                files = _without_copies(files_in(folder, suffixes))
+                sensors[kind] |= self._split_by_sensor(name, files, about.get(kind, ()))
         if broken := [file for folder in names for file in _broken_links(folder)]:
             self.warn(f"{self._name_files(broken)}: a link to what is not there")
         lidars = sensors["lidars"]
@@ -266,6 +307,7 @@ class Folder(Dataset):
             )
         lead_values = leading.values if leading else dict.fromkeys(lead[1], 0)
         stamped = dict[Path, int]()
+        by_stem = {file.stem: number for number, file in enumerate(lead[1])}
         for kind, name, files in all_sensors:
             times = file_times(files)
             stated = about.get(kind, {}).get(name, {})
@@ -276,6 +318,8 @@ class Folder(Dataset):
                     self.warn(f"the names {times.note}")
                 if times.frames and "rate" not in stated:
                     self._check_frame_range(lead[0], leading.values, name, numbers)
+            elif not leading and {file.stem for file in files} <= by_stem.keys():
+                numbers = {file: by_stem[file.stem] for file in files}
             elif not leading:
                 numbers = {file: i for i, file in enumerate(files)}
             elif len(files) == len(lead_values):
@@ -337,6 +381,10 @@ class Folder(Dataset):
         file = self.path / POSES
         if not file.is_file():
             return []
+        first = next((line for line in read_lines(file, TABLE_LIMIT) if line.strip()), "")
+        if len(first.split()) == 12:
+            self.warn(f"{POSES} has 12 numbers in a line, as KITTI's, and no stamps: it is not used")
+            return []
         table = read_table(file, 8, "stamp x y z qx qy qz qw")
         table = table[np.argsort(table[:, 0], kind="stable")]
         if table[:, 0].max(initial=0) < MAX_SECONDS:
@@ -376,28 +424,30 @@ def _sensor_folders(path: Path) -> dict[Path, str]:
 
     They are the folder, its subfolders, and the subfolders of camera or LiDAR folders.
     """
-    names = {path: "", **{folder: folder.name for folder in _folders(path)}}
+    names = {path: "", **{folder: folder.name for folder in subfolders(path)}}
     for folder in [folder for folder, name in names.items() if SENSOR_FOLDER.match(name)]:
-        for within in _folders(folder):
+        for within in subfolders(folder):
             names[within] = folder.name if within.name == "data" else within.name
     return {folder: name for folder, name in names.items() if not DRIVE_FOLDER.match(name)}
 
 
-def _folders(path: Path) -> list[Path]:
-    return sorted(child for child in path.iterdir() if child.is_dir() and not HIDDEN.match(child.name))
-
-
-def _unread_notes(path: Path) -> str:
+def _unread_notes(path: Path, read: Collection[Path]) -> str:
     """Return a clause about calibrations and labels of other programs, which are not read; empty: none."""
-    folders = [path, *(inner for folder in _folders(path) for inner in (folder, *_folders(folder)))]
+    folders = [path, *(inner for folder in subfolders(path) for inner in (folder, *subfolders(folder)))]
     files = [file for folder in folders for file in files_in(folder, NOTE_SUFFIXES)]
-    files = [file for file in files if file.name not in (CALIBRATION, STAMPS, POSES)]
+    files = [file for file in files if file.name not in (CALIBRATION, STAMPS, POSES) and file not in read]
     if not files:
         return ""
     named = files[0].relative_to(path)
     return (
         f"; {named} is not read" if len(files) == 1 else f"; {named} and {len(files) - 1} more are not read"
     )
+
+
+def _without_copies(files: Sequence[Path]) -> list[Path]:
+    """Leave out a BIN file next to one of its name that states its columns: it is the same scan."""
+    stems = {file.stem for file in files if file.suffix.lower() in (".pcd", ".ply")}
+    return [file for file in files if file.suffix.lower() != ".bin" or file.stem not in stems]
 
 
 def _broken_links(folder: Path) -> list[Path]:

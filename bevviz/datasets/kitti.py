@@ -25,6 +25,7 @@ COLUMNS = (
     *("truncation", "occlusion", "alpha", "image box's left", "image box's top", "image box's right"),
     *("image box's bottom", "height", "width", "length", "x", "y", "z", "rotation_y"),
 )
+MIN_FOCAL = 5.0  # pixels; placeholders are the identity, or negative
 EARTH = 6378137.0  # metres; the radius in KITTI's development kit
 # SemanticKITTI label numbers of objects; moving objects begin at 252.
 OBJECTS = {
@@ -50,15 +51,19 @@ def label_files(path: Path) -> Sequence[Path]:
     return files
 
 
-def read_labels(file: Path) -> LabelledBoxes3D:
-    """Read the objects of ``label_2/NUMBER.txt`` in the LiDAR frame, with ``calib/NUMBER.txt`` next to it.
+def read_labels(file: Path, calibrations: Path | None = None) -> LabelledBoxes3D:
+    """Read the objects of ``label_2/NUMBER.txt`` in the LiDAR frame.
 
     A ``DontCare`` label keeps its region in the image.
+
+    Args:
+        file: label file.
+        calibrations: folder of ``NUMBER.txt``; None: the folder ``calib`` next to ``label_2``.
 
     Raises:
         UserError: a file cannot be read, or has not KITTI's format.
     """
-    calibration = Calibration(file.parent.parent / "calib" / file.name)
+    calibration = Calibration((calibrations or file.parent.parent / "calib") / file.name)
     lines = list(enumerate(read_text(file).splitlines(), 1))
     return labelled_boxes(file, lines, calibration.rectified_from_lidar)
 
@@ -102,7 +107,7 @@ def labelled_boxes(
         UserError: a line has not KITTI's format.
     """
     lidar_from_camera = geometry.inverse(rectified_from_lidar)
-    labels, rows, dont_care, kept, unusable = [], [], [], [], []
+    labels, rows, dont_care, kept, unusable, scores = [], [], [], [], [], []
     for index, (number, line) in enumerate(lines):
         kind, *values = line.split() or [""]
         if kind in ("", "Misc"):
@@ -121,6 +126,7 @@ def labelled_boxes(
             continue
         labels.append(kind)
         rows.append(row)
+        scores.append(_score(file, number, values))
         kept.append(index)
     table = np.array(rows, np.float64).reshape(-1, 14)
     height, width, length, x, y, z, turn = table[:, 7:].T
@@ -142,12 +148,23 @@ def labelled_boxes(
         np.array(dont_care, np.float32).reshape(-1, 4),
     )
     names = tuple(ids[index] for index in kept) if ids else ()
-    return _labelled(file, boxes, labels, ids=names, image=image, unusable=tuple(unusable))
+    return _labelled(file, boxes, labels, scores, ids=names, image=image, unusable=tuple(unusable))
 
 
-def _labelled(file: Path, boxes: Boxes3D, labels: Sequence[str], **more: Any) -> LabelledBoxes3D:
-    """Return the labels of a file, which have no scores."""
-    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), np.ones(len(labels), np.float32), **more)
+def _score(file: Path, number: int, values: Sequence[str]) -> float:
+    """Return the score in the 16th column of a detector's result; 1 for a label, which has none."""
+    try:
+        return float(values[14]) if len(values) > 14 else 1.0
+    except ValueError:
+        raise UserError(f"{file}: line {number} has something that is no number") from None
+
+
+def _labelled(
+    file: Path, boxes: Boxes3D, labels: Sequence[str], scores: Sequence[float] = (), **more: Any
+) -> LabelledBoxes3D:
+    """Return the labels of a file."""
+    values = np.array(scores or [1.0] * len(labels), np.float32)
+    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), values, **more)
 
 
 def _why_unusable(kind: str, row: Sequence[float]) -> str:
@@ -267,16 +284,28 @@ class Calibration:
     def __init__(self, file: Path) -> None:
         self.file = file
         self._rows = named_rows(file)
-        reference = self._matrix(3, 4, "Tr_velo_to_cam", "Tr_velo_cam", "Tr")
-        rectified = np.eye(4)
+        reference = self._matrix(3, 4, "Tr_velo_to_cam", "Tr_velo_cam", "Tr", "Tr_velo_to_cam_0")
+        rectified = self._rectified = np.eye(4)
         if not {"R0_rect", "R_rect"}.isdisjoint(self._rows):  # The odometry benchmark includes it in Tr.
             rectified[:3, :3] = self._matrix(3, 3, "R0_rect", "R_rect")
         self.rectified_from_lidar = rectified @ np.vstack([reference, [0, 0, 0, 1]])
 
     def camera(self, number: int) -> tuple[F64, F64]:
         """Return (3, 3) K and (4, 4) camera_from_lidar of a camera. Camera 2 is the left colour camera."""
-        matrix, camera_from_reference = _split_projection(self._matrix(3, 4, f"P{number}"))
+        matrix, camera_from_reference = split_projection(self._matrix(3, 4, f"P{number}"))
+        if f"Tr_velo_to_cam_{number}" in self._rows:
+            mounted = np.vstack([self._matrix(3, 4, f"Tr_velo_to_cam_{number}"), [0, 0, 0, 1]])
+            return matrix, np.asarray(camera_from_reference @ self._rectified @ mounted, np.float64)
         return matrix, camera_from_reference @ self.rectified_from_lidar
+
+    @property
+    def has_mountings(self) -> bool:
+        """Whether each camera has a mounting of its own, as in conversions of other data sets."""
+        return "Tr_velo_to_cam_0" in self._rows
+
+    def has_camera(self, number: int) -> bool:
+        """Return whether there is a projection of a camera."""
+        return f"P{number}" in self._rows
 
     @property
     def lidar_from_imu(self) -> F64:
@@ -295,14 +324,17 @@ class Calibration:
 def named_rows(file: Path) -> Mapping[str, F64]:
     """Read the numbers after each name. Other lines are left out.
 
+    The first of several lines with a name counts: an exporter of CARLA repeats P2 with numbers that mean
+    nothing.
+
     Raises:
         UserError: the file cannot be read.
     """
-    rows = {}
+    rows = dict[str, F64]()
     for line in read_text(file).splitlines():
         name, *values = line.replace(":", " ", 1).split() or [""]
         try:
-            rows[name] = np.array(values, np.float64)
+            rows.setdefault(name, np.array(values, np.float64))
         except ValueError:
             continue
     return rows
@@ -322,7 +354,7 @@ def rectified_camera(folder: Path, number: str) -> tuple[F64, F64]:
         rectified[:3, :3] = rows["R_rect_00"].reshape(3, 3)
     except (KeyError, ValueError):
         raise UserError(f"{file}: no P_rect_{number} or R_rect_00, as KITTI writes it") from None
-    K, camera_from_reference = _split_projection(projection)
+    K, camera_from_reference = split_projection(projection)
     return K, camera_from_reference @ rectified @ read_rigid(folder / "calib_velo_to_cam.txt")
 
 
@@ -341,13 +373,14 @@ def read_rigid(file: Path) -> F64:
     return pose
 
 
-def _split_projection(projection: F64) -> tuple[F64, F64]:
+def split_projection(projection: F64) -> tuple[F64, F64]:
     """Split a (3, 4) projection into (3, 3) K and (4, 4) camera_from_reference, both rectified cameras."""
     camera_from_reference = np.eye(4)
-    try:
-        camera_from_reference[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
-    except np.linalg.LinAlgError:
-        raise UserError(f"a projection of {projection.tolist()} is that of no camera") from None
+    if min(projection[0, 0], projection[1, 1]) < MIN_FOCAL or abs(np.linalg.det(projection[:, :3])) < 1e-9:
+        raise UserError(
+            f"a projection of {projection.tolist()} is that of no camera: its focal length is not in pixels"
+        )
+    camera_from_reference[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
     return projection[:, :3], camera_from_reference
 
 
@@ -386,14 +419,5 @@ def poses_of_oxts(table: F64) -> F64:
     poses[:, 0, 3] = scale * EARTH * np.radians(longitude)  # Mercator projection
     poses[:, 1, 3] = scale * EARTH * np.log(np.tan(np.radians(90.0 + latitude) / 2))
     poses[:, 2, 3] = altitude
-    poses[:, :3, :3] = _rotations(2, yaw) @ _rotations(1, pitch) @ _rotations(0, roll)
+    poses[:, :3, :3] = geometry.rotations(2, yaw) @ geometry.rotations(1, pitch) @ geometry.rotations(0, roll)
     return np.asarray(geometry.inverse(poses[0]) @ poses if len(poses) else poses)
-
-
-def _rotations(axis: int, angles: F64) -> F64:
-    """Return (N, 3, 3) rotations about an axis."""
-    a, b = (axis + 1) % 3, (axis + 2) % 3
-    turns = np.tile(np.eye(3), (len(angles), 1, 1))
-    turns[:, a, a] = turns[:, b, b] = np.cos(angles)
-    turns[:, b, a], turns[:, a, b] = np.sin(angles), -np.sin(angles)
-    return turns

@@ -5,7 +5,7 @@ They are described by Geiger, Lenz, Stiller and Urtasun (2012, 2013), SemanticKI
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib.recfunctions import append_fields
 from numpy.typing import NDArray
 
-from bevviz.datasets.cloud_files import read_points
+from bevviz.datasets.cloud_files import read_cloud, read_points
 from bevviz.datasets.dataset import (
     BOXES,
     IMAGES,
@@ -30,6 +30,7 @@ from bevviz.datasets.dataset import (
     mounting_stream,
     pose_stream,
     read_table,
+    subfolders,
 )
 from bevviz.datasets.kitti import (
     Calibration,
@@ -52,6 +53,14 @@ from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 LIDAR, IMU = "velodyne", "imu_link"
 CLOUDS = "/velodyne_points"
 RATE = 10.0  # Hz, where a benchmark has no stamps
+# Names of the benchmark's folders in copies of it.
+FOLDER_NAMES = {
+    "velodyne": ("velodyne", "points", "point_clouds", "pointclouds", "lidar", "pcd"),
+    "calib": ("calib", "calibs"),
+    "image_2": ("image_2", "image2", "image_02", "images", "image", "img"),
+}
+ARCHIVE = "data_object_velodyne"  # folder of the benchmark's scans where each archive has one
+LABEL_FOLDERS = ("label_2", "label_all", "label_0")
 FRAME_GAP = 100 * SECOND  # between unrelated frames, of which none may influence the next
 # Reasons why a camera gets no role by default; empty: it gets one.
 RIGHT_EYE, GREY = "the right eye of a stereo pair", "grey, beside a colour camera"
@@ -67,53 +76,132 @@ class KittiObject(Dataset):
     about = "KITTI object benchmark"
     expects = "velodyne/000000.bin and calib/000000.txt, mostly image_2/000000.png and label_2/000000.txt too"
     single_frames = True
-    CAMERA = "image_2"
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        """Tell whether a folder has the layout of the benchmark."""
-        if any((path / "calib").glob("[0-9]" * 6 + ".txt")):
+        """Tell whether a folder has the layout of the benchmark, or its archives, each in a folder."""
+        if any((path / ARCHIVE).glob("*/velodyne")):
+            return True
+        scans = _object_scans(path)
+        if not scans and any((path / "calib").glob("[0-9]" * 6 + ".txt")):
             return (path / "velodyne").is_dir()
+        if scans and scans[0].parent.name != "velodyne" and len(_image_folders(path)) != 1:
+            return False  # A plain folder has all of its cameras.
         # Sets in this layout name frames differently: View of Delft by five digits, converters by tokens.
-        calibrations = [path / f"calib/{scan.stem}.txt" for scan in files_in(path / "velodyne", [".bin"])[:1]]
-        return any("Tr_velo_to_cam" in named_rows(file) for file in calibrations if file.is_file())
+        calibrations = (_object_folder(path, "calib") / f"{scan.stem}.txt" for scan in scans)
+        file = next((file for file in calibrations if file.is_file()), None)
+        names = {"P2", "Tr_velo_to_cam", "Tr_velo_to_cam_0"}  # A damaged file may have one of them alone.
+        return file is not None and not names.isdisjoint(named_rows(file))
+
+    @classmethod
+    def drives(cls, path: Path) -> list[Path]:
+        """Return the folder, or those of the splits in the archive of the scans."""
+        return sorted(scans.parent for scans in (path / ARCHIVE).glob("*/velodyne")) or [path]
 
     def __init__(self, path: Path, sequence: str) -> None:
         super().__init__(path, sequence)
-        scans = files_in(path / "velodyne", [".bin"])
+        path = self.path = self.choose_folder()
+        scans = _object_scans(path)
         fields = _columns(self, scans, path / "velodyne/000000.bin")
         times = FRAME_GAP * np.arange(1, len(scans) + 1, dtype=np.int64)
         names = [scan.stem for scan in scans]
-        with_image, images = _matching(files_in(path / self.CAMERA, IMAGES), names, lambda file: file.stem)
-        with_labels, labels = _matching(files_in(path / "label_2", [".txt"]), names, lambda file: file.stem)
+        labelled = next(
+            (name for name in LABEL_FOLDERS if _object_folder(path, name).is_dir()), LABEL_FOLDERS[0]
+        )
+        with_labels, labels = _matching(
+            files_in(_object_folder(path, labelled), [".txt"]), names, lambda file: file.stem
+        )
+
+        calibrations = _object_folder(path, "calib")
 
         @lru_cache(maxsize=8)
-        def camera(row: int) -> tuple[F64, F64]:
-            return Calibration(path / f"calib/{names[row]}.txt").camera(2)
+        def calibration(row: int) -> Calibration:
+            return Calibration(calibrations / f"{names[row]}.txt")
+
+        cameras = self._cameras(calibration, len(names))
 
         def mounting(row: int) -> Any:
-            edge = (LIDAR, self.CAMERA, geometry.inverse(camera(row)[1]))
-            return encode_transforms(int(times[row]), [edge])
+            poses = {name: calibration(row).camera(number)[1] for name, number in cameras.items()}
+            return encode_transforms(
+                int(times[row]), [(LIDAR, name, geometry.inverse(pose)) for name, pose in poses.items()]
+            )
 
         # Each frame has its own map with the LiDAR at the origin.
         self.streams = [
             *mounting_stream(int(times[0]), [(MAP, LIDAR, np.eye(4))]),
             Stream("/tf", "tf2_msgs/msg/TFMessage", times, mounting),
         ]
-        if images:
-            self.streams += [
-                intrinsics_stream(
-                    self.CAMERA,
-                    times[with_image],
-                    lambda row: Intrinsics(0, 0, camera(with_image[row])[0]),
-                ),
-                image_stream(self.CAMERA, times[with_image], images),
-            ]
+        for camera, number in cameras.items():
+            rows, images = _matching(files_in(self._images(camera), IMAGES), names, lambda file: file.stem)
+            if images:
+                self.streams += _camera_streams(camera, number, times[rows], rows, images, calibration)
         if labels:
             self.streams.append(
-                _truth_stream(BOXES, times[with_labels], lambda row: read_labels(labels[row]))
+                _truth_stream(BOXES, times[with_labels], lambda row: read_labels(labels[row], calibrations))
             )
         self.streams.append(_cloud_stream(times, scans, fields))
+
+    def _images(self, camera: str) -> Path:
+        """Return the folder of a camera. The left colour camera's may have any name if it is the only one."""
+        folder = _object_folder(self.path, camera)
+        others = _image_folders(self.path)
+        if folder.is_dir() or camera != "image_2" or not others:
+            return folder
+        if len(others) > 1:
+            listed = ", ".join(child.name for child in others)
+            self.warn(f"no {camera}, so that there is no camera: there are images in {listed}")
+            return folder
+        return others[0]
+
+    def _cameras(self, calibration: Callable[[int], Calibration], frames: int) -> dict[str, int]:
+        """Return the number of each camera: the left colour one, or all of a set with several mountings."""
+        for row in range(min(frames, 2)):
+            try:
+                first = calibration(row)
+            except UserError:  # It is reported when the frame is read.
+                continue
+            if first.has_mountings:
+                numbers = (number for number in range(10) if (self.path / f"image_{number}").is_dir())
+                return {f"image_{number}": number for number in numbers if first.has_camera(number)}
+            break
+        return {"image_2": 2}
+
+
+def _object_folder(path: Path, name: str) -> Path:
+    """Return the folder of the object benchmark with a name, one that copies give it, or in its archive."""
+    folders = [path / other for other in FOLDER_NAMES.get(name, (name,))]
+    if path.parent.name == ARCHIVE:
+        root = path.parent.parent
+        folders += [root / f"data_object_{name}" / path.name / name, root / path.name / name]
+    return next((folder for folder in folders if folder.is_dir()), path / name)
+
+
+def _image_folders(path: Path) -> list[Path]:
+    """Return the subfolders with images."""
+    return [child for child in subfolders(path) if files_in(child, IMAGES)]
+
+
+def _object_scans(path: Path) -> list[Path]:
+    """Return the scans of the object benchmark. Copies of it have them as PCD or PLY, or as BIN too."""
+    folder = _object_folder(path, "velodyne")
+    return files_in(folder, [".bin"]) or files_in(folder, [".pcd", ".ply"])
+
+
+def _camera_streams(
+    camera: str,
+    number: int,
+    times: I64,
+    rows: Sequence[int],
+    images: Sequence[Path],
+    calibration: Callable[[int], Calibration],
+) -> Iterator[Stream]:
+    """Yield the calibrations and the images of a camera. ``rows`` are the numbers of the frames."""
+
+    def intrinsics(row: int) -> Intrinsics:
+        return Intrinsics(0, 0, calibration(rows[row]).camera(number)[0])
+
+    yield intrinsics_stream(camera, times, intrinsics)
+    yield image_stream(camera, times, images)
 
 
 class KittiTracking(Dataset):
@@ -264,8 +352,13 @@ class KittiRaw(Dataset):
 
     @classmethod
     def fits(cls, path: Path) -> bool:
-        """Tell whether a folder is a drive or contains drives."""
-        return (path / "velodyne_points").is_dir() or any(path.glob("*_drive_*/velodyne_points"))
+        """Tell whether a folder is a drive or contains drives.
+
+        A piece of a drive without stamps and calibration is a plain folder.
+        """
+        if (path / "velodyne_points").is_dir():
+            return (path / "velodyne_points/timestamps.txt").is_file() or any(path.parent.glob("calib_*.txt"))
+        return any(path.glob("*_drive_*/velodyne_points"))
 
     @classmethod
     def drives(cls, path: Path) -> list[Path]:
@@ -325,7 +418,7 @@ def _columns(drive: Dataset, scans: Sequence[Path], expected: Path) -> list[str]
     if not scans:
         raise UserError(f"{expected.parent}: no scan in it; expected {expected.name}")
     fields = drive.column_names(scans)
-    drive.check_sizes(scans, 4 * len(fields))
+    drive.check_sizes([scan for scan in scans if scan.suffix == ".bin"], 4 * len(fields))
     return fields
 
 
@@ -414,10 +507,10 @@ def _cloud_stream(
     """Return the stream of scans. ``label`` returns the labels of a row with a number of points."""
 
     def make(row: int) -> Any:
-        points = read_points(files[row], fields)
+        points, announced = read_cloud(files[row], fields)
         if label is not None:
             points = append_fields(points, "label", label(row, len(points)), usemask=False)
-        return encode_points(int(times[row]), LIDAR, points)
+        return encode_points(int(times[row]), LIDAR, points, announced)
 
     return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
 

@@ -106,7 +106,7 @@ class NuScenes(Dataset):
         key_stamps: dict[str, int] = {}  # stamp of the key scan by sample
         for channel, rows in sorted(rows_by_channel.items()):
             calibration = mounted[rows[0]["calibrated_sensor_token"]]
-            pose = _pose(calibration)
+            pose = pose_of(calibration)
             times = 1000 * np.array([row["timestamp"] for row in rows], np.int64)
             files = [_resolve_file(root, row["filename"]) for row in rows]
             if sensors[calibration["sensor_token"]]["modality"] == "lidar":
@@ -126,6 +126,7 @@ class NuScenes(Dataset):
                 f"{len(others)} of {len(scenes)} scenes have scans here: {', '.join(others[:8])}"
                 f"{' ...' if len(others) > 8 else ''}"
             )
+        self.sample_stamps = key_stamps
         self.streams = [
             *mounting_stream(int(clouds[0].times[0]), edges),
             _pose_stream([poses[row["ego_pose_token"]] for rows in rows_by_channel.values() for row in rows]),
@@ -233,10 +234,10 @@ def _pose_stream(poses: Sequence[Record]) -> Stream:
     """Return the stream of vehicle poses by stamp."""
     pose_rows = {1000 * int(row["timestamp"]): row for row in poses}
     times = np.array(sorted(pose_rows), np.int64)
-    return pose_stream(times, BASE, lambda row: _pose(pose_rows[int(times[row])]))
+    return pose_stream(times, BASE, lambda row: pose_of(pose_rows[int(times[row])]))
 
 
-def _pose(row: Record) -> F64:
+def pose_of(row: Record) -> F64:
     """Return the (4, 4) pose of a translation and a quaternion w, x, y, z."""
     w, x, y, z = row["rotation"]
     return geometry.transform(row["translation"], (x, y, z, w))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import zstandard
@@ -23,12 +25,34 @@ Item = tuple[str, str, int, bytes]
 """Topic, type, log time and serialised message."""
 
 
-def items(ros1: bool) -> list[Item]:
+@cache
+def items(ros1: bool) -> tuple[Item, ...]:
     """Return a drive of four seconds in order of log time."""
     messages = bags.Messages(ros1)
     serialize = messages.store.serialize_ros1 if ros1 else messages.store.serialize_cdr
     found = sorted(bags.small_items(messages, SCANS, POINTS), key=lambda item: item.received)
-    return [(i.topic, i.type, i.received, bytes(serialize(i.message, i.type))) for i in found]
+    return tuple((i.topic, i.type, i.received, bytes(serialize(i.message, i.type))) for i in found)
+
+
+def written_once(write: Callable[[Path], Path]) -> Callable[[Path], Path]:
+    """Return a function that writes the same files into each folder. Only the first call makes the bag."""
+
+    @cache
+    def made() -> tuple[dict[Path, bytes], Path]:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            path = write(folder).relative_to(folder)
+            files = (file for file in folder.rglob("*") if file.is_file())
+            return {file.relative_to(folder): file.read_bytes() for file in files}, path
+
+    def copy(folder: Path) -> Path:
+        files, path = made()
+        for name, data in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
+        return folder / path
+
+    return copy
 
 
 def rosbag2(plugin: StoragePlugin, mode: CompressionMode | None = None) -> Callable[[Path], Path]:
@@ -144,7 +168,7 @@ def unclosed(folder: Path) -> Path:
 
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
-FORMATS: dict[str, Callable[[Path], Path]] = {
+WRITERS: dict[str, Callable[[Path], Path]] = {
     "mcap": mcap(NONE),
     "mcap, no checksums": mcap(NONE, crc=False),
     "mcap, lz4": mcap(LZ4),
@@ -166,3 +190,4 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "ros1, lz4": ros1("lz4"),
     "ros1, one lz4 chunk": ros1("lz4", ONE_CHUNK),
 }
+FORMATS = {name: written_once(write) for name, write in WRITERS.items()}

@@ -58,7 +58,7 @@ def oxts(number: int) -> str:
 def kitti_object(root: Path) -> Path:
     """Write three frames with a car and a region without labels."""
     for folder in ("velodyne", "calib", "image_2", "label_2"):
-        (root / folder).mkdir()
+        (root / folder).mkdir(parents=True)
     for number in range(3):
         scan(number).tofile(root / f"velodyne/{number:06d}.bin")
         image(root / f"image_2/{number:06d}.png", 50 * number)

@@ -1,0 +1,401 @@
+"""Calibration files of other tools in a plain folder: what each states about cameras and LiDARs.
+
+A function of ``PARSERS`` reads one kind of file. A new kind is one function more.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz.config.files import parse_yaml
+from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in, subfolders
+from bevviz.datasets.kitti import (
+    MIN_FOCAL,
+    Calibration,
+    named_rows,
+    read_rigid,
+    rectified_camera,
+    split_projection,
+)
+from bevviz.datasets.nuscenes import pose_of
+from bevviz.errors import UserError
+from bevviz.model import geometry
+from bevviz.model.frame import F64
+from bevviz.support.files import read_text
+
+SUFFIXES = (".json", ".yaml", ".yml", ".txt")
+LEVELS = 3  # folders deep that are searched
+MAX_FILES = 12  # of one folder; others of it are of single frames
+MAX_SIZE = 1 << 20  # bytes of a calibration
+LABELS = re.compile(r"label|annot|result|pred", re.IGNORECASE)  # folders that are not searched
+OPENCV_TAG = re.compile(r"!!opencv-matrix|^%YAML.*$", re.MULTILINE)
+# A camera's body frame (x forward) in its optical frame (z forward).
+OPTICAL_FROM_BODY = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
+LENSES = {"radtan": "plumb_bob", "equi": "equidistant", "fisheye": "equidistant", "none": ""}
+CAMERAS = (2, 0, 1, 3, 4)  # of KITTI: the left colour camera first
+ANY_CAMERA = "camera"  # the only one of a folder, whatever its name
+SAME = 1e-3  # relative difference of two calibrations of a camera
+TOLERANCE = 0.02  # of a rotation matrix, which some tools write with few digits
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSensor:
+    """Statement of a calibration file about a sensor.
+
+    Attributes:
+        name: name of the sensor in the file, or that of the file; empty: the file names none.
+        lens: K, D, distortion_model and size, as in ``calibration.yaml``.
+        sensor_from_lidar: (4, 4) transform from the LiDAR; None: not stated.
+        base_from_sensor: (4, 4) pose in the frame of the vehicle; None: not stated.
+        is_lidar: whether it is a LiDAR.
+    """
+
+    name: str
+    lens: Mapping[str, Any] = field(default_factory=dict)
+    sensor_from_lidar: F64 | None = None
+    base_from_sensor: F64 | None = None
+    is_lidar: bool = False
+
+
+@dataclass(slots=True)
+class FoundCalibration:
+    """Statements of all files, as ``calibration.yaml`` has them: by kind of sensor and name."""
+
+    lidars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[str]) -> FoundCalibration:
+    """Find what the calibration files in a folder state about its sensors.
+
+    Args:
+        path: the folder.
+        lidars: names of its LiDARs.
+        cameras: names of its cameras.
+    """
+    found = FoundCalibration()
+    for file in _candidates(path):
+        try:
+            sensors = _sensors_of(file)
+        except (UserError, *NOT_AS_DOCUMENTED) as error:
+            why = str(error) if isinstance(error, UserError) else describe_error(error)
+            found.warnings.append(f"{file.relative_to(path)}: is not used: {why}")
+            continue
+        single = len([sensor for sensor in sensors if not sensor.is_lidar]) == 1
+        before = {name: stated["K"] for name, stated in found.cameras.items() if "K" in stated}
+        used = [_note(found, sensor, lidars, cameras, single) for sensor in sensors]
+        for name, K in before.items():
+            stated = [s.lens["K"] for s in sensors if "K" in s.lens and _means(s, cameras, single) == name]
+            if stated and not np.allclose(_flat(stated[0]), _flat(K), rtol=SAME):
+                found.warnings.append(
+                    f"{file.relative_to(path)} states another K of {name} than "
+                    f"{found.files[0].relative_to(path)}: the first is used for all frames"
+                )
+        if any(used):
+            found.files.append(file)
+    return found
+
+
+def _note(
+    found: FoundCalibration,
+    sensor: FoundSensor,
+    lidars: Collection[str],
+    cameras: Collection[str],
+    single: bool,
+) -> bool:
+    """Note a statement about a sensor of the folder. Return False if the folder has no such sensor."""
+    names, sensors = (lidars, found.lidars) if sensor.is_lidar else (cameras, found.cameras)
+    name = _means(sensor, names, single)
+    if not name:
+        return False
+    stated = sensors.setdefault(name, {})
+    for key, value in sensor.lens.items():
+        stated.setdefault(key, value)
+    pose = sensor.base_from_sensor
+    if pose is None and sensor.sensor_from_lidar is not None:
+        pose = geometry.inverse(sensor.sensor_from_lidar)
+    if pose is not None:
+        stated.setdefault("pose", pose.reshape(-1).tolist())
+    return True
+
+
+def _means(sensor: FoundSensor, names: Collection[str], single: bool) -> str:
+    """Return the sensor of the folder that a statement is about; empty if it is not clear."""
+    return match_name(sensor.name, names, alone=single or sensor.is_lidar or sensor.name == ANY_CAMERA)
+
+
+def match_name(name: str, names: Collection[str], *, alone: bool) -> str:
+    """Return the sensor of a folder that a calibration means; empty if it is not clear.
+
+    Args:
+        name: name in the calibration.
+        names: names of the sensors in the folder.
+        alone: whether the only sensor of the folder is meant if no name fits.
+    """
+    wanted = _plain(name)
+    for fits in (
+        lambda known: known == wanted,
+        lambda known: bool(known) and (known in wanted or (bool(wanted) and wanted in known)),
+    ):
+        matching = [known for known in names if fits(_plain(known))]
+        if len(matching) == 1:
+            return matching[0]
+    return next(iter(names)) if alone and len(names) == 1 else ""
+
+
+def _plain(name: str) -> str:
+    """Return a name without case and marks, with one word for a camera."""
+    return re.sub(r"[^a-z0-9]", "", name.lower()).replace("camera", "cam").replace("image", "cam")
+
+
+def _candidates(path: Path) -> Iterator[Path]:
+    """Yield the files that may be calibrations. Of a folder with one for each frame the first is one."""
+    level = [path]
+    for depth in range(LEVELS):
+        for folder in level:
+            files = [f for f in files_in(folder, SUFFIXES) if f.stat().st_size <= MAX_SIZE]
+            yield from files if len(files) <= MAX_FILES else files[:1]
+        if depth + 1 < LEVELS:
+            level = [d for folder in level for d in subfolders(folder) if not LABELS.search(d.name)][:200]
+
+
+def _sensors_of(file: Path) -> list[FoundSensor]:
+    """Return the statements of a file; none if it is no calibration."""
+    if file.suffix == ".txt":
+        return list(_text(file))
+    text = OPENCV_TAG.sub("", read_text(file, MAX_SIZE))
+    tree = json.loads(text) if file.suffix == ".json" else parse_yaml(text, str(file))
+    if not isinstance(tree, dict):
+        return []
+    name = file.parent.name if file.stem.isdigit() else file.stem
+    for parser in PARSERS:
+        if sensors := list(parser(tree, name)):
+            return sensors
+    return []
+
+
+# --- one kind of file each ---------------------------------------------------------------------
+
+
+def _text(file: Path) -> Iterator[FoundSensor]:
+    """Read lines of a name and numbers: those of KITTI's benchmarks and raw drives, and of CalibAnything."""
+    rows = named_rows(file)
+    sizes = {name: len(values) for name, values in rows.items()}
+    if not {"Tr_velo_to_cam", "Tr_velo_to_cam_0", "Tr", "Tr_velo_cam"}.isdisjoint(rows):
+        yield from _kitti(file, rows)
+    elif file.name == "calib_velo_to_cam.txt":
+        cameras = file.with_name("calib_cam_to_cam.txt")
+        names = named_rows(cameras) if cameras.is_file() else ()
+        yield from _numbered(
+            {n: rectified_camera(file.parent, f"{n:02}") for n in CAMERAS if f"P_rect_{n:02}" in names}
+        )
+    elif sizes.get("K") == 9 and sizes.get("T") == 12:
+        yield FoundSensor(
+            ANY_CAMERA, {"K": _square(rows["K"]), **_lens(_flat(rows.get("D", ())), "")}, _rigid(rows["T"])
+        )
+    elif sizes.get("P2") == 12 and sizes.get("R") == 9 and sizes.get("T") == 3:
+        K, camera_from_reference = split_projection(rows["P2"].reshape(3, 4))
+        yield from _numbered({2: (K, camera_from_reference @ _rigid(read_rigid(file)))})
+
+
+def _kitti(file: Path, rows: Mapping[str, F64]) -> Iterator[FoundSensor]:
+    """Read the text of KITTI's benchmarks: projections P0 to P3 and ``Tr_velo_to_cam``."""
+    calibration = Calibration(file)
+    numbers = [number for number in CAMERAS if len(rows.get(f"P{number}", ())) == 12]
+    if not numbers:
+        yield FoundSensor(ANY_CAMERA, {}, calibration.rectified_from_lidar)
+    cameras, problems = dict[int, tuple[F64, F64]](), list[UserError]()
+    for number in numbers:
+        try:
+            cameras[number] = calibration.camera(number)
+        except UserError as error:  # Converters write placeholders for cameras that a set does not have.
+            problems.append(error)
+    if problems and not cameras:
+        raise problems[0]
+    yield from _numbered(cameras)
+
+
+def _numbered(cameras: Mapping[int, tuple[F64, F64]]) -> Iterator[FoundSensor]:
+    """Yield numbered cameras of KITTI: (3, 3) K and (4, 4) camera_from_lidar."""
+    for number, (K, camera_from_lidar) in cameras.items():
+        yield FoundSensor(f"image_{number:02}", {"K": K.tolist()}, camera_from_lidar)
+        yield FoundSensor(f"image_{number}", {"K": K.tolist()}, camera_from_lidar)
+    for K, camera_from_lidar in [*cameras.values()][:1]:  # of a folder with one camera of any name
+        yield FoundSensor(ANY_CAMERA, {"K": K.tolist()}, camera_from_lidar)
+
+
+def _sustech(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read SUSTechPOINTS: ``extrinsic`` from the LiDAR to the camera, and ``intrinsic``."""
+    if {"extrinsic", "intrinsic"} <= tree.keys() and isinstance(tree["intrinsic"], list):
+        yield FoundSensor(name, {"K": _square(tree["intrinsic"])}, _rigid(tree["extrinsic"]))
+
+
+def _opencalib(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read OpenCalib: ``NAME-intrinsic``, and ``LIDAR-to-CAMERA-extrinsic``."""
+    for key, about in tree.items():
+        param = about.get("param") if isinstance(about, dict) else None
+        if not isinstance(param, dict):
+            continue
+        if key.endswith("-intrinsic") and "cam_K" in param:
+            D = _flat(param.get("cam_dist", {}).get("data", ()))
+            # The tool does not use the size of the image that its files state, and some state a wrong one.
+            yield FoundSensor(
+                about.get("sensor_name") or key.removesuffix("-intrinsic"),
+                {"K": _square(_flat(param["cam_K"]["data"])), **_lens(D, "")},
+            )
+        elif key.endswith("-extrinsic") and "sensor_calib" in param:
+            target = about.get("target_sensor_name") or key.removesuffix("-extrinsic").partition("-to-")[2]
+            yield FoundSensor(target, {}, _rigid(param["sensor_calib"]["data"]))
+
+
+def _camera_info(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read camera matrices as ROS' camera_calibration, OpenCV and Autoware.AI write them."""
+    matrix = next((tree[key] for key in ("camera_matrix", "CameraMat", "K") if key in tree), None)
+    matrix = matrix.get("data") if isinstance(matrix, dict) else matrix
+    if not isinstance(matrix, list) or len(matrix) not in (3, 9):
+        return
+    keys = ("distortion_coefficients", "DistCoeff", "dist_coeffs", "D")
+    distortion: Any = next((tree[key] for key in keys if key in tree), {})
+    D = _flat(distortion.get("data", ()) if isinstance(distortion, dict) else distortion)
+    sides = tree.get("ImageSize") or [tree.get("image_width", 0), tree.get("image_height", 0)]
+    lens = {"K": _square(matrix), "size": sides, **_lens(D, str(tree.get("distortion_model", "")))}
+    extrinsic = tree.get("CameraExtrinsicMat")
+    lidar_from_camera = _rigid(extrinsic["data"]) if isinstance(extrinsic, dict) else None
+    camera_from_lidar = None if lidar_from_camera is None else geometry.inverse(lidar_from_camera)
+    yield FoundSensor(str(tree.get("camera_name") or name), lens, camera_from_lidar)
+
+
+def _kalibr(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read Kalibr's camchain; ``T_cam_lidar`` is an addition of some tools."""
+    previous: F64 | None = None
+    for key, about in tree.items():
+        if not (isinstance(about, dict) and re.fullmatch(r"cam\d+", key)):
+            continue
+        pose = None
+        if "T_cam_lidar" in about:
+            pose = _rigid(about["T_cam_lidar"])
+        elif previous is not None and "T_cn_cnm1" in about:
+            pose = _rigid(about["T_cn_cnm1"]) @ previous
+        previous = pose
+        lens: dict[str, Any] = {}
+        if about.get("camera_model", "pinhole") == "pinhole" and len(about.get("intrinsics", ())) == 4:
+            fx, fy, cx, cy = map(float, about["intrinsics"])
+            D = _flat(about.get("distortion_coeffs", ()))
+            lens = {"K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
+            lens |= {"size": about.get("resolution", [0, 0])}
+            lens |= _lens(D, str(about.get("distortion_model", "")))
+        yield FoundSensor(key, lens, pose)
+
+
+def _autoware(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read Autoware's sensor calibration: x y z roll pitch yaw of each frame in its parent."""
+    edges = {
+        (parent, child): _autoware_pose(pose)
+        for parent, children in tree.items()
+        if isinstance(children, dict)
+        for child, pose in children.items()
+        if isinstance(pose, dict) and {"x", "y", "z", "roll", "pitch", "yaw"} <= pose.keys()
+    }
+    parents = {child: parent for parent, child in edges}
+    for _, child in edges:
+        pose, frame = np.eye(4), child
+        for _ in range(len(edges)):
+            if frame not in parents:
+                break
+            pose, frame = edges[parents[frame], frame] @ pose, parents[frame]
+        if re.search("cam", child, re.IGNORECASE):
+            body = child.endswith("camera_link")
+            pose = pose @ geometry.inverse(OPTICAL_FROM_BODY) if body else pose
+            yield FoundSensor(child.removesuffix("/camera_link"), {}, None, pose)
+        elif re.search("lidar|velodyne|hesai|pandar|ouster|livox|rslidar", child, re.IGNORECASE):
+            yield FoundSensor(child.removesuffix("_base_link"), {}, None, pose, is_lidar=True)
+
+
+def _named_sensors(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read sensors by name, with the translation and the quaternion (w x y z) of nuScenes."""
+    for inner in ("sensors", "calibration", "calibrated_sensors"):
+        tree = tree[inner] if isinstance(tree.get(inner), dict) else tree
+    for key, about in tree.items():
+        if not (isinstance(about, dict) and {"translation", "rotation"} <= about.keys()):
+            continue
+        pose = pose_of(about)
+        intrinsic = about.get("camera_intrinsic") or about.get("intrinsic")
+        lens = {"K": _square(_flat(intrinsic))} if intrinsic else {}
+        if D := _flat(about.get("camera_distortion") or ()):
+            lens |= _lens(D, "")
+        yield FoundSensor(key, lens, None, pose, is_lidar=not intrinsic)
+
+
+PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
+    _sustech,
+    _opencalib,
+    _camera_info,
+    _kalibr,
+    _named_sensors,
+    _autoware,
+)
+
+
+# --- numbers -----------------------------------------------------------------------------------
+
+
+def _flat(values: Any) -> list[float]:
+    """Return the numbers of nested lists."""
+    return [float(value) for value in np.array(values, np.float64).reshape(-1)]
+
+
+def _square(values: Any) -> list[float]:
+    """Return the nine numbers of a camera matrix.
+
+    Raises:
+        ValueError: they are no camera matrix.
+    """
+    numbers = _flat(values)
+    if len(numbers) != 9 or numbers[6:8] != [0, 0] or min(numbers[0], numbers[4]) < MIN_FOCAL:
+        raise ValueError(f"{numbers} is no camera matrix")
+    return numbers
+
+
+def _rigid(values: Any) -> F64:
+    """Return a (4, 4) transform of 12 or 16 numbers.
+
+    Raises:
+        ValueError: they are no rotation and translation.
+    """
+    numbers = _flat(values)
+    if len(numbers) not in (12, 16):
+        raise ValueError(f"{len(numbers)} numbers are no transform")
+    matrix = np.eye(4)
+    matrix[: len(numbers) // 4] = np.reshape(numbers, (-1, 4))
+    u, scale, v = np.linalg.svd(matrix[:3, :3])
+    if np.abs(scale - 1).max() > TOLERANCE or np.linalg.det(u @ v) < 0:
+        raise ValueError("its upper left part is no rotation")
+    matrix[:3, :3] = u @ v
+    return matrix
+
+
+def _autoware_pose(pose: Mapping[str, Any]) -> F64:
+    """Return the (4, 4) transform of x, y, z, roll, pitch and yaw."""
+    matrix = np.eye(4)
+    angles = np.array([[float(pose[name])] for name in ("roll", "pitch", "yaw")])
+    about_x, about_y, about_z = (geometry.rotations(axis, angle)[0] for axis, angle in enumerate(angles))
+    matrix[:3, :3] = about_z @ about_y @ about_x
+    matrix[:3, 3] = [float(pose[name]) for name in "xyz"]
+    return matrix
+
+
+def _lens(D: Sequence[float], model: str) -> dict[str, Any]:
+    """Return the distortion as ``calibration.yaml`` states it; nothing for an ideal lens."""
+    if not any(D):
+        return {}
+    known = LENSES.get(model, model) or ("plumb_bob" if len(D) <= 5 else "rational_polynomial")
+    return {"D": list(D), "distortion_model": known}
