@@ -173,9 +173,9 @@ def test_common_stages_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     runs: list[int] = []
     infer = detector.Detector.infer
 
-    def counted(self: detector.Detector, bgr: Any) -> Any:
+    def counted(self: detector.Detector, bgr: Any, least: float) -> Any:
         runs.append(id(bgr))
-        return infer(self, bgr)
+        return infer(self, bgr, least)
 
     monkeypatch.setattr(detector.Detector, "infer", counted)
     variants = Variants()

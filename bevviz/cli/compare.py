@@ -10,6 +10,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_jobs,
     add_output,
     add_selection,
     add_truth,
@@ -46,6 +47,7 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(compare)
     add_selection(group)
+    add_jobs(group)
     add_config(compare)
     sides = compare.add_argument_group("the two sides", "What --set, --config and --preset say is for both.")
     for side in "ab":
@@ -121,6 +123,7 @@ def _run(
     from bevviz.compare.sides import ComparisonRecorder, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
+    from bevviz.pipeline.frame_workers import working_ahead
 
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
 
@@ -134,14 +137,9 @@ def _run(
             say(f"{summary.without} frames for which the robot published nothing are left out")
         _report(summary, options)
 
-    return run_logged(
-        source,
-        processor,
-        config,
-        Outputs.of(options).or_file(_default(options)),
-        observers,
-        finish,
-    )
+    outputs = Outputs.of(options).or_file(_default(options))
+    with working_ahead(processor, source, configs, options.jobs) as ahead:
+        return run_logged(source, ahead, config, outputs, observers, finish)
 
 
 def _saved(options: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_jobs,
     add_keep,
     add_limits,
     add_output,
@@ -24,10 +25,12 @@ from bevviz.errors import UserError
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
+    from bevviz.bags.source import BagSource
     from bevviz.config import Config
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.metrics import Limit
-    from bevviz.model.protocols import FrameSource, Observer
+    from bevviz.model.json_forms import EvaluateForm, LimitForm
+    from bevviz.model.protocols import Observer
     from bevviz.model.results import FrameResult
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
@@ -51,6 +54,7 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(evaluate)
     add_selection(group)
+    add_jobs(group)
     add_truth(evaluate)
     add_limits(evaluate)
     add_config(evaluate)
@@ -71,23 +75,30 @@ def _evaluate(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as frames:
         evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels), false_causes)
-        status = _run(frames, config, evaluation, Outputs.of(options), table=not json_on_stdout(options))
+        of_ground = any(limit.metric.startswith(("ground", "object_points")) for limit in limits)
+        if not (config.detector.model or config.objects.method != "frustum" or of_ground):
+            raise UserError(
+                "without a detector no object has a class, and all would be missed: give --model FILE.onnx, "
+                "or another objects.method; --min ground_iou=0.9 needs none"
+            )
+        status = _run(frames, config, evaluation, options)
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
         return _report(evaluation, limits, options) or status
 
 
-def _run(
-    frames: FrameSource, config: Config, evaluation: Evaluation, outputs: Outputs, *, table: bool
-) -> int:
+def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: argparse.Namespace) -> int:
     """Run the pipeline with the evaluation and return the exit status."""
     from bevviz.anomalies import FailureSummary
+    from bevviz.pipeline.frame_workers import working_ahead
     from bevviz.pipeline.session import Session
 
-    session, failures = Session(config), FailureSummary()
+    session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
+    ahead = working_ahead(session, frames, [config], options.jobs)
     if not outputs:
         print_hints(frames.scene, config)
-        end = run_with_progress(frames, session, [evaluation, failures])
+        with ahead as processor:
+            end = run_with_progress(frames, processor, [evaluation, failures])
         warn([*frames.warnings, *failures.warnings])
         return table_status(end)
     from bevviz.evaluate.log import EvaluationRecorder
@@ -104,25 +115,28 @@ def _run(
 
     def finish() -> None:
         warn(failures.warnings)
-        if table:
+        if not json_on_stdout(options):
             print(evaluation.table(), flush=True)
 
-    return run_logged(frames, session, config, outputs, observers, finish)
+    with ahead as processor:
+        return run_logged(frames, processor, config, outputs, observers, finish)
 
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
     """Print and write the results. Return the exit status of the gate: 1 if a limit is not kept, else 0."""
+    from bevviz.bags.remote import beside
     from bevviz.evaluate.metrics import check, write_junit
 
     if not Outputs.of(options) and not json_on_stdout(options):
         print(evaluation.table())
     results = check(limits, evaluation.metrics)
-    gate = [
+    gate: list[LimitForm] = [
         {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
     ]
-    write_json(options, "evaluate", {**evaluation.as_tree(), "limits": gate})
+    tree: EvaluateForm = {**evaluation.as_tree(), "limits": gate}
+    write_json(options, "evaluate", tree)
     if options.junit is not None:
-        write_junit(options.junit, {options.paths[0].resolve().stem: results})
+        write_junit(options.junit, {beside(options.paths[0]).stem: results})
     for result in results:
         if result.reason:
             say(f"not kept: {result.reason}", always=True)

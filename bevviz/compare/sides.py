@@ -70,7 +70,7 @@ class ComparedSessions:
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         """Run the stages of both configurations on a frame."""
         a, b = self._sessions.perceive(frame, network)
-        return ComparedFrame(frame, a, b)
+        return ComparedFrame(a.frame, a, b)
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         """Finish the results of both sides in frame order, and compare them."""
@@ -88,7 +88,8 @@ class ComparedRobot:
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         """Run the stages on a frame."""
-        return ComparedFrame(frame, self._session.perceive(frame, network), None)
+        result = self._session.perceive(frame, network)
+        return ComparedFrame(result.frame, result, None)
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         """Finish the result in frame order, and compare it with the robot's."""

@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from bevviz.compare.differences import (
     TruthComparison,
 )
 from bevviz.config import ParameterChange
+from bevviz.model.json_forms import ComparedFrameForm, CompareForm, JudgedForm, ObjectDifferenceForm
 from bevviz.model.protocols import Observer
 from bevviz.support import table
 from bevviz.support.files import save_text
@@ -50,7 +51,7 @@ class ComparisonSummary(Observer[FrameComparison]):
     def __init__(self, names: tuple[str, str], config: Mapping[str, ParameterChange]) -> None:
         self.names, self.config = names, {key: str(change) for key, change in config.items()}
         self.without = 0  # frames for which a side has no result
-        self.frames: list[dict[str, Any]] = []
+        self.frames: list[ComparedFrameForm] = []
         self._classes: dict[str, Counter[str]] = defaultdict(Counter)
         self._detections: dict[str, Counter[str]] = defaultdict(Counter)
         self._clusters: Counter[str] = Counter()
@@ -129,17 +130,17 @@ class ComparisonSummary(Observer[FrameComparison]):
                 self._judged[judged.labels[row].lower()][outcome] += 1
 
     @property
-    def truth(self) -> Mapping[str, Any] | None:
+    def truth(self) -> JudgedForm | None:
         """Labelled objects that each side finds, by class, and the number of false ones. None: no truth."""
         if not self._judged:
             return None
         wrong = {
             side: sum(n for name, n in w.items() if name in self._names) for side, w in self._wrong.items()
         }
-        return {"classes": self._judged, "wrong": wrong}
+        return {"classes": self._judged, "wrong": {"A": wrong["A"], "B": wrong["B"]}}
 
     @property
-    def worst(self) -> Sequence[Mapping[str, Any]]:
+    def worst(self) -> Sequence[ComparedFrameForm]:
         """Frames that differ. Frames in which B loses an object come first, then those with most changes."""
         return sorted(
             (f for f in self.frames if f["number"]),
@@ -212,7 +213,7 @@ class ComparisonSummary(Observer[FrameComparison]):
         objects = "no object differs" if self._detected else "no detector (--model FILE.onnx), so no objects"
         return f"{objects}; the number of clusters differs in {self._other_clusters} of {frames}"
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> CompareForm:
         """Return the counts and every difference for JSON."""
         return {
             "a": self.names[0],
@@ -265,7 +266,7 @@ def _rows(counts: Mapping[str, Counter[str]], which: Sequence[str] = COLUMNS) ->
     yield ("all", *(str(total[column]) for column in which))
 
 
-def _row(difference: Difference, differences: FrameDifferences) -> dict[str, Any]:
+def _row(difference: Difference, differences: FrameDifferences) -> ObjectDifferenceForm:
     side, row = differences.side_with(difference)
     x, y, z = (round(v, 3) for v in side.boxes.center[row].tolist())
     pair = difference.row_a >= 0 and difference.row_b >= 0

@@ -9,6 +9,7 @@ import numpy as np
 
 from bevviz.config import OpinionsConfig
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I32, I64, Bool, Boxes3D
 from bevviz.model.results import (
@@ -152,7 +153,7 @@ def _cluster_shares(boxes: Boxes3D, points: F32 | None, clusters: Clusters | Non
     rows = np.flatnonzero(column_of_point >= 0)
     points, column_of_point = points[rows], column_of_point[rows]
     wide = Boxes3D(boxes.center, boxes.size + np.float32(2 * MARGIN), boxes.yaw)
-    for k, inside in geometry.inside_each(points, wide):
+    for k, inside in inside_each(points, wide):
         share[k] = np.bincount(column_of_point[inside], minlength=len(named))
     whole: F32 = np.maximum(np.bincount(column_of_point, minlength=len(named)), 1).astype(np.float32)
     return share / whole

@@ -8,6 +8,7 @@ import numpy as np
 
 from bevviz.errors import StageError
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.frame import (
     F32,
     Bool,
@@ -60,8 +61,7 @@ def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
     labels = np.full(len(points), -1, np.int32)
     nearest = np.full(len(points), np.inf, np.float32)
     centroid = boxes.center.astype(np.float32)
-    for k in range(len(boxes)):
-        inside = np.flatnonzero(geometry.inside(points, boxes, k))
+    for k, inside in inside_each(points, boxes):
         away = np.linalg.norm(points[inside] - boxes.center[k], axis=1)
         nearer = inside[away < nearest[inside]]
         labels[nearer], nearest[nearer] = k, away[away < nearest[inside]]

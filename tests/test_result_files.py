@@ -1,0 +1,133 @@
+"""Results of detectors in files, as boxes of a drive's frames."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+import bevviz
+from bevviz.cli import main
+from bevviz.config import load
+from bevviz.model.results import FrameResult, Objects
+from bevviz.report.facts import shareable
+from tests.support import datasets
+
+LABEL = "Car 0.00 0 0.0 {left} 5 70 30 1.5 1.6 4.0 0.0 1.7 {ahead} -1.57 {score}\n"
+
+
+def open_with(path: Path, stage: str, file: Path, **more: str) -> bevviz.Drive:
+    settings = {"source.results": {"mine": str(file)}, stage: "topic:/results/mine"}
+    return bevviz.open(path, set={**settings, **more})
+
+
+def objects_of(result: FrameResult) -> Objects:
+    assert result.objects is not None and result.failures == ()
+    return result.objects
+
+
+def test_kitti_results_rank_by_their_16th_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The labels themselves, and a wrong box that is surer of itself or less."""
+    drive = datasets.kitti_object(tmp_path / "training")
+    precision = {}
+    for score in ("0.95", "0.10"):
+        folder = tmp_path / f"surer_{score[2:]}"
+        folder.mkdir()
+        for label in sorted((drive / "label_2").glob("*.txt")):
+            label.write_text(
+                label.read_text().replace("14.00 70.00 28.00", "4.00 70.00 36.00")
+            )  # 25 pixels count
+            rows = [line for line in label.read_text().splitlines() if not line.startswith("DontCare")]
+            wrong = LABEL.format(left=60, ahead=30, score=score)
+            (folder / label.name).write_text("".join(f"{row} 0.5\n" for row in rows) + wrong)
+        assert main(["evaluate", str(drive), "--results", str(folder), "--json"]) == 0
+        metrics = json.loads(capsys.readouterr().out)["metrics"]
+        precision[score] = {name: value for name, value in metrics.items() if name.startswith("ap_3d_0.5")}
+        assert metrics["recall.car"] == 1
+    assert precision["0.95"] and precision["0.95"] != precision["0.10"]
+    assert all(value <= precision["0.10"][name] for name, value in precision["0.95"].items())
+    objects = objects_of(open_with(drive, "objects.method", tmp_path / "surer_10").at(frame=1))
+    assert objects.names == ("Car", "Car") and objects.score.tolist() == pytest.approx([0.5, 0.1])
+
+
+def test_results_of_nuscenes_are_those_of_their_samples(tmp_path: Path) -> None:
+    root = datasets.nuscenes(tmp_path / "nuscenes")
+    rows = json.loads((root / "v1.0-mini" / "sample_annotation.json").read_text())
+    results: dict[str, list[dict[str, object]]] = {}
+    for row in rows:
+        box = {key: row[key] for key in ("sample_token", "translation", "size", "rotation")}
+        results.setdefault(row["sample_token"], []).append(
+            {**box, "velocity": [0, 0], "detection_name": "car", "detection_score": 0.7, "attribute_name": ""}
+        )
+    file = tmp_path / "results_nusc.json"
+    file.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results}))
+    drive = open_with(root, "objects.method", file, **{"source.sequence": "scene-0061"})
+    frame = next(frame for n in range(len(drive)) if (frame := drive.raw(n)).truth is not None)
+    (labelled,) = frame.robot_boxes
+    assert frame.truth is not None and labelled.world_from_boxes is not None
+    np.testing.assert_allclose(labelled.boxes.center[0], frame.truth.boxes.center[0])
+    np.testing.assert_allclose(labelled.boxes.size[0], frame.truth.boxes.size[0])
+    assert labelled.boxes.yaw[0] == pytest.approx(frame.truth.boxes.yaw[0])
+    assert set(labelled.scores.tolist()) == {np.float32(0.7)}
+
+
+def test_results_of_coco_are_detections(tmp_path: Path) -> None:
+    drive = datasets.kitti_object(tmp_path / "training")
+    file = tmp_path / "coco.json"
+    file.write_text(json.dumps([{"image_id": 1, "category_id": 3, "bbox": [10, 5, 40, 20], "score": 0.8}]))
+    detections = open_with(drive, "detector.model", file).at(frame=1).cameras[0].detections
+    assert detections is not None and detections.names == ("car",)
+    assert detections.xyxy.tolist() == [[10, 5, 50, 25]] and detections.score[0] == np.float32(0.8)
+    whole = {
+        "images": [{"id": 77, "file_name": "image_2/000002.png"}],
+        "categories": [{"id": 9, "name": "van"}],
+        "annotations": [{"image_id": 77, "category_id": 9, "bbox": [1, 2, 3, 4]}],
+    }
+    file.write_text(json.dumps(whole))
+    detections = open_with(drive, "detector.model", file).at(frame=2).cameras[0].detections
+    assert detections is not None and detections.names == ("van",)
+    assert main(["why", str(drive), "--results", f"net={file}", "--at-frame", "2"]) == 0
+
+
+def test_a_table_of_our_own_objects_comes_back(tmp_path: Path) -> None:
+    with bevviz.simulate(frames=3) as source:
+        made = objects_of(source.at(frame=1))
+    table = made.to_arrow().append_column("frame", pa.array([1] * len(made)))
+    parquet.write_table(table, tmp_path / "boxes.parquet")
+    drive = datasets.kitti_object(tmp_path / "training")
+    objects = objects_of(open_with(drive, "objects.method", tmp_path / "boxes.parquet").at(frame=1))
+    assert objects.names == made.names
+    np.testing.assert_allclose(objects.boxes.center, made.boxes.center)
+    np.testing.assert_allclose(objects.boxes.yaw, made.boxes.yaw)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("gone.json", None, "no such file or folder; expected a folder of KITTI"),
+        ("boxes.json", "{", "is no JSON"),
+        ("boxes.json", "[1]", "neither results of nuScenes nor of COCO"),
+        ("boxes.json", '{"results": {"a": []}}', "are of nuScenes' samples, which the drive lacks"),
+        ("boxes.json", '[{"image_id": 99, "bbox": [0, 0, 1, 1]}]', "is of one of the 3 frames"),
+        ("boxes.csv", "frame,name\n1,car\n", "its columns are frame, name; expected"),
+        ("boxes.parquet", "no table", "cannot be read as a table"),
+        ("boxes.xyz", "", "is not read; expected"),
+    ],
+)
+def test_unusable_result_files_are_one_line(
+    tmp_path: Path, name: str, text: str | None, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = datasets.kitti_object(tmp_path / "training")
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert main(["info", str(drive), "--results", str(tmp_path / name)]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_report_names_result_files_without_their_folder() -> None:
+    config = load(settings=['source.results={"mine": "/home/me/preds/boxes.json"}'])
+    assert shareable(config).source.results == {"mine": "boxes.json"}
