@@ -80,6 +80,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.config.project import read_project_layers
     from bevviz.config.trust import Trust
     from bevviz.drive import Drive
+    from bevviz.evaluate.marks import MarkRecorder
     from bevviz.recording import blueprints
     from bevviz.recording.recorder import Recorder
     from bevviz.recording.source_lookup import Origin
@@ -91,13 +92,14 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     with BagSource([path], config) as source:
         drive = Drive(source, config)
         print_hints(drive.scene, config)
-        recording = rr.RecordingStream(application_id or "bevviz", recording_id=recording_id)
+        application_id = application_id or blueprints.application_id("debug", drive.scene, config)
+        recording = rr.RecordingStream(application_id, recording_id=recording_id)
         recording.set_log_time_enabled(False)
         recording.stdout(default_blueprint=blueprints.load("debug", drive.scene, config))
         origin = Origin.of(drive.scene, config, None)
         if origin is not None:
             origin.log(recording)
-        drive.run([Recorder(recording, config)])
+        drive.run([Recorder(recording, config), MarkRecorder(recording)])
         recording.flush()
         recording.disconnect()
         warn(drive.warnings)

@@ -56,6 +56,10 @@ class FolderExport(Observer[FrameResult]):
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
         """Return the folders to create for a drive with these cameras."""
 
+    def _takes(self, camera: str) -> bool:
+        """Return whether a camera is written."""
+        return self._camera in ("", camera)
+
     def _skip(self, why: str) -> None:
         self.skipped[why] = self.skipped.get(why, 0) + 1
 

@@ -41,7 +41,7 @@ class KittiExport(FolderExport):
     def observe(self, result: FrameResult) -> None:
         """Write a frame, or count why it is skipped."""
         frame = result.frame
-        camera = next((c for c in frame.cameras if self._camera in ("", c.name)), None)
+        camera = next((c for c in frame.cameras if self._takes(c.name)), None)
         if camera is None or camera.image is None or camera.intrinsics is None:
             self._skip("no image, or no CameraInfo")
         elif camera.camera_from_points is None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from bevviz.export.folder import FolderExport, rectify
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, F64, Camera, Frame
 from bevviz.model.protocols import Items
 from bevviz.model.results import FrameResult, Objects, Tracks
@@ -77,7 +78,7 @@ class NuScenesExport(FolderExport):
             self._tables["visibility"].append({"token": token, "level": level, "description": ""})
 
     def _folders(self, cameras: Sequence[str]) -> Sequence[str]:
-        channels = [self._channel(name) for name in cameras if self._camera in ("", name)]
+        channels = [self._channel(name) for name in cameras if self._takes(name)]
         return VERSION, "maps", "sweeps", *(f"samples/{name}" for name in (LIDAR, *channels))
 
     def _channel(self, camera: str) -> str:
@@ -102,7 +103,7 @@ class NuScenesExport(FolderExport):
             mounted = self._calibrated(LIDAR, "lidar", np.eye(4), [])
             self._data(LIDAR, sample["token"], mounted, frame.stamp, frame.pose, name, "pcd", (0, 0))
             for camera in frame.cameras:
-                if self._camera in ("", camera.name):
+                if self._takes(camera.name):
                     self._write_camera(frame, camera, sample["token"])
         if result.objects is not None:
             self._annotate(frame, sample["token"], result.objects, result.tracks)
@@ -187,6 +188,7 @@ class NuScenesExport(FolderExport):
         if tracks is not None:
             track_of = {int(row): int(number) for number, row in zip(tracks.id, tracks.object, strict=True)}
         boxes = objects.boxes
+        hits = {row: len(rows) for row, rows in inside_each(frame.points, boxes)}
         for row, name in enumerate(objects.names):
             key = f"track {track_of[row]}" if row in track_of else f"object {self.frames} {row}"
             category = CATEGORIES.get(name.lower(), f"other.{name}")
@@ -205,7 +207,7 @@ class NuScenesExport(FolderExport):
                 attribute_tokens=[],
                 **_pose_fields(frame.pose @ turned),
                 size=[float(side) for side in _width_first(boxes.size[row])],
-                num_lidar_pts=int(geometry.inside(frame.points, boxes, row).sum()),
+                num_lidar_pts=hits[row],
                 num_radar_pts=0,
                 score=float(objects.score[row]),
             )
