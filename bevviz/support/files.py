@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import os
 import random
 import re
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
@@ -441,3 +443,18 @@ def sampled_files(folder: Path) -> tuple[int, list[Path]]:
         count += len(names)
         chosen += [Path(parent, names[i]) for i in sorted({0, len(names) // 2, len(names) - 1}) if names]
     return count, [file for file in chosen if file.is_file()]
+
+
+# --- hashes ------------------------------------------------------------------------------------
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's content in hexadecimal. The file is read again only if it changed."""
+    stat = path.stat()
+    return _hash(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache
+def _hash(path: Path, size: int, mtime: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -36,6 +38,14 @@ def say(text: str) -> None:
 def bar(*args: Any, **options: Any) -> Any:
     """Return ``tqdm.tqdm`` of the same arguments. It shows nothing outside a terminal."""
     return _bar()(*args, **options, disable=None if _bars else True)
+
+
+def cleared() -> AbstractContextManager[object]:
+    """Return a context in which no progress bar is on the terminal, for a line on stderr."""
+    if not _bar.cache_info().currsize:
+        return nullcontext()
+    context: AbstractContextManager[object] = _bar().external_write_mode(sys.stderr)
+    return context
 
 
 @cache
