@@ -127,8 +127,7 @@ def test_dead_workers_and_bad_bags_cost_nothing_else(batch: Batch) -> None:
     assert "bad: " in batch.said and "not a bag" in batch.said
     assert "3 bags complete, 1 failed" in batch.said
     assert {path.name for path in batch.folder.iterdir()} == {
-        "summary.html",
-        "summary.parquet",
+        *("summary.html", "summary.parquet", "findings.parquet"),
         *(f"{name}.{kind}" for name in GOOD for kind in ("rrd", "parquet")),
     }
     for name in GOOD:
@@ -182,7 +181,7 @@ def test_an_interrupted_batch_can_be_continued(tmp_path: Path, capsys: pytest.Ca
     assert status == 130
     assert "1 bags are complete" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {
-        *("short.rrd", "short.parquet", "summary.html", "summary.parquet")
+        *("short.rrd", "short.parquet", "summary.html", "summary.parquet", "findings.parquet")
     }
     before = (tmp_path / "runs/short.rrd").stat()
     assert main([*arguments, "--every", "2"]) == 0
@@ -228,7 +227,7 @@ def test_death_of_a_dask_worker_loses_and_repeats_no_bag(
     assert killed and {name for name, jobs in begun.items() if len(jobs) > 1} <= {"b"}
     assert begun.keys() <= scans.keys() and "b" in begun
     assert "bevviz: bad: " in said and "5 bags complete, 1 failed" in said
-    tables = {name: len(versions) for name, versions in written.items() if "summary" not in name}
+    tables = {name: len(versions) for name, versions in written.items() if name in scans}
     assert tables == dict.fromkeys(scans, 1)
     rows = pq.read_table(folder / "summary.parquet", columns=["recording", "frame"]).to_pylist()
     assert sorted((r["recording"], r["frame"]) for r in rows) == [
@@ -268,6 +267,23 @@ def test_the_summary_agrees_with_a_direct_run(batch: Batch, model: str) -> None:
     assert found[0]["matched"] > 0 and "person" in found[0]["unmatched"]
 
 
+def test_findings_hold_each_object_and_detection(batch: Batch) -> None:
+    findings = pq.read_table(batch.folder / "findings.parquet").drop_columns("stamp").to_pylist()
+    summary = pq.read_table(batch.folder / "summary.parquet").drop_columns("stamp").to_pylist()
+    assert {(f["recording"], f["frame"]) for f in findings} == {(r["recording"], r["frame"]) for r in summary}
+    for frame in summary:
+        mine = [f for f in findings if (f["recording"], f["frame"]) == (frame["recording"], frame["frame"])]
+        outcomes = Counter(f["outcome"] for f in mine)
+        assert outcomes["found"] == frame["objects"]
+        # Of several boxes around one object, one is a finding.
+        assert outcomes["unexplained"] <= len(frame["unmatched"])
+        assert outcomes["anomaly"] == frame["anomalies"] and outcomes["quiet"] == (not frame["anomalies"])
+        assert {f["scan_points"] for f in mine} == {float(frame["points"])}
+    lost = [f for f in findings if f["outcome"] == "unexplained"]
+    assert lost and all(f["reason"] and f["text"] and f["camera"] for f in lost)
+    assert all(0 <= f["u"] <= 1 and 0 <= f["v"] <= 1 for f in lost)
+
+
 def test_badness_weighs_the_findings_of_a_frame(batch: Batch) -> None:
     config = Config()
     with BagSource([batch.root / "bags/one/drive"], config) as source:
@@ -290,7 +306,7 @@ def test_badness_weighs_the_findings_of_a_frame(batch: Batch) -> None:
 def test_the_page_needs_no_other_files(batch: Batch) -> None:
     text = (batch.folder / "summary.html").read_text()
     page = Page(text)
-    assert not {"script", "link", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
+    assert not {"link", "iframe", "b>", "object"} & {tag for tag, _ in page.tags}
     assert not [attrs for _, attrs in page.tags if {"href", "onclick"} & set(attrs)]
     sources = [tag["src"] for _, tag in page.tags if tag.get("src")]
     assert all(str(source).startswith("data:image/jpeg;base64,") for source in sources)
@@ -305,6 +321,8 @@ def test_the_page_needs_no_other_files(batch: Batch) -> None:
 
 def test_the_worst_frames_have_pictures(batch: Batch) -> None:
     for path in batch.folder.glob("*.parquet"):
+        if path.stem == "findings":
+            continue
         rows = sorted(pq.read_table(path).to_pylist(), key=lambda row: -row["badness"])
         pictured = [row for row in rows if row["above"] is not None]
         if path.stem == "summary" or not pictured:
@@ -334,6 +352,7 @@ def test_frames_are_counted_by_their_worst_finding(batch: Batch) -> None:
     nothing: dict[str, Any] = dict.fromkeys(("failures", "problems", "missed", "false", "anomalies"), 0)
     nothing["unmatched"] = []
     assert severity(nothing) == "well"
+    assert severity({**nothing, "missed": None, "false": None}) == "unjudged"
     assert severity({**nothing, "unmatched": ["car"]}) == "unmatched"
     assert severity({**nothing, "unmatched": ["car"], "anomalies": 1, "false": None}) == "strange"
     assert severity({**nothing, "anomalies": 1, "missed": 2}) == "wrong"
@@ -341,10 +360,10 @@ def test_frames_are_counted_by_their_worst_finding(batch: Batch) -> None:
     assert severity({**nothing, "problems": 1, "failures": 1}) == "failed"
     shown = re.findall(r'^<tr class="(\w+)">$', text, re.MULTILINE)
     assert shown == [severity(row) for row in frames[: len(shown)]]
-    assert {f"only-{kind}" for kind in SEVERITIES if kind != "well"} == set(
+    assert {f"only-{kind}" for kind in SEVERITIES if kind not in ("well", "unjudged")} == set(
         re.findall(r'id="(only-\w+)"', text)
     )
-    assert all(f"#only-{kind}:checked" in text for kind in SEVERITIES if kind != "well")
+    assert all(f"#only-{kind}:checked" in text for kind in SEVERITIES if kind not in ("well", "unjudged"))
 
 
 # --- the catalog -------------------------------------------------------------------------------

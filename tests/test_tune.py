@@ -92,9 +92,9 @@ def test_each_save_is_a_new_version(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     inferred: list[int] = []
     infer = detector.Detector.infer
 
-    def counted(self: detector.Detector, bgr: Any) -> Any:
+    def counted(self: detector.Detector, bgr: Any, least: float) -> Any:
         inferred.append(1)
-        return infer(self, bgr)
+        return infer(self, bgr, least)
 
     monkeypatch.setattr(detector.Detector, "infer", counted)
     with Tuned(tmp_path) as tuned:

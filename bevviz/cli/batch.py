@@ -78,7 +78,9 @@ def add(commands: Commands) -> None:
         help="start one here (default: 51234), and a web viewer; until Ctrl-C",
     )
     add_bind(results, "--serve-catalog")
-    results.add_argument("--dataset", metavar="NAME", help="in the catalog (default: name of DIR)")
+    results.add_argument(
+        "--catalog-name", metavar="NAME", help="of the data set in the catalog (default: name of DIR)"
+    )
     truth = batch.add_argument_group("ground truth")
     truth.add_argument(
         "--truth",
@@ -198,7 +200,8 @@ def _execute(
             from bevviz.fleet.processes import Processes
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-            engine = stack.enter_context(Processes(min(workers, len(todo))))
+            count = min(workers, len(todo))
+            engine = stack.enter_context(Processes(count, workers // count))
         yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
 
 
@@ -225,7 +228,7 @@ def _sum_up(
         if url:
             from bevviz.fleet.catalog import register
 
-            dataset = options.dataset or folder.resolve().name
+            dataset = options.catalog_name or folder.resolve().name
             link = register(url, dataset, recordings, options.blueprint)
             say(f"{len(complete)} recordings in dataset '{dataset}' at {url}")
         page = write_summary(folder, complete, failed, options.top, link, viewer)

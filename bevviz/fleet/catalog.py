@@ -19,7 +19,6 @@ from bevviz.recording.ports import (
     host_for,
     own_address,
 )
-from bevviz.recording.sinks import APPLICATION
 
 TIMEOUT = 600  # seconds
 
@@ -58,7 +57,9 @@ def register(url: str, name: str, results: Sequence[tuple[Path, RunInfo]], bluep
             if dataset.default_blueprint() is None:
                 with TemporaryDirectory() as folder:
                     layout = Path(folder) / "layout.rbl"
-                    blueprints.load(blueprint, results[0][1].scene).save(APPLICATION, str(layout))
+                    scene = results[0][1].scene
+                    application = blueprints.application_id(blueprint, scene)
+                    blueprints.load(blueprint, scene).save(application, str(layout))
                     dataset.register_blueprint(layout.as_uri())
     except RerunMissingDependencyError:
         raise UserError("a catalog needs more packages: pip install 'bevviz[catalog]'") from None

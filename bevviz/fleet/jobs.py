@@ -21,10 +21,10 @@ from bevviz.bags.source import FrameSelection
 from bevviz.config import Config, with_object_files
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
-from bevviz.fleet.table import NAME, RunInfo, find_damage, read_info
-from bevviz.recording.provenance import dependencies_of, file_hash, model_path
+from bevviz.fleet.table import RESERVED, RunInfo, find_damage, read_info
+from bevviz.recording.provenance import dependencies_of, model_path
 from bevviz.support import cleanup, progress
-from bevviz.support.files import bag_files, sampled_files
+from bevviz.support.files import bag_files, file_hash, sampled_files
 from bevviz.support.text import path_text
 
 T = TypeVar("T")
@@ -69,7 +69,7 @@ class Job:
                 for file in _files(self.bag)
             ],
             "selection": asdict(self.selection),
-            "config": self.config.model_dump(mode="json", exclude={"live": True, **files}),
+            "config": self.config.model_dump(mode="json", exclude={"live": True, "store": True, **files}),
             "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
             "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
         }
@@ -198,7 +198,7 @@ def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str
         owners: bag -> name of its existing results.
     """
     names = {bag: owners[path_text(bag)] for bag in bags if path_text(bag) in owners}
-    taken = {NAME, *owners.values()}
+    taken = {*RESERVED, *owners.values()}
     unnamed = [bag for bag in bags if bag not in names]
     deepest = max((len(bag.parts) for bag in unnamed), default=0)
     for depth in range(1, deepest + 1):
@@ -276,7 +276,7 @@ def intact_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path
     """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
     results: list[tuple[Path, RunInfo]] = []
     unchecked = 0
-    for table in _with_bar([path for path in sorted(folder.glob("*.parquet")) if path.stem != NAME]):
+    for table in _with_bar([path for path in sorted(folder.glob("*.parquet")) if path.stem not in RESERVED]):
         info = read_info(table)
         if damage := find_damage(table, table.with_suffix(".rrd")):
             warn(f"{table.stem}: {damage}; it is left out until its bag is run again")

@@ -6,12 +6,9 @@ import os
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
 
 import cv2
 
@@ -19,20 +16,18 @@ from bevviz.fleet.jobs import Job, JobResult, JobResults
 from bevviz.fleet.work import run
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
+from bevviz.support.worker_processes import WorkerProcess, start_worker
 
 # concurrent.futures does not fit: a worker that dies breaks the pool and all its jobs.
 
-SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 TICK = 0.2  # seconds
 _FRAME = "frame"  # message of a worker after each frame
 
 
 @dataclass
-class _Worker:
-    """Worker process with its pipe and its job."""
+class _Worker(WorkerProcess):
+    """Worker process and its job."""
 
-    process: SpawnProcess
-    pipe: Connection
     job: Job | None = None
 
 
@@ -41,11 +36,12 @@ class Processes(Closable):
 
     Args:
         count: number of processes that run at the same time.
+        helpers: number of processes beside each that run the networks ahead. 1: none.
     """
 
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._threads = max(1, (os.cpu_count() or 1) // max(count, 1))
+    def __init__(self, count: int, helpers: int = 1) -> None:
+        self.count, self._helpers = count, helpers
+        self._threads = max(1, (os.cpu_count() or 1) // max(count * helpers, 1))
         self._idle: list[_Worker] = []
         try:
             while len(self._idle) < count:
@@ -57,7 +53,7 @@ class Processes(Closable):
     def close(self) -> None:
         """End the idle processes."""
         while self._idle:
-            _end(self._idle.pop())
+            self._idle.pop().end()
 
     def run(
         self,
@@ -101,7 +97,7 @@ class Processes(Closable):
                     busy.remove(worker)
                     ended_job = worker.job
                     assert ended_job is not None
-                    retry, result = _judge(worker.process, ended_job, message)
+                    retry, result = _judge(worker, ended_job, message)
                     retry = retry and attempts[ended_job.name] < retries
                     if retry:
                         attempts[ended_job.name] += 1
@@ -109,34 +105,27 @@ class Processes(Closable):
                     if (job := next_job()) is not None:
                         busy.append(self._assign(worker, job))
                     else:
-                        _end(worker)
+                        worker.end()
                     if not retry:
                         yield result
         finally:
             for worker in busy:
                 worker.process.kill()
             for worker in busy:
-                _end(worker)
+                worker.end()
             self.close()
 
     def _start(self, *, speaks: bool = False) -> _Worker:
-        context = get_context("spawn")  # A fork would copy threads of Rerun and onnxruntime amid their work.
-        ours, theirs = context.Pipe()
-        arguments = (theirs, self._threads, speaks)
-        # A worker looks for Python's own modules first, not for files of the working directory. OpenBLAS and
-        # Open3D read the number of threads when they are loaded.
-        variables = {"PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": str(self._threads)}
-        process = context.Process(target=_work, args=arguments, name="bevviz batch", daemon=True)
-        # The worker inherits the signal mask: the batch alone handles signals of the terminal and ends its
-        # workers. The batch must not be interrupted between the start of a worker and its storage.
-        previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
-            with _environment(variables):
-                process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
-        theirs.close()  # Without this, the pipe would not report the end of the process.
-        return _Worker(process, ours)
+        started = start_worker(
+            _work,
+            self._threads,
+            speaks,
+            self._helpers,
+            name="bevviz batch",
+            threads=self._threads,
+            daemon=self._helpers == 1,
+        )
+        return _Worker(started.process, started.pipe)
 
     def _assign(self, worker: _Worker, job: Job) -> _Worker:
         """Send a job to a worker. If its process has ended, send it to a new one."""
@@ -147,48 +136,20 @@ class Processes(Closable):
                 pass
             else:
                 return _Worker(worker.process, worker.pipe, job)
-        _end(worker)
+        worker.end()
         fresh = self._start()
         fresh.pipe.send(job)
         return _Worker(fresh.process, fresh.pipe, job)
 
 
-@contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for the processes that start meanwhile."""
-    previous = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in previous.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _judge(process: SpawnProcess, job: Job, message: JobResult | str | None) -> tuple[bool, JobResult]:
+def _judge(worker: _Worker, job: Job, message: JobResult | str | None) -> tuple[bool, JobResult]:
     """Return whether to try a job again, and how it ended."""
     if isinstance(message, JobResult):
         return False, message
-    if message is not None:
-        return True, JobResult(job.name, error=message)
-    process.join()
-    code = process.exitcode or 0
-    reason = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
-    hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    return True, JobResult(job.name, error=f"its process ended {reason}{hint}")
+    return True, JobResult(job.name, error=message or f"its process ended {worker.reason()}")
 
 
-def _end(worker: _Worker) -> None:
-    """End a worker at once. Its result is complete, or not needed."""
-    worker.pipe.close()
-    worker.process.kill()
-    worker.process.join()
-
-
-def _work(pipe: Connection, threads: int, speaks: bool) -> None:
+def _work(pipe: Connection, threads: int, speaks: bool, helpers: int) -> None:
     """Run jobs in the worker process until the other end of the pipe is closed."""
     # Workers compile the stages at the same time. Only one of them reports it.
     progress.set_receiver(
@@ -202,7 +163,7 @@ def _work(pipe: Connection, threads: int, speaks: bool) -> None:
         except EOFError:
             return
         try:
-            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME))
+            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME), helpers)
         except BrokenPipeError:
             return  # The batch has ended.
         except Exception as error:

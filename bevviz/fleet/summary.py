@@ -14,11 +14,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevviz.bags.source import iso
+from bevviz.fleet.causes import Causes, Findings, find_causes
+from bevviz.fleet.findings import FINDINGS, write_findings
 from bevviz.fleet.table import NAME, SCHEMA, SEVERITIES, RunInfo, severity
 from bevviz.support.files import atomic_write, save_text
 from bevviz.support.html import render
 
 SHOWN = 6  # number of remarks shown for a frame
+LISTED = 1000  # findings on the page, so that it opens at once
 
 Link = Callable[[str, int], str]  # recording ID, frame -> address that opens it
 
@@ -50,6 +53,7 @@ def page(
     worst: Sequence[Mapping[str, Any]],
     failed: Sequence[tuple[str, str]],
     viewer: str,
+    causes: Causes,
 ) -> str:
     """Return the page as HTML.
 
@@ -59,6 +63,7 @@ def page(
         worst: rows of the table of frames, worst first.
         failed: name and error of each failed bag.
         viewer: address of a web viewer for the links to frames; empty: there is none.
+        causes: causes of the batch.
     """
     return render(
         "batch.html",
@@ -72,6 +77,9 @@ def page(
         failed=failed,
         warnings=[(bag.name, text) for bag in bags for text in bag.info.warnings],
         worst=[_worst_frame(row, viewer) for row in worst],
+        causes=causes,
+        findings=causes.listed(LISTED),
+        total=causes.findings.count,
     )
 
 
@@ -122,8 +130,9 @@ def collect(results: Sequence[tuple[Path, RunInfo]], link: Link | None) -> tuple
         bag_frames = pq.read_table(path, schema=SCHEMA)
         bags.append(_totals(path.stem, info, bag_frames))
         links = [link(info.recording_id, f) if link else None for f in bag_frames["frame"].to_pylist()]
-        tables.append(bag_frames.append_column("link", pa.array(links, pa.string())))
-    empty = SCHEMA.append(pa.field("link", pa.string())).empty_table()
+        tables.append(bag_frames.drop_columns(FINDINGS).append_column("link", pa.array(links, pa.string())))
+    columns = [field for field in SCHEMA if field.name != FINDINGS]
+    empty = pa.schema([*columns, pa.field("link", pa.string())]).empty_table()
     frames = pa.concat_tables([empty, *(p.replace_schema_metadata(None) for p in tables)])
     order = [("badness", "descending"), ("recording", "ascending"), ("frame", "ascending")]
     return frames.sort_by(order), bags
@@ -177,7 +186,11 @@ def write_summary(
     path = folder / f"{NAME}.html"
     stamp_column = frames.schema.get_field_index("stamp")
     in_nanoseconds = frames.set_column(stamp_column, "stamp", frames["stamp"].cast(pa.int64()))
-    text = page(folder.resolve().name, bags, in_nanoseconds.slice(0, top).to_pylist(), failed, viewer)
+    columns = ["bag", "recording", "frame", "stamp", FINDINGS]
+    write_findings(folder, (pq.read_table(table, columns=columns) for table, _ in results))
+    causes = find_causes(Findings.load(folder, named=Path()))
+    worst = in_nanoseconds.slice(0, top).to_pylist()
+    text = page(folder.resolve().name, bags, worst, failed, viewer, causes)
     with atomic_write(folder / f"{NAME}.parquet", "summary") as file:
         pq.write_table(frames, file.path)
     save_text(path, text, "-o")

@@ -15,20 +15,22 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
 from bevviz.config import Config
+from bevviz.fleet.findings import FINDING, FINDINGS
 from bevviz.model.counts import count_results
 from bevviz.model.frame import Scene
 from bevviz.model.results import Decision, DetectionState, FrameResult
 from bevviz.recording.decisions import decision_log_lines
-from bevviz.recording.provenance import file_hash
+from bevviz.support.files import file_hash
 
 # Decisions that are possible for a kept detection.
 DECISIONS = tuple(d.name.lower() for d in Decision if d.value in (0, 1, 2, 3, 4, 8))
 STAGES = (
-    *("voxel", "ground", "clustering", "detector", "projection", "fusion", "tracking", "bev", "explain"),
-    "total",
+    *("odometry", "voxel", "ground", "clustering", "detector", "projection", "fusion", "tracking", "bev"),
+    *("explain", "total"),
 )
 
 NAME = "summary"  # of the table and the page of all bags
+RESERVED = {NAME, FINDINGS}  # names of tables that are of all bags
 
 FAILURE, PROBLEM, ANOMALY, WRONG = 10.0, 3.0, 0.5, 1.0
 UNMATCHED = {
@@ -61,6 +63,7 @@ SCHEMA = pa.schema(
         ("missed", pa.int64()),
         ("false", pa.int64()),
         ("false_causes", pa.list_(pa.string())),  # of the judged false objects
+        (FINDINGS, pa.list_(FINDING)),
         # JPEGs, only for the worst frames: the first camera with its detections, and the bird's-eye view.
         ("picture", pa.binary()),
         ("above", pa.binary()),
@@ -75,11 +78,12 @@ SEVERITIES = {  # of a frame, the gravest first -> description
     "strange": "an anomaly",
     "unmatched": "a detection has no match",
     "well": "nothing is wrong",
+    "unjudged": "not judged: there is no ground truth, and nothing stands out",
 }
 
 
 def severity(row: Mapping[str, Any]) -> str:
-    """Return the gravest problem of a frame, a key of ``SEVERITIES``."""
+    """Return the gravest problem of a frame, or how good it is: a key of ``SEVERITIES``."""
     numbers = {
         "failed": row["failures"],
         "lacking": row["problems"],
@@ -87,7 +91,8 @@ def severity(row: Mapping[str, Any]) -> str:
         "strange": row["anomalies"],
         "unmatched": len(row["unmatched"]),
     }
-    return next((kind for kind, number in numbers.items() if number), "well")
+    good = "unjudged" if row["missed"] is None else "well"
+    return next((kind for kind, number in numbers.items() if number), good)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,17 +15,19 @@ from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
+from bevviz.evaluate.marks import MarkRecorder
+from bevviz.fleet.findings import FINDINGS, FindingCollector, judged_names
 from bevviz.fleet.jobs import PARTIAL, Job, JobResult
 from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
+from bevviz.pipeline.frame_workers import has_networks, with_threads, working_ahead
 from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
-from bevviz.recording.provenance import file_hash
 from bevviz.recording.recorder import DiskWatch, Recorder
 from bevviz.recording.sinks import open_recording
 from bevviz.report.pictures import camera_picture, crop_ahead, jpeg, shrink
-from bevviz.support.files import unfinished_files
+from bevviz.support.files import file_hash, unfinished_files
 from bevviz.support.text import path_text
 from bevviz.why.false_objects import false_causes
 
@@ -40,7 +42,7 @@ class WithdrawnError(Exception):
         super().__init__("its unfinished recording was removed")
 
 
-def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
+def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None, helpers: int = 1) -> JobResult:
     """Run the pipeline over a bag. Recording and table get their final names when both are complete.
 
     Unfinished files are deleted at the end. If another process deletes the recording, the job ends.
@@ -49,6 +51,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
         job: the bag and its settings.
         threads: largest number of threads of the network, unless the configuration has one.
         on_frame: called after each frame.
+        helpers: number of processes that run the networks ahead. 1: none.
 
     Raises:
         WithdrawnError: the unfinished recording was removed.
@@ -59,7 +62,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> 
     recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
     table = recording.with_suffix(".parquet")
     try:
-        info = _fill(job, recording, rows, threads, on_frame, start)
+        info = _fill(job, recording, rows, threads, on_frame, start, helpers)
         write_table(table, rows, info)
         job.table.unlink(missing_ok=True)  # An older table must not vouch for the new recording.
         recording.replace(job.recording)
@@ -79,15 +82,14 @@ def _fill(
     threads: int,
     on_frame: Callable[[], None],
     start: float,
+    helpers: int,
 ) -> RunInfo:
     """Write the recording and append a row for each frame. Return the description of the run.
 
     Raises:
         UserError: the bag cannot be used, or has no frame.
     """
-    detector = job.config.detector
-    detector = detector.model_copy(update={"threads": detector.threads or threads})
-    config = job.config.model_copy(update={"detector": detector})  # used by the stages only
+    config = with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
     with job.selection.source([job.bag], job.config) as source:
         session = Session(config)
@@ -106,10 +108,14 @@ def _fill(
             if job.truth is not None:
                 evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
+            else:
+                observers.append(MarkRecorder(sinks.recording))
             assert sinks.file is not None
             collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation)
-            if run_frames(source, session, [*observers, collector, DiskWatch(sinks)]).interrupted:
-                raise KeyboardInterrupt
+            watchers = [*observers, collector, DiskWatch(sinks)]
+            with working_ahead(session, source, [config], helpers if has_networks(config) else 1) as ahead:
+                if run_frames(source, ahead, watchers).interrupted:
+                    raise KeyboardInterrupt
         warnings = tuple(source.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
@@ -121,7 +127,7 @@ def _fill(
             time.perf_counter() - start,
             replace(source.scene, bag=(), topics=()),
             warnings,
-            None if evaluation is None else evaluation.as_tree()["metrics"],
+            None if evaluation is None else dict(evaluation.as_tree()["metrics"]),
             recording.stat().st_size,
             file_hash(recording),
         )
@@ -140,6 +146,7 @@ class _RowCollector(Observer[FrameResult]):
     ) -> None:
         self._job, self._rows, self._recording = job, rows, recording
         self._on_frame, self._evaluation = on_frame, evaluation
+        self._findings = FindingCollector(evaluation)
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def observe(self, result: FrameResult) -> None:
@@ -154,6 +161,7 @@ class _RowCollector(Observer[FrameResult]):
             heapq.heappush(self._worst, (*rank, _pictures(result)))
         if len(self._worst) > PICTURED:
             heapq.heappop(self._worst)
+        values[FINDINGS] = self._findings.of_frame(result)
         self._rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
@@ -162,6 +170,9 @@ class _RowCollector(Observer[FrameResult]):
     def end(self) -> None:
         for _, negative_row, jpegs in self._worst:
             self._rows[-negative_row] |= jpegs
+        if self._evaluation is not None:
+            for values in self._rows:
+                values[FINDINGS] = judged_names(values[FINDINGS], self._evaluation)
 
 
 def _pictures(result: FrameResult) -> Mapping[str, bytes]:

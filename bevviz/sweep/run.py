@@ -12,7 +12,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
+from bevviz.model.json_forms import SweepForm
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
@@ -29,6 +29,8 @@ from bevviz.support.files import save_text
 from bevviz.support.text import printable
 
 MOST = 500  # combinations of values, at most
+PARTS = 20  # parts of a drive that are left out in turn to estimate the noise of F1
+SIGNIFICANT = 2.0  # standard errors by which two values of F1 differ
 
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*:\s*({_NUMBER})\s*")
@@ -137,6 +139,9 @@ class SweepOutcome:
     failures: int = 0
     judged: int = 0  # frames with ground truth
     score: ObjectScore = field(default_factory=ObjectScore)
+    frame_counts: list[tuple[int, int, Counter[str]]] = field(
+        default_factory=list
+    )  # true, missed, false names
 
     def add(self, result: FrameResult, truth: Truth | None) -> None:
         """Add the result of one frame."""
@@ -148,7 +153,32 @@ class SweepOutcome:
             self.seconds[stage].append(result.timings.get(stage, 0.0))
         if truth is not None and result.objects is not None:
             self.judged += 1
-            self.score.add(result.objects, truth)
+            matches = self.score.add(result.objects, truth)
+            false = Counter(result.objects.names[j].lower() for j in np.flatnonzero(matches.false))
+            self.frame_counts.append((int(matches.true.sum()), int(matches.missed.sum()), false))
+
+    @property
+    def f1_of_parts(self) -> F64:
+        """(B,) F1 without each of B parts of the drive. The parts are runs of consecutive judged frames.
+
+        Neighbouring frames show the same objects. So parts, and not single frames, are left out.
+        """
+        judged = self.score.judged
+        counts = np.array(
+            [
+                (2 * true, missed + sum(n for name, n in false.items() if judged.of(name) is not None))
+                for true, missed, false in self.frame_counts
+            ]
+        )
+        parts = np.array([part.sum(axis=0) for part in np.array_split(counts, min(len(counts), PARTS))])
+        rest = parts.sum(axis=0) - parts
+        return np.asarray(rest[:, 0] / np.maximum(rest.sum(axis=1), 1))
+
+    @property
+    def one_object(self) -> float:
+        """Change of F1 if one more object were right. It is the least difference that is not noise."""
+        total = self.score.total
+        return 2 / max(2 * total["tp"] + total["fp"] + total["fn"], 1)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -210,7 +240,38 @@ class Sweep:
 
     @property
     def best(self) -> Values | None:
-        """Values with the highest F1, of equal ones with the smallest error. None without ground truth."""
+        """Values with the highest F1, of equal ones with the smallest error.
+
+        None without ground truth, and if no other value is worse by more than the noise.
+        """
+        alike = self.alike
+        return alike[0] if len(alike) == 1 or len(alike) < len(self._rated) else None
+
+    @property
+    def alike(self) -> Sequence[Values]:
+        """Values that are the best within the noise, the one with the highest F1 first.
+
+        The noise is the standard error of the difference in F1 on the same frames, by leaving out each part
+        of the drive in turn. It is at least one object.
+        """
+        rated = self._rated
+        if not rated:
+            return ()
+        best, *others = rated
+        outcomes = self.outcomes
+        top, top_parts = outcomes[best].score.f1, outcomes[best].f1_of_parts
+        alike = [best]
+        for values in others:
+            outcome = outcomes[values]
+            parts = top_parts - outcome.f1_of_parts
+            error = math.sqrt((len(parts) - 1) / len(parts) * float(((parts - parts.mean()) ** 2).sum()))
+            if top - outcome.score.f1 <= max(SIGNIFICANT * error, outcomes[best].one_object):
+                alike.append(values)
+        return alike
+
+    @property
+    def _rated(self) -> Sequence[Values]:
+        """Values with an F1, the best first."""
         rated = {
             values: outcome.score
             for values, outcome in self.outcomes.items()
@@ -220,7 +281,7 @@ class Sweep:
             values: float(np.median(score.errors)) if score.errors else math.inf
             for values, score in rated.items()
         }
-        return min(rated, key=lambda values: (-rated[values].f1, errors[values]), default=None)
+        return sorted(rated, key=lambda values: (-rated[values].f1, errors[values]))
 
     @property
     def title(self) -> str:
@@ -232,17 +293,25 @@ class Sweep:
         frames = max(outcome.frames for outcome in self.outcomes.values())
         lines = [f"{frames} frames; means of a frame, median milliseconds", ""]
         lines += table.lines([*self.rows("time ms")])
-        if self.best is not None:
-            where = ", ".join(
-                f"{parameter.key} = {value}"
-                for parameter, value in zip(self.parameters, self.best, strict=True)
-            )
-            f1 = self.outcomes[self.best].score.f1
-            others = sum(outcome.judged and outcome.score.f1 == f1 for outcome in self.outcomes.values()) - 1
-            ties = f"; the same F1 at {others} more, with errors as large or larger" if others else ""
-            lines += ["", f"best F1: {f1:.3f} at {printable(where)}{ties}"]
+        if (verdict := self.verdict) is not None:
+            lines += ["", printable(verdict)]
         failures = sum(outcome.failures for outcome in self.outcomes.values())
         return "\n".join([*lines, *([f"{failures} stages failed"] if failures else [])])
+
+    @property
+    def verdict(self) -> str | None:
+        """One sentence about the best values. None without ground truth."""
+        rated, alike, best = self._rated, self.alike, self.best
+        if not rated:
+            return None
+        high, low = (self.outcomes[values].score.f1 for values in (rated[0], rated[-1]))
+        if best is None:
+            return f"no value is best within the noise: F1 {low:.3f} to {high:.3f}"
+        where = ", ".join(
+            f"{parameter.key} = {value}" for parameter, value in zip(self.parameters, best, strict=True)
+        )
+        others = f"; {len(alike) - 1} more as good within the noise" if alike[1:] else ""
+        return f"best F1: {high:.3f} at {where}{others}"
 
     def rows(self, last: str) -> Iterator[tuple[str, ...]]:
         """Yield the header and a row for each combination. Of the times, it has ``last`` only."""
@@ -256,7 +325,7 @@ class Sweep:
         """Return the names of all metrics."""
         return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> SweepForm:
         """Return the sweep for JSON: every metric of the table, the time of each stage, counts by class."""
         return {
             "parameters": [parameter.key for parameter in self.parameters],
@@ -266,7 +335,7 @@ class Sweep:
                     "frames": outcome.frames,
                     "metrics": outcome.metrics,
                     "classes": {
-                        name: {kind: class_counts[kind] for kind in ("tp", "fp", "fn")}
+                        name: {"tp": class_counts["tp"], "fp": class_counts["fp"], "fn": class_counts["fn"]}
                         for name, class_counts in sorted(outcome.score.classes.items())
                     },
                     "failures": outcome.failures,

@@ -1,0 +1,498 @@
+"""Search of parameters that repair a cause: chosen on some drives, confirmed on others."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevviz.bags.source import BagSource
+from bevviz.config import Config, load
+from bevviz.errors import UserError
+from bevviz.evaluate.ground_truth import Truth, truth_source
+from bevviz.evaluate.matching import AcceptedNames, judge
+from bevviz.fleet.causes import Cause, Findings
+from bevviz.fleet.findings import judged_findings
+from bevviz.model.frame import F64, Bool, Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.session import Variants
+from bevviz.sweep.search import Settings, search
+from bevviz.why.false_objects import false_causes
+
+FRAMES = 60  # frames to choose on, and as many to confirm
+TRIALS = 72
+OF_CAUSE = 0.5  # share of these frames that have findings of the cause
+FEW = 6  # drives below which parts of drives are left out instead of whole drives
+PARTS = 10  # of a drive
+DRAWS = 2000  # of the bootstrap
+COMMON = 0.05  # least share of a reason among the findings whose parameters are searched
+
+_GROUND = ("ground.distance_threshold", "ground.method", "clustering.min_points", "voxel.size")
+_GROUPS = ("clustering.eps", "clustering.min_points", "clustering.min_cluster_points", "voxel.size")
+_MATCH = ("fusion.min_rating", "fusion.min_iou", "fusion.min_points", "fusion.split", "fusion.method")
+# Parameters that a reason depends on. The first one decides; the others change how often it comes to that.
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "ground": (*_GROUND, "clustering.min_cluster_points"),
+    "noise": (*_GROUPS, "ground.distance_threshold"),
+    "no cluster": (*_GROUPS, "ground.distance_threshold", "fusion.max_depth"),
+    "no points": ("voxel.size",),
+    "too small": ("clustering.min_cluster_points", "clustering.eps", "clustering.min_points", "voxel.size"),
+    "too large": ("clustering.max_cluster_points", "clustering.eps"),
+    "merged": ("clustering.eps", "fusion.split", "fusion.min_rating", "fusion.method", "voxel.size"),
+    "split": ("clustering.eps", "clustering.min_points", "fusion.split", "voxel.size"),
+    "misplaced": ("clustering.eps", "fusion.split", "fusion.method", "voxel.size"),
+    "not detected": ("detector.conf_threshold",),
+    "below threshold": ("detector.conf_threshold", "fusion.min_rating"),
+    "suppressed": ("detector.iou_threshold",),
+    "low overlap": ("fusion.min_iou", "clustering.eps", "fusion.method", "fusion.split"),
+    "misfit": ("fusion.min_rating", "fusion.split", "clustering.eps"),
+    "too few points": (
+        "fusion.min_points",
+        "clustering.min_points",
+        "voxel.size",
+        "ground.distance_threshold",
+    ),
+    "too far": ("fusion.max_depth", "fusion.method", "ground.distance_threshold"),
+    "taken": ("fusion.method", "clustering.eps", "detector.iou_threshold", "fusion.min_iou"),
+    "other cluster": ("fusion.method", "clustering.eps", "fusion.split"),
+    "borrowed name": ("fusion.method", "clustering.eps", "fusion.split"),
+    "shared box": ("fusion.method", "fusion.split"),
+    "misnamed": ("fusion.method", "detector.iou_threshold", "detector.conf_threshold"),
+    "duplicate": ("detector.iou_threshold", "clustering.eps", "fusion.split", *_MATCH[:2]),
+    "wrong depth": (*_MATCH, "clustering.eps"),
+    "wall in the frustum": (*_MATCH, "clustering.eps"),
+    "detector's own error": ("detector.conf_threshold", "fusion.min_rating", "fusion.min_iou"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SampleFrame:
+    """Frame of a sample.
+
+    Attributes:
+        frame: the decoded frame.
+        truth: its ground truth.
+        unit: drive, or part of a drive, that the bootstrap draws as a whole.
+        of_cause: whether it has findings of the cause.
+        weight: number of frames that it stands for.
+    """
+
+    frame: Frame
+    truth: Truth
+    unit: str
+    of_cause: bool
+    weight: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameScore:
+    """Outcome of one configuration on one frame."""
+
+    found: Bool  # (K,) objects of the ground truth
+    false: Counter[str]  # false objects by name
+
+
+@dataclass
+class Sample:
+    """Frames that configurations are scored on.
+
+    Attributes:
+        frames: the frames.
+        variants: runs the stages.
+    """
+
+    frames: Sequence[SampleFrame]
+    variants: Variants = field(default_factory=Variants)
+    _names: AcceptedNames = field(default_factory=AcceptedNames)
+
+    def __post_init__(self) -> None:
+        for sampled in self.frames:
+            self._names.add(sampled.truth)
+
+    def scores(self, configs: Sequence[Config]) -> list[list[FrameScore]]:
+        """Run each configuration on each frame. Return the scores of each configuration."""
+        scores: list[list[FrameScore]] = [[] for _ in configs]
+        for sampled in self.frames:
+            for of_config, config in zip(scores, configs, strict=True):
+                result = self.variants.perceive(sampled.frame, config)
+                of_config.append(self._score(result, sampled.truth))
+        return scores
+
+    def reasons(self, config: Config) -> Counter[str]:
+        """Run a configuration. Return the number of missed and false objects by reason."""
+        reasons: Counter[str] = Counter()
+        for sampled in self.frames:
+            result = self.variants.perceive(sampled.frame, config)
+            if result.objects is None:
+                continue
+            matches = judge(result.objects, sampled.truth)
+            causes = false_causes(result, sampled.truth)
+            findings = judged_findings(result, sampled.truth, matches, causes)
+            reasons.update(f["reason"] for f in findings if f["outcome"] != "found")
+        return reasons
+
+    def _score(self, result: FrameResult, truth: Truth) -> FrameScore:
+        if result.objects is None:
+            return FrameScore(np.zeros(len(truth.must), bool), Counter())
+        matches = judge(result.objects, truth)
+        names = [result.objects.names[j].lower() for j in np.flatnonzero(matches.false).tolist()]
+        return FrameScore(truth.must & ~matches.missed, Counter(n for n in names if self._names.of(n)))
+
+    def counts(self, scores: Sequence[FrameScore]) -> F64:
+        """Return (F, 3) weighted true, missed and false objects of each frame."""
+        rows = [
+            (score.found.sum(), (s.truth.must & ~score.found).sum(), score.false.total())
+            for s, score in zip(self.frames, scores, strict=True)
+        ]
+        weights = np.array([s.weight for s in self.frames])
+        return np.asarray(np.array(rows, np.float64).reshape(-1, 3) * weights[:, None], np.float64)
+
+
+def f1(counts: F64) -> float:
+    """Return the F1 of (F, 3) true, missed and false objects."""
+    true, missed, false = counts.sum(axis=0)
+    return float(2 * true / max(2 * true + missed + false, 1e-9))
+
+
+@dataclass(frozen=True)
+class Fix:
+    """Changed parameters with what they do on frames that were not used to choose them.
+
+    Attributes:
+        settings: changed parameters; empty: none is better than the present ones.
+        keys: parameters that were searched.
+        trials: number of settings that were tried.
+        before: F1 of the present configuration.
+        after: F1 of the changed one.
+        interval: 95 % interval of the difference in F1, by drawing whole drives or parts.
+        fixed: objects that were missed before and are found.
+        missed: objects that were missed before.
+        broken: objects that were found before and are missed.
+        found: objects that were found before.
+        cause_fixed: fixed objects in frames of the cause.
+        cause_missed: missed objects in frames of the cause.
+        false: false objects before and after.
+        frames: number of frames to confirm on.
+        units: number of drives or parts that these frames come from.
+        parts: whether they are parts of drives.
+    """
+
+    settings: Settings
+    keys: Sequence[str]
+    trials: int
+    before: float
+    after: float
+    interval: tuple[float, float]
+    fixed: int
+    missed: int
+    broken: int
+    found: int
+    cause_fixed: int
+    cause_missed: int
+    false: tuple[int, int]
+    frames: int
+    units: int
+    parts: bool
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the whole interval is an improvement."""
+        return bool(self.settings) and self.interval[0] > 0
+
+    def lines(self) -> Iterator[str]:
+        """Yield the result for the terminal."""
+        yield f"{self.trials} settings of {', '.join(self.keys)} tried"
+        if not self.settings:
+            yield "none is better than the present ones"
+            return
+        for key, value in self.settings.items():
+            yield f"  --set {key}={text_of(value)}"
+        units = "parts of drives" if self.parts else "drives"
+        yield f"on {self.frames} frames of {self.units} {units} that were not used to choose them:"
+        yield f"  fixes {self.fixed} of {self.missed} missed objects" + (
+            f", {self.cause_fixed} of {self.cause_missed} in frames of the cause" if self.cause_missed else ""
+        )
+        false = f"false objects {self.false[0]} -> {self.false[1]}"
+        yield f"  breaks {self.broken} of {self.found} found ones; {false}"
+        low, high = self.interval
+        yield f"  F1 {self.before:.3f} -> {self.after:.3f}; the change is {low:+.3f} to {high:+.3f} (95 %)"
+        if not self.confirmed:
+            yield "not confirmed: it may as well be chance"
+
+    def as_tree(self) -> dict[str, Any]:
+        """Return the result for JSON."""
+        return {
+            "settings": dict(self.settings),
+            "confirmed": self.confirmed,
+            "searched": list(self.keys),
+            "trials": self.trials,
+            "f1_before": round(self.before, 6),
+            "f1_after": round(self.after, 6),
+            "f1_change": [round(value, 6) for value in self.interval],
+            "fixed": self.fixed,
+            "missed": self.missed,
+            "broken": self.broken,
+            "found": self.found,
+            "cause_fixed": self.cause_fixed,
+            "cause_missed": self.cause_missed,
+            "false_before": self.false[0],
+            "false_after": self.false[1],
+            "frames": self.frames,
+            "units": self.units,
+            "parts": self.parts,
+        }
+
+    def yaml(self) -> str:
+        """Return the changed parameters as a configuration file."""
+        sections: dict[str, dict[str, Any]] = {}
+        for key, value in self.settings.items():
+            section, _, name = key.partition(".")
+            sections.setdefault(section, {})[name] = value
+        head = [f"# {line.strip()}" for line in self.lines() if "--set" not in line]
+        body = [
+            line
+            for section, parameters in sections.items()
+            for line in (f"{section}:", *(f"  {name}: {json.dumps(v)}" for name, v in parameters.items()))
+        ]
+        return "\n".join([*head, *body, ""])
+
+
+def text_of(value: Any) -> str:
+    """Return a value as ``--set`` takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def find_fix(
+    config: Config,
+    keys: Sequence[str],
+    choosing: Sample,
+    confirming: Sample,
+    trials: int = TRIALS,
+    tick: Callable[[int], None] = lambda _: None,
+    *,
+    parts: bool = False,
+    defaults: bool = True,
+) -> Fix:
+    """Search settings on one sample, and confirm the best on the other.
+
+    Args:
+        config: present configuration.
+        keys: parameters to search.
+        choosing: sample that the settings are chosen on.
+        confirming: sample of other drives, or of other parts of drives.
+        trials: number of settings to try.
+        tick: called with the number of settings that were tried since the last call.
+        parts: whether the units of the samples are parts of drives.
+        defaults: whether the default values are tried first.
+    """
+
+    def scored(settings: Sequence[Settings]) -> list[float]:
+        configs = [changed(config, one) for one in settings]
+        valid = [c for c in configs if c is not None]
+        scores = iter(choosing.scores(valid))
+        tick(len(settings))
+        return [-1.0 if c is None else f1(choosing.counts(next(scores))) for c in configs]
+
+    tried: dict[tuple[tuple[str, Any], ...], float] = {}
+    for point, value in search(config, keys, scored, trials, defaults=defaults):
+        tried[tuple(point.items())] = value
+    best = max(tried.items(), key=lambda item: (round(item[1], 6), -len(item[0])))
+    settings = _simplified(dict(best[0]), best[1], scored, choosing)
+    return _confirmed(config, settings, keys, len(tried), confirming, parts)
+
+
+def changed(config: Config, settings: Settings) -> Config | None:
+    """Return the configuration with settings. None: they contradict each other."""
+    try:
+        return load(settings=[f"{key}={text_of(value)}" for key, value in settings.items()], base=config)
+    except UserError:
+        return None
+
+
+def _simplified(
+    best: Settings, value: float, scored: Callable[[Sequence[Settings]], Sequence[float]], sample: Sample
+) -> Settings:
+    """Leave out each change without which F1 is lower by less than one object."""
+    weights = sum(s.weight * s.truth.must.sum() for s in sample.frames)
+    one_object = max((s.weight for s in sample.frames), default=1.0) / max(weights, 1)
+    while best:
+        fewer = [{k: v for k, v in best.items() if k != key} for key in best]
+        values = scored(fewer)
+        at = int(np.argmax(values))
+        if values[at] < value - one_object:
+            break
+        best, value = fewer[at], max(value, values[at])
+    return best
+
+
+def _confirmed(
+    config: Config, settings: Settings, keys: Sequence[str], trials: int, sample: Sample, parts: bool
+) -> Fix:
+    """Compare the present configuration with the changed one on the frames to confirm on."""
+    after = changed(config, settings)
+    assert after is not None
+    old, new = sample.scores([config, after])
+    counts = sample.counts(old), sample.counts(new)
+    units = sorted({s.unit for s in sample.frames})
+    of_unit = np.array([units.index(s.unit) for s in sample.frames])
+    sums = [np.stack([c[of_unit == i].sum(axis=0) for i in range(len(units))]) for c in counts]
+    rng = np.random.default_rng(0)
+    draws = rng.integers(len(units), size=(DRAWS, len(units)))
+    differences = [f1(sums[1][draw]) - f1(sums[0][draw]) for draw in draws]
+    low, high = np.quantile(differences, [0.025, 0.975]).tolist()
+    totals: Counter[str] = Counter()
+    for s, a, b in zip(sample.frames, old, new, strict=True):
+        fixed, missed = int((b.found & ~a.found).sum()), int((s.truth.must & ~a.found).sum())
+        totals.update(fixed=fixed, missed=missed, broken=int((a.found & ~b.found).sum()))
+        totals.update(found=int(a.found.sum()), false_before=a.false.total(), false_after=b.false.total())
+        if s.of_cause:
+            totals.update(cause_fixed=fixed, cause_missed=missed)
+    return Fix(
+        settings, keys, trials, f1(counts[0]), f1(counts[1]), (low, high),
+        totals["fixed"], totals["missed"], totals["broken"], totals["found"],
+        totals["cause_fixed"], totals["cause_missed"], (totals["false_before"], totals["false_after"]),
+        len(sample.frames), len(units), parts,
+    )  # fmt: skip
+
+
+def keys_for(reasons: Mapping[str, int]) -> list[str]:
+    """Return the parameters that reasons depend on, those of frequent reasons first."""
+    total = sum(reasons.values())
+    keys: dict[str, None] = {}
+    for reason, number in sorted(reasons.items(), key=lambda item: -item[1]):
+        if number >= COMMON * total:
+            keys |= dict.fromkeys(PARAMETERS.get(reason, ()))
+    return list(keys)
+
+
+# --- frames ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFrames:
+    """Frames of one drive that a sample may take.
+
+    Attributes:
+        paths: files of the drive.
+        name: name of the drive.
+        numbers: numbers of its frames.
+        of_cause: numbers of the frames with findings of the cause.
+    """
+
+    paths: tuple[Path, ...]
+    name: str
+    numbers: Sequence[int]
+    of_cause: frozenset[int]
+
+
+def drives_of(findings: Findings, cause: Cause | None) -> list[DriveFrames]:
+    """Return the drives of a batch whose bags exist.
+
+    Args:
+        findings: of the batch.
+        cause: cause to fix; None: every missed and every false object.
+    """
+    if cause is not None:
+        wanted = cause.rows
+    else:
+        wanted = np.flatnonzero(findings.is_word("outcome", "missed") | findings.is_word("outcome", "false"))
+    names, drive = findings.words("recording")
+    bags, bag = findings.words("bag")
+    frame = findings.table["frame"].to_numpy()
+    is_wanted = np.zeros(len(findings), bool)
+    is_wanted[wanted] = True
+    drives = []
+    for code, name in enumerate(names):
+        rows = np.flatnonzero(drive == code)
+        path = Path(bags[bag[rows[0]]])
+        if path.exists():
+            numbers = sorted(set(frame[rows].tolist()))
+            drives.append(
+                DriveFrames((path,), name, numbers, frozenset(frame[rows[is_wanted[rows]]].tolist()))
+            )
+    return drives
+
+
+def draw_samples(
+    drives: Sequence[DriveFrames],
+    config: Config,
+    frames: int = FRAMES,
+    truth: str | None = None,
+    kitti: Path | None = None,
+    tick: Callable[[int], None] = lambda _: None,
+) -> tuple[Sample, Sample, bool]:
+    """Draw frames to choose on and frames to confirm on, from different drives or parts of drives.
+
+    Returns:
+        choosing: the first sample.
+        confirming: the second sample.
+        parts: whether they are of different parts of the same drives, because there are few drives.
+
+    Raises:
+        UserError: no frame has ground truth, or a bag cannot be read.
+    """
+    parts = len(drives) < FEW
+    units: dict[str, list[tuple[DriveFrames, int]]] = {}
+    for drive in drives:
+        for place, number in enumerate(drive.numbers):
+            part = f"#{place * PARTS // len(drive.numbers)}" if parts else ""
+            units.setdefault(drive.name + part, []).append((drive, number))
+    rng = np.random.default_rng(0)
+    # Each half gets every second unit in the order of their findings of the cause, so that both have some.
+    order = sorted(units, key=lambda unit: -sum(n in d.of_cause for d, n in units[unit]))
+    pairs = [order[i : i + 2] for i in range(0, len(order), 2)]
+    sides: tuple[list[str], list[str]] = ([], [])
+    for pair in pairs:
+        first = int(rng.integers(2)) if len(pair) == 2 else 0
+        for i, unit in enumerate(pair):
+            sides[(i + first) % 2].append(unit)
+    chosen: list[list[tuple[DriveFrames, int, str, float, bool]]] = []
+    for side in sides:
+        pool = [(drive, number, unit) for unit in side for drive, number in units[unit]]
+        bad = [entry for entry in pool if entry[1] in entry[0].of_cause]
+        others = [entry for entry in pool if entry[1] not in entry[0].of_cause]
+        count = min(len(bad), max(round(OF_CAUSE * frames), frames - len(others)))
+        picked = []
+        for stratum, number in ((bad, count), (others, min(len(others), frames - count))):
+            drawn = rng.permutation(len(stratum))[:number].tolist()
+            picked += [(*stratum[at], len(stratum) / number, stratum is bad) for at in drawn]
+        chosen.append(picked)
+    read = _read(drives, chosen, config, truth, kitti, tick)
+    if not all(sample.frames for sample in read):
+        raise UserError("no ground truth in the frames: a fix is judged by it")
+    return read[0], read[1], parts
+
+
+def _read(
+    drives: Sequence[DriveFrames],
+    chosen: Sequence[Sequence[tuple[DriveFrames, int, str, float, bool]]],
+    config: Config,
+    topic: str | None,
+    kitti: Path | None,
+    tick: Callable[[int], None],
+) -> tuple[Sample, Sample]:
+    """Read the frames of both samples, one bag after the other."""
+    samples: tuple[list[SampleFrame], list[SampleFrame]] = ([], [])
+    for drive in drives:
+        wanted = sorted(
+            (number, side, unit, weight, of_cause)
+            for side, picked in enumerate(chosen)
+            for d, number, unit, weight, of_cause in picked
+            if d is drive
+        )
+        if not wanted:
+            continue
+        with BagSource(drive.paths, config) as source:
+            truths = truth_source(source.roles, topic, kitti, len(source.scans))
+            for number, side, unit, weight, of_cause in wanted:
+                frame = source.frame(number)
+                truth = truths(frame) if frame is not None and truths is not None else None
+                if frame is not None and truth is not None:
+                    samples[side].append(SampleFrame(frame, truth, unit, of_cause, weight))
+                tick(1)
+    return Sample(samples[0]), Sample(samples[1])
