@@ -1,0 +1,1 @@
+"""Tools of `bevviz mcp`, by which agents ask about a drive or a batch. Imports `workbench` and below."""

@@ -1,0 +1,131 @@
+"""Drives that an agent asks about: how they are opened and run, and which values an agent may change."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from bevviz.anomalies import FailureSummary, Onsets
+from bevviz.config import Config, changed_config, changes
+from bevviz.config.keys import values
+from bevviz.drive import Drive
+from bevviz.errors import UserError
+from bevviz.evaluate import truth_source
+from bevviz.fleet.table import RunInfo
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.run import run
+from bevviz.pipeline.session import Session
+from bevviz.recording.source_lookup import find_source
+from bevviz.workbench.findings import FindingList, find_findings
+from bevviz.workbench.recorded_drive import recorded_session
+from bevviz.workbench.session import WorkbenchSession
+from bevviz.workbench.startup import LabelledSource
+
+
+@dataclass
+class AskedDrive:
+    """An open drive, and the words after ``bevviz COMMAND`` that open it in a terminal."""
+
+    words: Sequence[str]
+    paths: Sequence[Path]
+    source: LabelledSource
+    session: WorkbenchSession
+    drive: Drive
+    truth: tuple[str | None, Path | None] = (None, None)
+
+    @classmethod
+    def of(
+        cls,
+        words: Sequence[str],
+        paths: Sequence[Path],
+        config: Config,
+        truth: tuple[str | None, Path | None] = (None, None),
+    ) -> AskedDrive:
+        """Open a drive.
+
+        Args:
+            words: see the class.
+            paths: of the bag.
+            config: configuration of the runs.
+            truth: topic and label files of the ground truth, if the user has stated them.
+
+        Raises:
+            UserError: the bag or the model cannot be used.
+        """
+        source = LabelledSource(paths, config)
+        truth_of = truth_source(source.roles, *truth, len(source.scans))
+        if truth != (None, None):
+            source.truth_of = truth_of
+        drive = Drive(source, config)
+        session = recorded_session(drive, source, paths, truth_of)
+        return cls(words, paths, source, session, drive, truth)
+
+    def command(self, command: str, *words: object) -> str:
+        """Return the command line that gives the same in a terminal."""
+        return shlex.join(["bevviz", command, *self.words, *map(str, words)])
+
+    def run(self, settings: Sequence[str], observers: Sequence[Observer[FrameResult]]) -> None:
+        """Run the drive with some values changed."""
+        config = agent_config(self.drive.config, settings)
+        run(self.drive.frames, Session(config, loader=self.drive.session.loader), observers)
+
+    @cached_property
+    def findings(self) -> RunFindings:
+        """Findings of a run of the whole drive."""
+        found = RunFindings(self)
+        self.run((), [found])
+        return found
+
+
+class RunFindings(Observer[FrameResult]):
+    """Findings, anomalies and failures of a run."""
+
+    def __init__(self, asked: AskedDrive) -> None:
+        self._asked, self._onsets = asked, Onsets()
+        self.list, self.failures, self.frames = FindingList(), FailureSummary(), 0
+
+    def observe(self, result: FrameResult) -> None:
+        """List the findings of a frame."""
+        frame = result.frame
+        self.list.add(find_findings(self._asked.session.source.explainer(result)))
+        self.list.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
+        self.failures.observe(result)
+        self.frames += 1
+
+
+def agent_config(config: Config, settings: Sequence[str]) -> Config:
+    """Return the configuration with an agent's values. No value names a file, a topic or a function.
+
+    Raises:
+        UserError: an unknown key, a wrong value, or a value that only the user may state.
+    """
+    changed = changed_config(config, settings)
+    texts = values(changed)
+    for key in changes(config, changed):
+        value = texts[key]
+        if key.endswith((".model", ".names")) or re.search(r"[/\\:]", json.dumps(value, default=str)):
+            raise UserError(
+                f"{key}: files, topics and functions are stated by the user: bevviz mcp --set {key}=..."
+            )
+    return changed
+
+
+def batch_drives(
+    results: Sequence[tuple[Path, RunInfo]],
+) -> dict[str, Callable[[], AskedDrive]]:
+    """Return what opens each drive of a batch, as its recording was configured."""
+
+    def opener(recording: Path) -> Callable[[], AskedDrive]:
+        def open_it() -> AskedDrive:
+            found = find_source(recording, [], ())
+            return AskedDrive.of([str(recording)], found.paths, found.load())
+
+        return open_it
+
+    return {table.stem: opener(table.with_suffix(".rrd")) for table, _ in results}
