@@ -64,3 +64,8 @@ def __getattr__(name: str) -> "Any":
 
     module, attribute = _HOMES[name]
     return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, also those that are not imported yet."""
+    return [*__all__, "__doc__", "__file__", "__path__"]

@@ -17,12 +17,14 @@ from bevviz.errors import UserError
 from bevviz.model.frame import F64, Frame, Scene
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult
+from bevviz.model.tables import Columns, Tabular
 from bevviz.pipeline.run import RunEnd, iterate_results, run
 from bevviz.pipeline.session import Session
+from bevviz.stages.odometry import Odometry, place
 from bevviz.support.contexts import Closable
+from bevviz.support.python_words import errors_about_arguments, python_words
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
     from rerun.blueprint import Blueprint
 
     from bevviz.evaluate.evaluation import Evaluation
@@ -33,7 +35,7 @@ Settings = Mapping[str, Any] | Sequence[str]
 MAX_RESULTS = 8  # number of single frames whose results are kept for further questions
 
 
-class Drive(Closable):
+class Drive(Closable, Tabular):
     """Open drive: its frames, in order or one by one, and the results of the stages.
 
     Use it as a context manager, or call ``close``.
@@ -55,6 +57,7 @@ class Drive(Closable):
         self.frames, self.session = frames, Session(config)
         self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
+        self._poses: dict[int, F64] = {}  # estimated by runs over the drive, by stamp
         self._questioner: FrameExplainer | None = None
         self._viewer: NotebookViewer | None = None
 
@@ -64,7 +67,8 @@ class Drive(Closable):
 
     def __repr__(self) -> str:
         seconds = f"{self.times[-1]:.1f} s" if len(self) else "empty"
-        return f"<Drive {self.scene.name}: {len(self)} scans, {seconds}, preset {self.config.preset}>"
+        noun = "scans" if self.scene.lidar else "images"
+        return f"<Drive {self.scene.name}: {len(self)} {noun}, {seconds}, preset {self.config.preset}>"
 
     # --- properties ----------------------------------------------------------------------------
 
@@ -81,7 +85,7 @@ class Drive(Closable):
     @property
     def warnings(self) -> list[str]:
         """Losses and irregularities so far, one sentence each."""
-        return [*self._notes, *self.frames.warnings]
+        return [*map(python_words, self._notes), *map(python_words, self.frames.warnings)]
 
     @property
     def times(self) -> F64:
@@ -93,6 +97,25 @@ class Drive(Closable):
         """Return the number of scans in the recording."""
         return len(self.frames.scans)
 
+    @overload
+    def __getitem__(self, frame: int) -> FrameResult: ...
+
+    @overload
+    def __getitem__(self, frame: slice) -> list[FrameResult]: ...
+
+    def __getitem__(self, frame: int | slice) -> FrameResult | list[FrameResult]:
+        """Return the results of one scan by its number, or those of a slice, see ``at``.
+
+        Raises:
+            IndexError: there is no such scan.
+            UserError: a scan cannot be read.
+        """
+        if isinstance(frame, slice):
+            return [self.at(frame=number) for number in range(*frame.indices(len(self)))]
+        if not -len(self) <= frame < len(self):
+            raise IndexError(f"frame {frame}: the drive has {len(self)}")
+        return self.at(frame=frame)
+
     # --- one frame -----------------------------------------------------------------------------
 
     @overload
@@ -101,6 +124,7 @@ class Drive(Closable):
     @overload
     def at(self, *, frame: int) -> FrameResult: ...
 
+    @errors_about_arguments()
     def at(self, time: str | float | None = None, *, frame: int | None = None) -> FrameResult:
         """Return the results of one scan, without tracks and anomalies, which need the frames before it.
 
@@ -120,8 +144,9 @@ class Drive(Closable):
         self._results.move_to_end(key)
         return self._results[key]
 
+    @errors_about_arguments()
     def raw(self, frame: int) -> Frame:
-        """Return a scan with all messages of its time, before any stage.
+        """Return a scan with all messages of its time, before any stage, where the last run placed it.
 
         Raises:
             UserError: there is no such scan, or it cannot be read.
@@ -129,8 +154,10 @@ class Drive(Closable):
         raw_frame = self.frames.frame(frame)
         if raw_frame is None:
             raise UserError(f"frame {frame}: the scan there cannot be read: {'; '.join(self.warnings)}")
-        return raw_frame
+        pose = self._poses.get(raw_frame.stamp)
+        return raw_frame if pose is None else place(raw_frame, pose)
 
+    @errors_about_arguments()
     def why(
         self,
         time: str | float | None = None,
@@ -206,6 +233,7 @@ class Drive(Closable):
         session = Session(viewer.config, loader=self.session.loader)
         return viewer.selected(session.run_single(self.raw(viewer.clicked)))
 
+    @errors_about_arguments()
     def questioner(self, time: str | float | None = None, *, frame: int | None = None) -> FrameExplainer:
         """Return an object that answers questions about one scan. It computes shared results once.
 
@@ -229,6 +257,7 @@ class Drive(Closable):
             self._questioner = FrameExplainer(result, self.session.loader, names)
         return self._questioner
 
+    @errors_about_arguments()
     def configure(self, *settings: str, **more: Any) -> dict[str, ParameterChange]:
         """Change parameters from now on.
 
@@ -259,13 +288,19 @@ class Drive(Closable):
         return iterate_results(self.frames, self.new_session())
 
     def new_session(self) -> Session:
-        """Return a session for a run over the whole drive. It has its own tracks and shares the networks."""
-        return Session(self.config, loader=self.session.loader)
+        """Return a session for a run over the whole drive. It has its own tracks and shares the networks.
+
+        Where it estimates the robot's motion, single frames are placed by that from then on.
+        """
+        self._results.clear()
+        self._poses.clear()
+        return Session(self.config, loader=self.session.loader, odometry=Odometry(self._poses))
 
     def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
         """Run every frame in order and pass the results to the observers, see ``bevviz.pipeline.run.run``."""
         return run(self.frames, self.new_session(), observers)
 
+    @errors_about_arguments()
     def evaluate(
         self, *, truth: str | None = None, kitti_labels: str | PathLike[str] | None = None
     ) -> Evaluation:
@@ -289,6 +324,7 @@ class Drive(Closable):
         self.run([evaluation])
         return evaluation
 
+    @errors_about_arguments()
     def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:
         """Run the whole drive into a Rerun recording.
 
@@ -299,6 +335,7 @@ class Drive(Closable):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
+        from bevviz.evaluate.marks import MarkRecorder
         from bevviz.pipeline.run import Progress
         from bevviz.recording.recorder import DiskWatch, Recorder
         from bevviz.recording.sinks import open_recording
@@ -306,11 +343,12 @@ class Drive(Closable):
         target = Path(path)
         with open_recording(self.scene, self.config, save=target, blueprint=blueprint) as sinks:
             recorder = Recorder(sinks.recording, self.config, self.session.stages.provider)
-            end = self.run([recorder, DiskWatch(sinks), Progress()])
+            end = self.run([recorder, MarkRecorder(sinks.recording), DiskWatch(sinks), Progress()])
             if end.interrupted:
                 raise KeyboardInterrupt
         return target
 
+    @errors_about_arguments()
     def show(self, blueprint: str | Blueprint | None = None) -> None:
         """Run the whole drive into a viewer: in a notebook into the cell, else into a window.
 
@@ -322,6 +360,7 @@ class Drive(Closable):
         Raises:
             UserError: no viewer can be shown.
         """
+        from bevviz.evaluate.marks import MarkRecorder
         from bevviz.notebook import NotebookViewer, in_notebook
         from bevviz.recording.recorder import Recorder
         from bevviz.recording.sinks import open_recording
@@ -331,16 +370,17 @@ class Drive(Closable):
             self.run([self._viewer])
             return
         with open_recording(self.scene, self.config, spawn=True, blueprint=blueprint or "debug") as sinks:
-            self.run([Recorder(sinks.recording, self.config, self.session.stages.provider)])
+            recorder = Recorder(sinks.recording, self.config, self.session.stages.provider)
+            self.run([recorder, MarkRecorder(sinks.recording)])
 
-    def to_pandas(self) -> DataFrame:
+    def _columns(self) -> Columns:
         """Run the whole drive and return a row for each frame: counts, times and problems."""
         from bevviz.fleet.table import row
-        from bevviz.model.frame import data_frame
 
-        return data_frame([row(result, result.config) for result in self])
+        return [row(result, result.config) for result in self]
 
 
+@errors_about_arguments()
 def open_drive(
     path: str | PathLike[str] | Sequence[str | PathLike[str]],
     *,
@@ -403,6 +443,7 @@ def open_drive(
         raise
 
 
+@errors_about_arguments()
 def simulate(
     frames: int = 100,
     seed: int = 0,

@@ -24,6 +24,10 @@ class StageError(Exception):
     """Invalid input or output of a stage, in one clear sentence."""
 
 
+class FunctionError(StageError):
+    """Exception in a user's function, with its file and line. The cause is the exception itself."""
+
+
 def first_line(error: object) -> str:
     """Return the first line of a library's error, as the end of a sentence."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")

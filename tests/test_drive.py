@@ -14,6 +14,7 @@ import pytest
 import bevviz
 from bevviz.cli import main
 from bevviz.model.results import FrameResult
+from bevviz.support.python_words import python_words
 from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Selection
 from tests.support.recordings import Recording, verify
@@ -149,6 +150,48 @@ def test_results_are_exported_as_tables(drive: bevviz.Drive) -> None:
     last = list(drive)[-1]
     assert last.tracks is not None
     assert len(last.tracks.to_pandas()) == len(last.tracks)
+    arrow = result.objects.to_arrow()
+    assert arrow.column("name").to_pylist() == list(result.objects.names)
+    np.testing.assert_array_equal(arrow.column("x").to_numpy(), result.objects.boxes.center[:, 0])
+
+
+def test_results_are_short_in_text_and_pictures_in_a_page(drive: bevviz.Drive) -> None:
+    result = drive.at(0.5)
+    assert result.objects is not None and result.clusters is not None
+    parts = (result, result.frame, result.clusters, result.objects, result.cameras[0].detections)
+    assert all(len(repr(part)) < 200 for part in parts)
+    assert f"{len(result.frame.points):,} points" in repr(result)
+    page = result._repr_html_()
+    assert page.count("data:image/jpeg;base64,") == 2, "the camera and the view from above"
+    assert all(f"<td>{name}</td>" in page for name in result.objects.names)
+
+
+def test_frames_are_reached_by_number_and_slice(drive: bevviz.Drive) -> None:
+    assert drive[3] is drive.at(frame=3) and drive[-1].frame.index == len(drive) - 1
+    assert [result.frame.index for result in drive[-3:]] == [9, 10, 11]
+    with pytest.raises(IndexError, match="frame 12: the drive has 12"):
+        drive[12]
+    assert {"open", "simulate", "Drive"} <= {*dir(bevviz)}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("--set clustering.epz=1: unknown", 'set=["clustering.epz=1"]: unknown'),
+        ("2 drives; choose with --sequence NAME", '2 drives; choose with set={"source.sequence": "NAME"}'),
+        ("no detector: --model FILE.onnx", 'no detector: model="FILE.onnx"'),
+        ("--set sync.offsets='{/t: 0.5}' sets it", 'set=["sync.offsets={/t: 0.5}"] sets it'),
+        ("a number (--frames, --at-frame)", "a number (frames=, frame=)"),
+        ("--set detector.model=det:find: det", 'set=["detector.model=det:find"]: det'),
+    ],
+)
+def test_options_become_arguments_in_python(text: str, said: str) -> None:
+    assert python_words(text) == said
+
+
+def test_errors_in_python_name_arguments(bag: Path) -> None:
+    with pytest.raises(bevviz.UserError, match=r'^set=\["clustering\.epz=1"\]: unknown key'):
+        bevviz.open(bag, set={"clustering.epz": 1})
 
 
 def test_the_synthetic_drive_can_be_opened() -> None:

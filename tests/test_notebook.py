@@ -10,12 +10,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+import rerun as rr
 
 import bevviz
 from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.notebook import NotebookViewer
-from bevviz.recording import entities
+from bevviz.recording import blueprints, entities
 from bevviz.why import Selection
 
 pytest.importorskip("rerun_notebook")
@@ -51,6 +52,11 @@ def viewer(drive: Drive) -> NotebookViewer:
 def tell(drive: Drive, **event: object) -> None:
     """As the page does."""
     viewer(drive).viewer._viewer._handle_custom_msg(json.dumps({**ORIGIN, **event}), [])
+
+
+def test_the_viewer_has_the_application_id_of_its_layout(drive: Drive) -> None:
+    application = blueprints.application_id("workbench", drive.scene, drive.config)
+    assert rr.get_application_id(viewer(drive).recording) == application
 
 
 def click(drive: Drive, path: str, **more: object) -> None:

@@ -14,17 +14,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config.sections import Quantity
-from bevviz.errors import UserError
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 
 Bool = NDArray[np.bool_]
 F32 = NDArray[np.float32]
@@ -34,19 +29,6 @@ I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
 Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # video codecs that Rerun shows without decoding
-
-
-def data_frame(columns: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> DataFrame:
-    """Return a table of pandas.
-
-    Raises:
-        UserError: pandas is not installed.
-    """
-    try:
-        from pandas import DataFrame
-    except ImportError:
-        raise UserError("a table needs pandas: pip install 'bevviz[notebook]'") from None
-    return DataFrame(columns)
 
 
 # --- input -------------------------------------------------------------------------------------
@@ -324,7 +306,7 @@ class LateBoxes:
     index: int = 0  # index of that frame
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Frame:
     """One LiDAR scan with all data of its time. Without a LiDAR, one image of the first camera.
 
@@ -353,6 +335,16 @@ class Frame:
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
     around: RobotContext | None = None
+
+    def __repr__(self) -> str:
+        images = ", ".join(camera.name for camera in self.cameras if camera.image is not None) or "none"
+        points = f"{len(self.points):,} points of {self.lidar or 'no LiDAR'}"
+        return f"<Frame {self.index}: {points}, images: {images}>"
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the clouds are scans of one plane through the sensor, which no floor is in."""
+        return bool(self.clouds) and not any(cloud.xyz[:, 2].any() for cloud in self.clouds)
 
     @property
     def pose(self) -> F64:

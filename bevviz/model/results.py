@@ -5,6 +5,7 @@ The conventions are those of `bevviz.model.frame`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -23,12 +24,10 @@ from bevviz.model.frame import (
     Boxes3D,
     Camera,
     Frame,
-    data_frame,
 )
+from bevviz.model.tables import Columns, Tabular
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
-
     from bevviz.config import AnomalyKind, ClusteringConfig, Config
     from bevviz.model.reasons import Reason
 
@@ -58,8 +57,8 @@ class ClusterState(IntEnum):
     TOO_LARGE = 2  # more points than clustering.max_cluster_points
 
 
-@dataclass(frozen=True, slots=True)
-class Clusters:
+@dataclass(frozen=True, slots=True, repr=False)
+class Clusters(Tabular):
     """DBSCAN clusters of the obstacle points. Row k of each array is the cluster with label k."""
 
     labels: I32  # (P,) label of each obstacle point, -1 for noise
@@ -72,6 +71,9 @@ class Clusters:
     def __len__(self) -> int:
         return len(self.count)
 
+    def __repr__(self) -> str:
+        return f"<Clusters: {len(self)}, {int(self.kept.sum())} of them kept>"
+
     @property
     def kept(self) -> Bool:
         """(K,) mask of the clusters that go on to the fusion."""
@@ -81,10 +83,10 @@ class Clusters:
         """Return the boxes that ``clustering.boxes`` selects."""
         return self.obb if config.boxes == "oriented" else self.aabb
 
-    def to_pandas(self) -> DataFrame:
-        """Return a table with a row for each cluster and its oriented box."""
+    def _columns(self) -> Columns:
+        """Return a row for each cluster and its oriented box."""
         states = [ClusterState(state).name.lower() for state in self.state]
-        return data_frame({"state": states, "points": self.count, **self.obb.columns})
+        return {"state": states, "points": self.count, **self.obb.columns}
 
 
 class DetectionState(IntEnum):
@@ -119,8 +121,8 @@ class Masks:
         return cells
 
 
-@dataclass(frozen=True, slots=True)
-class Detections:
+@dataclass(frozen=True, slots=True, repr=False)
+class Detections(Tabular):
     """2D detections in pixels of the camera's image, best score first, including weak ones.
 
     Only the ``kept`` ones go on to the fusion. The others exist only to be explained.
@@ -138,17 +140,21 @@ class Detections:
     def __len__(self) -> int:
         return len(self.score)
 
+    def __repr__(self) -> str:
+        names = Counter(name for name, kept in zip(self.names, self.kept, strict=True) if kept)
+        return f"<Detections: {_listed(names)}; {int((~self.kept).sum())} weak ones>"
+
     @property
     def kept(self) -> Bool:
         """(D,) mask of the detections that go on to the fusion."""
         return np.equal(self.state, DetectionState.KEPT)
 
-    def to_pandas(self) -> DataFrame:
-        """Return a table with a row for each detection, including weak ones."""
+    def _columns(self) -> Columns:
+        """Return a row for each detection, including weak ones."""
         x0, y0, x1, y1 = self.xyxy.T
         states = [DetectionState(state).name.lower() for state in self.state]
         box = {"x0": x0, "y0": y0, "x1": x1, "y1": y1}
-        return data_frame({"name": self.names, "score": self.score, "state": states, **box})
+        return {"name": self.names, "score": self.score, "state": states, **box}
 
     @staticmethod
     def empty() -> Detections:
@@ -278,8 +284,8 @@ class CameraResult:
 BOX_SIDES = ("front", "back", "left", "right")  # sides of a box: +x, -x, +y, -y
 
 
-@dataclass(frozen=True, slots=True)
-class Objects:
+@dataclass(frozen=True, slots=True, repr=False)
+class Objects(Tabular):
     """Fused boxes: one row for each named object, in Frame.points_frame."""
 
     boxes: Boxes3D  # boxes of the whole object if sizes of its class are known, else around its points
@@ -294,16 +300,19 @@ class Objects:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __repr__(self) -> str:
+        return f"<Objects: {_listed(Counter(self.names))}>"
+
     @staticmethod
     def empty() -> Objects:
         """Return zero objects."""
         f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
         return Objects(Boxes3D.empty(), (), f, i, (), i)
 
-    def to_pandas(self) -> DataFrame:
-        """Return a table with a row for each object."""
+    def _columns(self) -> Columns:
+        """Return a row for each object."""
         origin = {"camera": self.camera, "detection": self.detection, "cluster": self.cluster}
-        return data_frame({"name": self.names, "score": self.score, **self.boxes.columns, **origin})
+        return {"name": self.names, "score": self.score, **self.boxes.columns, **origin}
 
 
 class Opinion(IntEnum):
@@ -356,8 +365,8 @@ class Opinions:
         return np.less(self.partner, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Tracks:
+@dataclass(frozen=True, slots=True, repr=False)
+class Tracks(Tabular):
     """Objects over time: one row for each living track, including tracks without a name.
 
     Coordinates are in ``frame_id``. This is the fixed frame, or (not ``absolute``) the frame of the points,
@@ -382,17 +391,21 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.id)
 
+    def __repr__(self) -> str:
+        names = (name for name, confirmed in zip(self.names, self.confirmed, strict=True) if confirmed)
+        return f"<Tracks: {len(self)}, confirmed: {_listed(Counter(names))}>"
+
     @property
     def speed(self) -> F32:
         """(T,) m/s on the ground."""
         return np.hypot(self.velocity[:, 0], self.velocity[:, 1])
 
-    def to_pandas(self) -> DataFrame:
-        """Return a table with a row for each living track."""
+    def _columns(self) -> Columns:
+        """Return a row for each living track."""
         state = {"confirmed": self.confirmed, "age": self.age, "coasting": self.coasting}
         rows = {"cluster": self.cluster, "object": self.object}
         head = {"id": self.id, "name": self.names, "speed": self.speed}
-        return data_frame({**head, **self.boxes.columns, **state, **rows})
+        return {**head, **self.boxes.columns, **state, **rows}
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,7 +428,7 @@ class Failure:
     traceback: str = ""  # traceback of an unexpected error
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class FrameResult:
     """All results and decisions of one frame. None: the stage did not run, see ``failures``."""
 
@@ -435,7 +448,26 @@ class FrameResult:
     anomalies: tuple[Anomaly, ...] = ()
     splits: Splits | None = None  # None: clusters are those of the LiDAR alone
     opinions: Opinions | None = None  # None: our fusion made the objects, or there are none
+    first_labels: I32 | None = None  # (P,) cluster of each obstacle before detections divided clusters
     ranges: F32 | None = None  # result of ``visibility.range_image``, if a stage has computed it already
+
+    def __repr__(self) -> str:
+        words = [f"{len(self.frame.points):,} points", f"{len(self.cameras)} images"]
+        if self.clusters is not None:
+            words.append(f"{int(self.clusters.kept.sum())} clusters")
+        if any(camera.detections is not None for camera in self.cameras):
+            kept = (camera.detections.kept.sum() for camera in self.cameras if camera.detections is not None)
+            words.append(f"{int(sum(kept))} detections")
+        if self.objects is not None:
+            words.append(f"objects: {_listed(Counter(self.objects.names))}")
+        failed = f"; failed: {', '.join(failure.stage for failure in self.failures)}" if self.failures else ""
+        return f"<FrameResult {self.frame.index}: {', '.join(words)}{failed}>"
+
+    def _repr_html_(self) -> str:
+        """Return the images, the view from above and the objects, for a notebook."""
+        from bevviz.model.preview import preview
+
+        return preview(self)
 
     @staticmethod
     def unprocessed(
@@ -474,3 +506,8 @@ class Anomaly:
     severity: Literal["WARN", "ERROR"] = "WARN"
     since: int = 0  # stamp of the frame in which it began
     rank: float = 0.0  # 0 to 1: severity; the highest come first
+
+
+def _listed(names: Counter[str]) -> str:
+    """Return ``2 car, 1 person``."""
+    return ", ".join(f"{count} {name}" for name, count in sorted(names.items())) or "none"
