@@ -87,6 +87,7 @@ def test_options_override_project_and_environment(capsys: Capture, monkeypatch: 
     [
         ('modle = "x"', "unknown key 'modle'; did you mean 'model'?"),
         ("[clusterin]\neps = 1", "unknown key 'clusterin'; did you mean 'clustering'?"),
+        ("[detector]\nconf = 1", "unknown key 'detector.conf'; did you mean 'detector.conf_threshold'?"),
         ("[clustering]\nepss = 1", "unknown key 'clustering.epss'; did you mean 'clustering.eps'?"),
         ('[clustering]\neps = "3 deg"', "clustering.eps is in metres, not in 'deg'"),
         ("model = 3", "model must be a valid string (given: 3)"),

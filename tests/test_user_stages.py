@@ -111,7 +111,26 @@ ragged = returns(lambda points: ([[0, 0, 1]], [0.5], ["car"]))
 nan = returns(lambda points: ([[0, 0, 1, np.nan]], [0.5], ["car"]))
 names = returns(lambda points: ([[0, 0, 1, 1]], [0.5], ["car", "bus"]))
 flat = returns(lambda points: ([[0, 0, 0, 1, 0, 1, 0]], [0.5], ["car"]))
+swapped = returns(lambda image: ([[0, 0, 9, 9], [400, 300, 50, 40]], [0.5, 0.9], ["car", "car"]))
+shares = returns(lambda image: ([[0.1, 0.2, 0.5, 0.6]], [0.5], ["car"]))
+percent = returns(lambda array: ([[0, 0, 9, 9, 1, 1, 0][: 4 if array.ndim == 3 else 7]], [90], ["car"]))
 number = 3
+asked = []
+
+
+def leaving(points):
+    raise SystemExit(3)
+
+
+def asking(points, params, stamp, number, sensor):
+    asked.append((stamp, number, sensor))
+    return cells(points, params)
+
+
+class Asking(Detector):
+    def __call__(self, bgr, *, sensor, stamp=None):
+        asked.append((stamp, sensor))
+        return super().__call__(bgr)
 '''
 
 
@@ -307,7 +326,17 @@ def test_an_unusable_stage_is_one_line(here: Path, settings: list[str], message:
 @pytest.mark.parametrize(
     ("setting", "stage", "reason"),
     [
-        ("clustering.method=mine.stages:raising", "clustering", "ZeroDivisionError: integer division"),
+        (
+            "clustering.method=mine.stages:raising",
+            "clustering",
+            "mine.stages:raising raised ZeroDivisionError: integer division or modulo by zero "
+            "(stages.py, line 54)",
+        ),
+        ("clustering.method=mine.stages:leaving", "clustering", "leaving raised SystemExit: 3 (stages.py"),
+        ("detector.model=mine.stages:swapped", "detector", "returned 1 of 2 boxes with swapped corners (400"),
+        ("detector.model=mine.stages:shares", "detector", "corners are pixels, not shares of the image"),
+        ("detector.model=mine.stages:percent", "detector", "a score of 90: scores are from 0 to 1"),
+        ("objects.method=mine.stages:percent", "objects", "a score of 90: scores are from 0 to 1"),
         ("clustering.method=mine.stages:short", "clustering", "returned labels of shape ("),
         (
             "clustering.method=mine.stages:floats",
@@ -340,7 +369,15 @@ def test_a_wrong_stage_result_is_a_reason_and_the_frame_goes_on(
     assert reason in failure.reason
     assert "\n" not in failure.reason
     assert result.bev is not None
-    assert ("Traceback" in failure.traceback) == ("ZeroDivision" in reason)
+    assert ("Traceback" in failure.traceback) == ("raised" in reason or "ZeroDivision" in reason)
+
+
+def test_stages_get_the_facts_that_they_ask_for(here: Path, frame: Frame) -> None:
+    session = Session(configured("clustering.method=mine.stages:asking", "detector.model=mine.stages:Asking"))
+    assert session.run(frame).failures == ()
+    import mine.stages
+
+    assert set(mine.stages.asked) == {(frame.stamp, frame.index, "rslidar"), (frame.stamp, "zed")}
 
 
 def test_the_traceback_goes_to_logging(here: Path, frame: Frame, caplog: pytest.LogCaptureFixture) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
+import annotated_types
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -157,6 +158,17 @@ def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
     return Config.model_fields.get(key) if model is None else model.model_fields.get(name)
 
 
+def limits_of(info: FieldInfo) -> tuple[Any, Any]:
+    """Return the least and the largest number of a field, also if it excludes them. None: it has no limit."""
+    low = high = None
+    for rule in info.metadata:
+        if isinstance(rule, annotated_types.Ge | annotated_types.Gt):
+            low = rule.ge if isinstance(rule, annotated_types.Ge) else rule.gt
+        if isinstance(rule, annotated_types.Le | annotated_types.Lt):
+            high = rule.le if isinstance(rule, annotated_types.Le) else rule.lt
+    return low, high
+
+
 def _model(section: str) -> type[BaseModel] | None:
     """Return the model of a section, or None if the name is unknown or stands for a single value."""
     model = Config.model_fields[section].annotation if section in Config.model_fields else None
@@ -167,6 +179,7 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     """Return the sentence for an unknown key, with the nearest of the ``known`` keys."""
     choices = {k.replace(".params.", "."): k for k in [*known, *TUTORIAL_NAMES]}
     by_last = [k for k in choices if k.rsplit(".", 1)[-1] == key.rsplit(".", 1)[-1]]
-    near = by_last or difflib.get_close_matches(key.replace(".params.", "."), choices, 1, 0.3)
+    begun = [k for k in choices if k.startswith(key) and "." in key]  # a name that was cut short
+    near = by_last or begun or difflib.get_close_matches(key.replace(".params.", "."), choices, 1, 0.3)
     hint = f"; did you mean '{choices[near[0]]}'?" if near else ""
     return f"unknown key '{key}'{hint} ('bevviz config' lists all)"

@@ -31,6 +31,7 @@ REFERENCE: dict[str, dict[str, Any]] = {
     },
     "detector": {"conf_threshold": 0.25},
     "fusion": {"method": "centroid", "match_radius": 150.0},
+    "odometry": {"method": "none"},
     "tracking": {"method": "none"},
     "bev": {"range_x": 10.0, "range_y": 10.0, "resolution": 0.05, "style": "reference"},
     "sync": {"motion_compensation": False},

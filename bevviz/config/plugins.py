@@ -44,6 +44,7 @@ CLOUD_PARAMETER_NAMES = (
 )
 IMAGE_PARAMETER_NAMES = ("image", "img", "bgr", "frame", "picture")
 _ARRAY_ANNOTATION = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
+FACTS = ("stamp", "number", "sensor")  # of the frame; a stage gets those that it has parameters for
 STAGE_HINT = "write a function whose first parameter is 'points' or 'image' (docs/stages.md)"
 
 
@@ -56,12 +57,14 @@ class Plugin:
         target: the function or class.
         params: model of its parameters. None: it has none.
         takes_params: whether it takes its parameters as an argument after the array.
+        facts: those of ``FACTS`` that it has parameters for.
     """
 
     name: str
     target: Callable[..., Any]
     params: type[BaseModel] | None
     takes_params: bool
+    facts: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
@@ -126,7 +129,7 @@ def load_plugin(name: str, folder: str | None = "") -> Plugin:
         params = None
     if folder is not None and (fault := _target_fault(target, has_params=params is not None)):
         raise UserError(f"'{name}' is no stage: {fault}")
-    return Plugin(name, target, params, params is not None and _accepts_params(target))
+    return Plugin(name, target, params, params is not None and _accepts_params(target), _facts(target))
 
 
 def _import_module(name: str, folder: str | None) -> ModuleType:
@@ -141,12 +144,30 @@ def _import_module(name: str, folder: str | None) -> ModuleType:
         raise UserError(
             f"there is no module '{error.name}' {where} ('pip install' it, or run where it lies)"
         ) from None
-    except Exception as error:  # A user's file may raise anything.
-        line = traceback.extract_tb(error.__traceback__)[-1]
-        position = f" ({Path(line.filename).name}, line {line.lineno})"
-        raise UserError(
-            f"'{name}' cannot be imported: {type(error).__name__}: {first_line(error)}{position}"
-        ) from error
+    except (Exception, SystemExit) as error:  # A user's file may raise anything.
+        raise UserError(f"'{name}' cannot be imported: {describe_exception(error)}") from error
+
+
+def describe_exception(error: BaseException, file: Path | None = None) -> str:
+    """Return type, first line and position of an exception.
+
+    Args:
+        error: the exception.
+        file: file whose line is named; None, or if it has no part in the exception: where it was raised.
+    """
+    lines = traceback.extract_tb(error.__traceback__)
+    position = next((line for line in reversed(lines) if file and Path(line.filename) == file), lines[-1])
+    place = f"({Path(position.filename).name}, line {position.lineno})"
+    return f"{type(error).__name__}: {first_line(error)} {place}"
+
+
+def _facts(target: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the facts of the frame that a target has parameters for."""
+    call = target.__call__ if isinstance(target, type) else target
+    try:
+        return tuple(name for name in FACTS if name in signature(call).parameters)
+    except (TypeError, ValueError):  # compiled code without a signature
+        return ()
 
 
 def _accepts_params(target: Callable[..., Any]) -> bool:
@@ -156,7 +177,7 @@ def _accepts_params(target: Callable[..., Any]) -> bool:
         parameters = signature(target).parameters.values()
     except (TypeError, ValueError):
         return True
-    positional = [p for p in parameters if p.kind in POSITIONAL]
+    positional = [p for p in parameters if p.kind in POSITIONAL and p.name not in FACTS]
     return len(positional) >= min_count or any(p.kind is Parameter.VAR_POSITIONAL for p in parameters)
 
 
@@ -212,7 +233,7 @@ def _missing_argument(function: Any, first: int, last: int) -> str:
         first: number of arguments that it always gets.
         last: number of arguments that it gets at most.
     """
-    parameters = list(signature(function).parameters.values())
+    parameters = [p for p in signature(function).parameters.values() if p.name not in FACTS]
     required = [p for p in parameters if p.kind in POSITIONAL and p.default is Parameter.empty][last:]
     required += [p for p in parameters if p.kind is Parameter.KEYWORD_ONLY and p.default is Parameter.empty]
     if not required:

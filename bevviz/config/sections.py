@@ -17,9 +17,11 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from bevviz.config.methods import CLUSTERING, GROUND, OBJECTS
 from bevviz.config.value_types import (
     CLASS_SIZES,
+    CLUSTERING,
+    GROUND,
+    OBJECTS,
     ClassSize,
     Degrees,
     Megabytes,
@@ -55,7 +57,7 @@ class SourceConfig(Section):
     dataset: str = Field("", description="data set that PATH is; empty: recognised by its folders")
     sequence: str = Field("", description="drive of a data set that has several in one folder")
     lidar_topics: tuple[str, ...] = Field(
-        (), description="PointCloud2 topics; several are merged in base_frame"
+        (), description="PointCloud2 or LaserScan topics; several are merged in base_frame"
     )
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
@@ -67,6 +69,9 @@ class SourceConfig(Section):
         {},
         description="topic with the robot's boxes in messages of its own, and where in them: topic, objects, "
         "center, size, orientation or yaw, label, score, id",
+    )
+    results: Mapping[str, str] = Field(
+        {}, description="name -> file with a detector's results, which appear on the topic /results/NAME"
     )
     odometry_topic: str = Field("", description="nav_msgs/Odometry used where /tf has no fixed frame")
     base_frame: str = Field("base_link", description="frame that several LiDARs are merged in")
@@ -252,6 +257,16 @@ class OpinionsConfig(Section):
     )
 
 
+class OdometryConfig(Section):
+    """Settings of the estimate of the robot's motion."""
+
+    method: Literal["auto", "kiss_icp", "none"] = Field(
+        "auto",
+        description="kiss_icp: estimate the motion from the scans of a drive; auto: if nothing else states "
+        "it; none: never, as in live runs",
+    )
+
+
 class TrackingConfig(Section):
     """Settings of the tracker."""
 
@@ -353,6 +368,17 @@ class LoggingConfig(Section):
     projected_points: bool = Field(True, description="log obstacle points over the image, coloured by depth")
 
 
+class StoreConfig(Section):
+    """Settings of the store of results, which commands share."""
+
+    size: Megabytes = Field(
+        10_000.0,
+        ge=0,
+        description="disk space for detections of images and boxes of 3D networks, which no command makes "
+        "twice; the least recently used go first; 0: none are kept",
+    )
+
+
 class LiveConfig(Section):
     """Settings of ``bevviz live``, which runs beside the robot."""
 
@@ -423,10 +449,12 @@ class Config(Section):
     fusion: FusionConfig = FusionConfig()
     objects: ObjectsConfig = ObjectsConfig()
     opinions: OpinionsConfig = OpinionsConfig()
+    odometry: OdometryConfig = OdometryConfig()
     tracking: TrackingConfig = TrackingConfig()
     anomalies: AnomaliesConfig = AnomaliesConfig()
     bev: BevConfig = BevConfig()
     logging: LoggingConfig = LoggingConfig()
+    store: StoreConfig = StoreConfig()
     live: LiveConfig = LiveConfig()
 
     _stated: Mapping[str, str] = PrivateAttr(default_factory=dict)

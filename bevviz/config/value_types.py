@@ -1,14 +1,17 @@
-"""Types of parameters: quantities with a unit that users may write, and sizes of classes."""
+"""Types of parameters: quantities with a unit, sizes of classes, and methods of a stage."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, PositiveFloat
 from pydantic_core import PydanticCustomError
+
+from bevviz.config import plugins
+from bevviz.config.pillars import is_network_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,3 +107,35 @@ def _check_count(size: tuple[float, ...]) -> tuple[float, ...]:
 
 
 ClassSize = Annotated[tuple[PositiveFloat, ...], AfterValidator(_check_count)]
+
+
+@dataclass(frozen=True, slots=True)
+class StageMethods:
+    """Allowed methods of a stage: built-in, ``module:function``, a registered name, or ``topic:NAME``."""
+
+    ours: tuple[str, ...]
+    former: Mapping[str, str] = field(default_factory=dict)  # former names of built-in methods
+    networks: bool = False  # whether an ONNX file is allowed
+
+    def check(self, value: str) -> str:
+        """Return the current name of a method. Raise an error for pydantic if the stage does not allow it."""
+        value = self.former.get(value, value)
+        if value in self.ours or ":" in value or value in plugins.registered():
+            return value
+        if self.networks and is_network_file(value):
+            return value
+        registered = f", {', '.join(plugins.registered())} (registered)" if plugins.registered() else ""
+        raise PydanticCustomError(
+            "method",
+            "must be one of {ours}{registered}, {file}module:function, or topic:/name",
+            {
+                "ours": ", ".join(self.ours),
+                "registered": registered,
+                "file": "FILE.onnx, " if self.networks else "",
+            },
+        )
+
+
+GROUND = StageMethods(("polar", "plane"), {"ransac": "plane"})
+CLUSTERING = StageMethods(("dbscan",))
+OBJECTS = StageMethods(("frustum",), networks=True)

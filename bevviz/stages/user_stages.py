@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config import ClusteringConfig, Config, plugin_of
-from bevviz.config.plugins import Plugin
-from bevviz.errors import StageError, UserError
-from bevviz.model import geometry
+from bevviz.config.plugins import Plugin, describe_exception
+from bevviz.errors import FunctionError, StageError, UserError, interrupt_in
+from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, I32, Bool, Boxes3D
 from bevviz.model.results import Clusters, Detections, DetectionState, Ground, Objects
 from bevviz.stages.clustering import describe_clusters
 
 CELL = 1.0  # metres: edge of a cell of the ground level, which is derived from ground points
+ROUNDING = 1e-3  # of a network in half precision, by which a score may leave 0 to 1
 REACH = 200.0  # metres around the origin within which that level is stored
 
 
@@ -30,9 +31,29 @@ class UserStage:
     plugin: Plugin
     call: Callable[..., Any]
 
-    def __call__(self, array: NDArray[Any]) -> Any:
-        """Call the function with a copy of the array, so that it cannot change the frame."""
-        return self.call(array.copy())
+    def __call__(self, array: NDArray[Any], stamp: int, number: int, sensor: str) -> Any:
+        """Call the function with a copy of the array, so that it cannot change the frame.
+
+        Args:
+            array: points or image.
+            stamp: nanoseconds, of the frame.
+            number: number of the frame.
+            sensor: name of the LiDAR or the camera.
+
+        Raises:
+            FunctionError: the function raised an exception, or wanted to end the process.
+            KeyboardInterrupt: the user wants to end, even if the function turned that into another error.
+        """
+        facts = {"stamp": stamp, "number": number, "sensor": sensor}
+        try:
+            return self.call(array.copy(), **{name: facts[name] for name in self.plugin.facts})
+        except (UserError, StageError):
+            raise
+        except (Exception, SystemExit) as error:
+            if interrupt_in(error):
+                raise KeyboardInterrupt from error
+            reason = describe_exception(error, self.plugin.file)
+            raise FunctionError(f"{self.name} raised {reason}") from error
 
     @property
     def name(self) -> str:
@@ -53,13 +74,12 @@ def load_user_stage(config: Config, section: str) -> UserStage | None:
     if plugin.takes_params and plugin.params is not None:
         params.append(plugin.params.model_validate(getattr(config, section).params))
     if not isinstance(plugin.target, type):
-        return UserStage(plugin, lambda array: plugin.target(array, *params))
+        return UserStage(plugin, lambda array, **facts: plugin.target(array, *params, **facts))
     try:
         instance = plugin.target(*params)
-    except Exception as error:  # A user's class may raise anything.
-        raise UserError(
-            f"{section}: {plugin.name} cannot be made: {type(error).__name__}: {error}"
-        ) from error
+    except (Exception, SystemExit) as error:  # A user's class may raise anything.
+        reason = describe_exception(error, plugin.file)
+        raise UserError(f"{section}: {plugin.name} cannot be made: {reason}") from error
     if not callable(instance):
         raise UserError(f"{section}: {plugin.name} makes a {type(instance).__name__} that cannot be called")
     return UserStage(plugin, instance)
@@ -101,6 +121,7 @@ def detections_of(threshold: float, returned: Any, name: str) -> Detections:
     xyxy, score, names = _unpack_three(name, returned, "xyxy, score and class names")
     xyxy = _check_array(name, xyxy, "boxes xyxy", (-1, 4), "fiu").astype(np.float32)
     score, names = _check_scores(name, len(xyxy), score, names)
+    _check_corners(name, xyxy)
     order = np.argsort(-score, kind="stable")
     kept = score[order] >= threshold
     return Detections(
@@ -152,7 +173,7 @@ def make_objects(
         kept = np.append(clusters.kept, False)
         candidates = np.flatnonzero(kept[clusters.labels])  # noise has label -1, the last element
         points, labels = obstacles[candidates], clusters.labels[candidates]
-        for k, rows in geometry.inside_each(points, boxes):
+        for k, rows in inside_each(points, boxes):
             if len(rows):
                 cluster[k] = np.bincount(labels[rows]).argmax()
     detection = np.full(len(boxes), -1, np.int32)
@@ -215,9 +236,27 @@ def _unpack_three(name: str, value: Any, what: str) -> tuple[Any, Any, Any]:
     return value[0], value[1], value[2]
 
 
+def _check_corners(name: str, xyxy: F32) -> None:
+    """Raise StageError if boxes are not left, top, right, bottom in pixels."""
+    swapped = np.flatnonzero((xyxy[:, 2:] < xyxy[:, :2]).any(axis=1))
+    if len(swapped):
+        box = " ".join(f"{value:g}" for value in xyxy[swapped[0]])
+        raise StageError(
+            f"{name} returned {len(swapped)} of {len(xyxy)} boxes with swapped corners ({box}): a box is "
+            "left, top, right, bottom, not a corner and a size"
+        )
+    if len(xyxy) and xyxy.max() <= 1:
+        raise StageError(
+            f"{name} returned boxes within one pixel: corners are pixels, not shares of the image"
+        )
+
+
 def _check_scores(name: str, count: int, score: Any, names: Any) -> tuple[F32, list[str]]:
     """Check scores and names of boxes."""
     scores = _check_array(name, score, "scores", (count,), "fiu").astype(np.float32)
+    wrong = scores[(scores < -ROUNDING) | (scores > 1 + ROUNDING)]
+    if len(wrong):
+        raise StageError(f"{name} returned a score of {wrong[0]:g}: scores are from 0 to 1")
     try:
         listed = [str(text) for text in names]
     except TypeError:
