@@ -1,4 +1,4 @@
-"""The unit and the launch file under examples/robot say what bevviz and systemd take."""
+"""The package of a ROS workspace: systemd unit, launch file, and the command of ros2."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -20,21 +21,22 @@ from bevviz.config.reloading import ReloadableConfig
 from tests.support.ros_graphs import own_graph
 from tests.support.waiting import PATIENCE
 
-EXAMPLES = Path(__file__).parents[1] / "examples" / "robot"
-CONFIG = EXAMPLES / "robot.yaml"
+PACKAGE = Path(__file__).parents[1] / "ros"
+CONFIG = PACKAGE / "config" / "robot.yaml"
+UNIT = PACKAGE / "config" / "bevviz.service"
 
 
 def unit() -> configparser.ConfigParser:
     parser = configparser.ConfigParser(interpolation=None)
     parser.optionxform = str  # type: ignore[assignment,method-assign]
-    parser.read_string((EXAMPLES / "bevviz.service").read_text().replace("\\\n", " "))
+    parser.read_string(UNIT.read_text().replace("\\\n", " "))
     return parser
 
 
 def settings_of(arguments: list[str]) -> ReloadableConfig:
     """Return the settings of a command line with the configuration file of the example."""
     options = _parser()[0].parse_args(arguments)
-    assert options.config == Path("/etc/bevviz/robot.yaml")
+    assert options.config in (Path("/etc/bevviz/robot.yaml"), CONFIG)
     given = [*options.set, f"live.nice={options.nice}"]
     return ReloadableConfig(
         CONFIG, given if options.flight is None else [*given, f"live.flight_time={options.flight}"]
@@ -52,7 +54,7 @@ def test_the_systemd_unit_is_valid(tmp_path: Path) -> None:
     assert (service["Restart"], unit()["Unit"]["StartLimitIntervalSec"]) == ("always", "0")
     if (verify := shutil.which("systemd-analyze")) is not None:
         there = tmp_path / "bevviz.service"
-        there.write_text((EXAMPLES / "bevviz.service").read_text().replace(program, sys.executable))
+        there.write_text(UNIT.read_text().replace(program, sys.executable))
         done = subprocess.run([verify, "verify", str(there)], capture_output=True, text=True, check=False)
         assert [line for line in done.stderr.splitlines() if "bevviz.service" in line] == []
 
@@ -64,7 +66,7 @@ def test_the_command_of_the_unit_runs_and_ends(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "bevviz", *(places.get(argument, argument) for argument in arguments)]
     with own_graph() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-        patch.setenv("PYTHONPATH", str(EXAMPLES.parents[1]))
+        patch.setenv("PYTHONPATH", str(PACKAGE.parent))
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as run:
             assert run.stderr is not None
             try:
@@ -77,6 +79,7 @@ def test_the_command_of_the_unit_runs_and_ends(tmp_path: Path) -> None:
 
 
 def test_the_launch_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BEVVIZ_PROGRAM", "/robot/bevviz")
     made = described(monkeypatch)
     (process,) = [args for kind, args in made if kind == "ExecuteProcess"]
     defaults = {args["name"]: args["default_value"] for kind, args in made if kind == "DeclareLaunchArgument"}
@@ -87,10 +90,10 @@ def test_the_launch_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
         return defaults[part[1]["name"]] if isinstance(part, tuple) else str(part)
 
     program, *arguments = map(text, process["cmd"])
-    assert program == "/opt/bevviz/bin/bevviz" and process["respawn"] is True
+    assert program == "/robot/bevviz" and process["respawn"] is True
     assert arguments[-3:] == ["--ros-args", "-r", "__ns:=/"]
     settings = settings_of(arguments)
-    assert settings.config.detector.model == "" and settings.config.live.flight_folder == "/var/lib/bevviz"
+    assert settings.config.detector.model == "" and settings.config.live.flight_folder == "."
 
 
 def described(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
@@ -114,7 +117,46 @@ def described(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]
         for kind in inside:
             setattr(module, kind, noted(kind))
         monkeypatch.setitem(sys.modules, name, module)
-    said: list[tuple[str, dict[str, Any]]] = runpy.run_path(str(EXAMPLES / "bevviz.launch.py"))[
+    said: list[tuple[str, dict[str, Any]]] = runpy.run_path(str(PACKAGE / "launch" / "live.launch.py"))[
         "generate_launch_description"
     ]()
     return said
+
+
+def test_the_workspace_installs_what_it_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: dict[str, Any] = {}
+    setuptools = ModuleType("setuptools")
+    setuptools.setup = said.update  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "setuptools", setuptools)
+    runpy.run_path(str(PACKAGE / "setup.py"))
+    files = [file for _, group in said["data_files"] for file in group]
+    assert [file for file in files if not (PACKAGE / file).is_file()] == []
+    name = ElementTree.parse(PACKAGE / "package.xml").getroot().findtext("name")
+    assert (PACKAGE / "resource" / str(name)).is_file() and f"share/{name}/launch" in dict(said["data_files"])
+
+
+def test_ros2_bevviz_runs_the_program_apart_from_ros(tmp_path: Path) -> None:
+    (tmp_path / "ros2cli").mkdir()
+    (tmp_path / "ros2cli" / "command.py").write_text("class CommandExtension: pass\n")
+    script = (
+        "import argparse; from bevviz_ros.command import BevvizCommand as C; p = argparse.ArgumentParser();"
+        "c = C(); c.add_arguments(p, 'ros2'); raise SystemExit(c.main(parser=p, args=p.parse_args()))"
+    )
+    fake = tmp_path / "bevviz"
+    fake.write_text('#!/bin/sh\necho "$@" "path: $PYTHONPATH"\n')
+    environment = {
+        "PYTHONPATH": f"{tmp_path}:{PACKAGE}",
+        "BEVVIZ_PROGRAM": str(fake),
+        "PATH": "/usr/bin:/bin",
+    }
+
+    def typed() -> str:
+        command = [sys.executable, "-c", script, "why", "--at", "3"]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False).stdout
+
+    fake.chmod(0o755)
+    assert typed() == "why --at 3 path: \n"
+    fake.unlink()
+    assert (
+        typed() == f"{fake}: No such file or directory: install bevviz there, or name it in BEVVIZ_PROGRAM\n"
+    )

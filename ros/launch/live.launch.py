@@ -1,23 +1,29 @@
-"""bevviz among a robot's nodes: ``ros2 launch ./bevviz.launch.py model:=/opt/models/yolo11n.onnx``.
+"""bevviz among a robot's nodes: ``ros2 launch bevviz live.launch.py model:=/opt/models/yolo11n.onnx``.
 
-It runs in an environment of its own (numpy 2), so it is a process here and no Node. It comes back when it has
-ended, and it shuts nothing down.
+bevviz runs in an environment of its own (numpy 2), so it is a process here and no Node. It restarts when it
+has ended, and it ends no other node.
 """
+
+import os
+import shutil
+from pathlib import Path
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration
 
+PROGRAM = os.environ.get("BEVVIZ_PROGRAM") or shutil.which("bevviz") or "/opt/bevviz/bin/bevviz"
 ARGUMENTS = {
-    "program": ("/opt/bevviz/bin/bevviz", "of the environment that bevviz is installed in"),
-    "config": ("/etc/bevviz/robot.yaml", "configuration, as 'bevviz config' prints it"),
+    "program": (PROGRAM, "program of the environment that bevviz is installed in"),
+    "config": (str(Path(__file__).parents[1] / "config" / "robot.yaml"), "file as 'bevviz config' prints it"),
     "model": ("", "detector, an .onnx file; empty: none"),
-    "folder": ("/var/lib/bevviz", "where the last seconds are saved"),
-    "namespace": ("/", "of the robot"),
+    "folder": (".", "existing folder for the last seconds before a fault"),
+    "namespace": ("/", "namespace of the robot"),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return the process and its arguments."""
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     command = [
         value["program"],
