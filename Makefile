@@ -7,7 +7,7 @@ BIN = $(VENV)/bin
 CONSTRAINTS ?= docs/constraints.txt
 INSTALL = $(BIN)/pip install --quiet $(CONSTRAINTS:%=--constraint %)
 
-.PHONY: demo test test-fast check docs bench accuracy constraints sbom clean
+.PHONY: demo test test-fast check docs bench accuracy constraints sbom wheel clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
@@ -52,6 +52,14 @@ sbom: .venv-release/.installed
 	mkdir -p dist
 	.venv-release/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
 		--output-file dist/bevviz.cdx.json .venv-user/bin/python
+
+# What a release publishes. tools/check_wheel.py installs the wheel alone and runs the demo.
+wheel: .venv-release/.installed
+	rm -rf dist
+	.venv-release/bin/python -m build --outdir dist .
+	.venv-release/bin/twine check --strict dist/*
+	.venv-release/bin/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	.venv-release/bin/check-jsonschema --builtin-schema vendor.github-actions action.yml
 
 $(VENV)/.installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)

@@ -22,11 +22,11 @@ from bevviz.recording.provenance import (
     Provenance,
     dependencies_of,
     differences,
-    file_hash,
     machine,
     provenance,
     versions,
 )
+from bevviz.support.files import file_hash
 
 PACKAGE = Path(bevviz.__file__).parent
 # What the packages do that are imported, but whose version changes no result.
@@ -51,6 +51,12 @@ NEUTRAL = {
     "distributed": "brings jobs to other machines",
     "pandas": "results as tables",
     "ipython": "the viewer in a notebook",
+    "mcp": "answers to agents",
+    "anyio": "answers to agents",
+    "fsspec": "bytes of files over the network",
+    "typing_extensions": "types of outputs",
+    "typing-extensions": "types of outputs",
+    "foxglove-sdk": "shows live results elsewhere",
 }
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 def pose(row: dict[str, Any]) -> Any:
     """(4, 4) of a record."""
-    from pyquaternion import Quaternion  # type: ignore[import-not-found]
+    from pyquaternion import Quaternion
 
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Quaternion(row["rotation"]).rotation_matrix, row["translation"]
