@@ -1,9 +1,10 @@
-"""Former names of public modules, accepted for one version."""
+"""Former names of public modules and of options, accepted for one version."""
 
 from __future__ import annotations
 
 import importlib
 import warnings
+from collections.abc import Sequence
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from types import ModuleType
@@ -14,6 +15,12 @@ FORMER = {
     "bevviz.logging": "bevviz.recording",
     "bevviz.results": "bevviz.model.results",
     "bevviz.run": "bevviz.pipeline.run",
+}
+
+FORMER_OPTIONS = {  # (command, former option) -> present option
+    ("batch", "--dataset"): "--catalog-name",
+    ("demo", "--bag"): "--output",
+    ("export", "--out"): "--output",
 }
 
 
@@ -32,6 +39,18 @@ class FormerNameLoader(Loader):
         """Give the module its own spec back, which the import system has replaced."""
         if module.__spec__ is not None and module.__spec__.loader is self:
             module.__spec__ = module.__spec__.loader_state
+
+
+def present_options(command_line: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a command line with the present names of options, and a line for each former name."""
+    command, lines, present = command_line[0] if command_line else "", [], []
+    for argument in command_line:
+        name, equals, value = argument.partition("=")
+        option = FORMER_OPTIONS.get((command, name), name)
+        if option != name:
+            lines.append(f"bevviz {command} {name} is called {option} now")
+        present.append(f"{option}{equals}{value}")
+    return present, lines
 
 
 def spec_of(name: str) -> ModuleSpec | None:

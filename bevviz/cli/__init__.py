@@ -9,7 +9,7 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,18 +17,23 @@ from bevviz.cli import (
     bag,
     batch,
     calib,
+    causes,
     compare,
     completion,
     config,
+    cut,
     demo,
     evaluate,
     export,
+    fix,
     info,
     interrupts,
     live,
+    mcp,
     outputs,
     recover,
     report,
+    store,
     sweep,
     trust,
     tune,
@@ -39,6 +44,7 @@ from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
+from bevviz.renamed import present_options
 from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
@@ -53,11 +59,14 @@ EPILOG = """examples:
   bevviz why drive.mcap --at 12.5             why an object was not reported then
   bevviz report drive.mcap --at 12.5          a bug report that stands on its own
   bevviz recover drive.mcap -o sound.mcap     a sound copy of a damaged bag
+  bevviz cut drive.mcap -o part.mcap --start 10 --end 20   ten seconds of it
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
   bevviz evaluate drive.mcap --model yolo11n.onnx --min recall=0.8                how right? a gate for CI
   bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz batch bags/ -o runs                  many bags, and the worst frames of all of them
+  bevviz causes runs                          what the missed objects of that batch have in common
+  bevviz fix runs --cause 1 -o fix.yaml       parameters that find them, tried on other drives
   bevviz live --model yolo11n.onnx --serve    the same beside a running robot, in a browser
   bevviz snap                                 save what it saw in the last 30 seconds
   bevviz calib drive.mcap                     is it the calibration or the clock?
@@ -83,6 +92,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     # Imports and frames make many objects and few cycles. At Python's default threshold of 700 the collector
     # takes a tenth of the run time.
     gc.set_threshold(50_000, 10, 10)
+    # Products of a cloud and a 3 x 3 matrix are too small for threads, and idle threads of OpenBLAS spin.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if arguments is None:
         interrupts.install()
     try:
@@ -95,12 +106,14 @@ def _main(arguments: Sequence[str] | None) -> int:
         if not command_line:
             parser.print_help()
             return 2
-        if command_line[0] not in commands and Path(command_line[0]).exists():
+        if command_line[0] not in commands and ("://" in command_line[0] or Path(command_line[0]).exists()):
             command_line = ["open", *command_line]
+        command_line, renamed = present_options(command_line)
         options = parser.parse_args(command_line)
         if options.verbose:
             _log_to_stderr()
         outputs.set_up_notes(quiet=options.quiet)
+        outputs.warn(renamed)
         follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run
@@ -136,7 +149,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 gc.freeze()  # A last search for cycles would take a third of a second.
 
 
-def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
+def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
     """Return the parser and the names of the commands."""
     parser = Parser(
         prog="bevviz",
@@ -150,6 +163,8 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         workbench,
         bag,
         batch,
+        causes,
+        fix,
         info,
         why,
         compare,
@@ -160,9 +175,12 @@ def _parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
         calib,
         report,
         recover,
+        cut,
         demo,
         live,
+        mcp,
         config,
+        store,
         trust,
         completion,
     ):

@@ -9,6 +9,7 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
+    add_jobs,
     add_keep,
     add_output,
     add_selection,
@@ -27,7 +28,9 @@ def add(commands: Commands) -> None:
         help="run the pipeline over a recorded bag",
         description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
     )
-    add_selection(add_bag(bag))
+    group = add_bag(bag)
+    add_selection(group)
+    add_jobs(group)
     add_config(bag)
     add_keep(add_output(bag))
     bag.set_defaults(run=_bag)
@@ -39,4 +42,5 @@ def _bag(options: argparse.Namespace) -> int:
 
     config = load_config(options)
     with open_bag(options, config) as source:
-        return process(Drive(source, config), Outputs.of(options), Path(options.paths[0].stem + ".rrd"))
+        default = Path(options.paths[0].stem + ".rrd")
+        return process(Drive(source, config), Outputs.of(options), default, source, options.jobs)

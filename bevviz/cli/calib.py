@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
     from bevviz.config import Config
     from bevviz.model.frame import Scene
+    from bevviz.model.json_forms import CalibForm
 
 FRAMES = 30  # Number of frames to use without --every.
 
@@ -64,7 +65,7 @@ def _calib(options: argparse.Namespace) -> int:
                 steps.update(round(100 * share) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
-    tree = {"cameras": [result.to_dict() for result in results]}
+    tree: CalibForm = {"cameras": [result.to_dict() for result in results]}
     print_result(options, "calib", tree, lambda: "\n".join(map(_text, results)))
     if options.write is not None:
         _write(results, options.write)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from math import inf
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from bevviz.config import Config, Layer, Preset
     from bevviz.evaluate.ground_truth import TruthLookup
     from bevviz.recording.source_lookup import RecordingSource
+    from bevviz.why import Selection
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -53,6 +55,7 @@ def parse_real(is_valid: Callable[[float], bool], problem: str) -> Callable[[str
 
 number = parse_whole(0, inf, "is no number, counted from 0")
 positive = parse_whole(1, inf, "is no whole number of 1 or more")
+_metres = parse_real(lambda metres: 0 < metres < 1000, "is no length in metres")
 port = parse_whole(1, 65534, "is no port (1 to 65534)")
 
 
@@ -97,6 +100,13 @@ def add_dataset(group: argparse._ActionsContainer) -> None:
         dest="source_sequence",
         metavar="NAME",
         help="which drive, of a data set with several in one folder",
+    )
+    group.add_argument(
+        "--results",
+        dest="source_results",
+        action="append",
+        metavar="[NAME=]PATH",
+        help="results (KITTI, nuScenes, COCO, Parquet, CSV) in place of our own; repeatable",
     )
 
 
@@ -146,12 +156,93 @@ def add_at(group: argparse._ArgumentGroup, what: str, *, required: bool = False)
     scan.add_argument("--at-frame", type=number, metavar="N", help="the same by its number, counted from 0")
 
 
+def add_subject(parser: argparse.ArgumentParser, default: str) -> argparse._ArgumentGroup:
+    """Add the options that select an object of a frame. Return their group.
+
+    Args:
+        parser: of the command.
+        default: sentence on what is meant without any of them.
+    """
+    targets = parser.add_argument_group("what to explain", default)
+    target = targets.add_mutually_exclusive_group()
+    target.add_argument("--class", dest="label", default="", metavar="NAME", help="all of that class")
+    target.add_argument(
+        "--box", type=_numbers(2, 4), default=(), metavar="U,V[,U1,V1]", help="at that pixel, or in that box"
+    )
+    target.add_argument(
+        "--point",
+        type=_numbers(3),
+        default=(),
+        metavar="X,Y,Z",
+        help="there, in metres of the points' frame",
+    )
+    target.add_argument(
+        "--cell",
+        type=_numbers(2),
+        default=(),
+        metavar="ROW,COLUMN",
+        help="what is in that cell of the bird's-eye view",
+    )
+    target.add_argument("--cluster", type=number, metavar="N", help="the cluster of that number")
+    target.add_argument("--object", type=number, metavar="N", help="the object in that row")
+    target.add_argument("--detection", type=number, metavar="N", help="the detection in that row")
+    targets.add_argument(
+        "--radius", type=_metres, default=0.5, metavar="M", help="around the point or cell (default: 0.5)"
+    )
+    targets.add_argument(
+        "--camera", default="", metavar="NAME", help="of pixel or detection, if there are several"
+    )
+    return targets
+
+
+def _numbers(*counts: int) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) not in counts or not all(abs(v) < 1e6 for v in values):
+            wanted = " or ".join(map(str, counts))
+            raise argparse.ArgumentTypeError(f"'{text}' is not {wanted} numbers with commas between")
+        return values
+
+    return parse
+
+
+def selected_subject(options: argparse.Namespace) -> Selection:
+    """Return the selection of the options of ``add_subject``."""
+    from bevviz.why import Selection
+
+    return Selection(
+        label=options.label,
+        box=options.box,
+        point=options.point,
+        radius=options.radius,
+        cell=tuple(map(int, options.cell)),
+        cluster=options.cluster,
+        detection=options.detection,
+        object=options.object,
+        camera=options.camera,
+    )
+
+
 def add_selection(group: argparse._ArgumentGroup) -> None:
     """Add the options that select a range of frames."""
     group.add_argument("--start", metavar="TIME", help="skip what is before this time")
     group.add_argument("--end", metavar="TIME", help="stop at this time")
     group.add_argument("--every", type=positive, default=1, metavar="N", help="run each N-th scan only")
     group.add_argument("--frames", type=frame_range, metavar="A:B", help="run scans A to B-1, counted from 0")
+
+
+def add_jobs(group: argparse._ActionsContainer) -> None:
+    """Add the option for processes that run the networks ahead."""
+    group.add_argument(
+        "--jobs",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="processes that run the networks on frames ahead (default: 1, no further process)",
+    )
 
 
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
@@ -279,7 +370,40 @@ def collect_settings(options: argparse.Namespace) -> list[str]:
         "source.sequence": getattr(options, "source_sequence", None),
         "logging.keep": getattr(options, "keep", None),
     }
-    return [*options.set, *(f"{key}={value}" for key, value in values.items() if value is not None)]
+    results = result_settings(getattr(options, "source_results", None) or [], options.set, values)
+    return [*options.set, *results, *(f"{key}={value}" for key, value in values.items() if value is not None)]
+
+
+def result_settings(
+    results: Sequence[str], settings: Sequence[str], options: Mapping[str, str | None]
+) -> list[str]:
+    """Return the settings for ``--results``: the files, and the first as the stage whose results they are.
+
+    Args:
+        results: ``PATH`` or ``NAME=PATH`` each.
+        settings: those of ``--set``, which win.
+        options: those of other options, which win.
+
+    Raises:
+        UserError: a file is missing or of no known kind, or a name comes twice.
+    """
+    from bevviz.datasets.result_files import RESULTS, results_are_2d
+
+    named = dict[str, str]()
+    for text in results:
+        name, equals, path = text.partition("=")
+        path = path if equals else name
+        name = re.sub(r"\W+", "_", name if equals else Path(path).stem).strip("_") or "results"
+        if name in named:
+            raise UserError(f"--results {text}: {name} is the name of {named[name]} already; give NAME=PATH")
+        named[name] = path
+    stages = dict[str, str]()
+    for name, path in named.items():
+        key = "detector.model" if results_are_2d(Path(path).expanduser()) else "objects.method"
+        stages.setdefault(key, f"topic:{RESULTS}{name}")
+    stated = {text.partition("=")[0] for text in settings} | {key for key, value in options.items() if value}
+    chosen = [f"{key}={value}" for key, value in stages.items() if key not in stated]
+    return [f"source.results={json.dumps(named)}", *chosen] if named else []
 
 
 def load_config_from(

@@ -12,6 +12,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from getpass import getuser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote
@@ -118,13 +119,15 @@ def set_up_notes(*, quiet: bool) -> None:
 def say(line: str, *, always: bool = False) -> None:
     """Print a line on stderr. ``--quiet`` suppresses it unless ``always`` is set."""
     if always or not _quiet:
-        print(f"bevviz: {printable(line)}", file=sys.stderr)
+        with progress.cleared():
+            print(f"bevviz: {printable(line)}", file=sys.stderr)
 
 
 def warn(warnings: Iterable[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
-        print(f"bevviz: {_colored('warning:', '33')} {printable(warning)}", file=sys.stderr)
+        with progress.cleared():
+            print(f"bevviz: {_colored('warning:', '33')} {printable(warning)}", file=sys.stderr)
 
 
 def print_error(message: object, kind: str = "error") -> None:
@@ -153,16 +156,23 @@ def print_hints(scene: Scene, config: Config) -> None:
         say("no detector: give --model FILE.onnx, or name it in bevviz.toml, to find objects in the images")
 
 
-def announce_viewer(address: str) -> None:
-    """Print the address of a viewer and how to reach it from elsewhere. Open the browser if there is one."""
-    say(f"viewer at {address}", always=True)
+def announce(what: str, address: str, browser: bool = True) -> None:
+    """Print an address and how to reach it from elsewhere. With ``browser``, open it if there is one.
+
+    Args:
+        what: what is at the address.
+        address: address of a page of this machine.
+        browser: whether to open it.
+    """
+    say(f"{what} at {address}", always=True)
     ports = [str(port) for port in re.findall(r":(\d+)", unquote(address))]
     over_ssh = " ".join(f"-L {port}:localhost:{port}" for port in ports)
-    if os.environ.get("SSH_CONNECTION"):
-        say(f"on your own machine first: ssh {over_ssh} {socket.gethostname()}")
-    if has_browser():
+    opens = browser and (has_display() or has_browser())
+    if os.environ.get("SSH_CONNECTION") or not opens:
+        say(f"from another machine, there first: ssh -N {over_ssh} {getuser()}@{socket.gethostname()}")
+    if opens:
         open_browser(address)
-    say("serving until Ctrl-C; only this machine can reach it")
+    say("open until Ctrl-C; only this machine can reach it")
 
 
 def program() -> str:
@@ -231,7 +241,7 @@ def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) 
 
     Args:
         options: of the command.
-        form: name of the format. The number after it increases with a change that breaks a reader.
+        form: name of the format, see ``bevviz.model.json_forms``.
         tree: the result: values that JSON can represent, NaN, and tuples.
 
     Raises:
@@ -241,9 +251,10 @@ def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) 
         return
     import json
 
+    from bevviz.model.json_forms import form_name
     from bevviz.support.files import save_text
 
-    text = json.dumps({"form": f"bevviz.{form}/1", **_plain(tree)}, indent=1, allow_nan=False)
+    text = json.dumps({"form": form_name(form), **_plain(tree)}, indent=1, allow_nan=False)
     if json_on_stdout(options):
         print(text, flush=True)
     else:
@@ -278,7 +289,6 @@ WRITTEN = {
     "json": "--json",
     "junit": "--junit",
     "write": "--write",
-    "bag": "--bag",
 }
 # Files written at the end of the run. Only ``check_outputs`` checks their folder before.
 TEXTS = ("csv", "json", "write")

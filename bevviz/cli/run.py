@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.drive import Drive
+    from bevviz.model.frame import Frame
     from bevviz.model.protocols import Items, Observer, Processor
     from bevviz.model.results import FrameResult
+    from bevviz.pipeline.frame_workers import FrameParts
     from bevviz.pipeline.run import RunEnd
 
 T = TypeVar("T")
@@ -41,15 +44,21 @@ def table_status(end: RunEnd) -> int:
     return 0 if end.frames else 1
 
 
-def process(drive: Drive, outputs: Outputs, default: Path) -> int:
+def process(
+    drive: Drive, outputs: Outputs, default: Path, source: FrameParts | None = None, jobs: int = 1
+) -> int:
     """Run every stage on every frame and log the results to every output. Return the exit status.
 
     Args:
         drive: the frames.
         outputs: requested outputs.
         default: file to save if nothing can be shown.
+        source: the frames, if other processes can read them.
+        jobs: number of processes that run the networks ahead. 1: none.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
+    from bevviz.evaluate.marks import MarkRecorder
+    from bevviz.pipeline.frame_workers import working_ahead
     from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()
@@ -59,14 +68,18 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         print_hints(drive.scene, drive.config)
         recorders.append(Recorder(recording, drive.config, session.stages.provider))
-        return [*recorders, anomalies, failures]
+        return [*recorders, MarkRecorder(recording), anomalies, failures]
 
     def finish() -> None:
         warn(failures.warnings)
         warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")
 
-    return run_logged(drive.frames, session, drive.config, outputs.or_file(default), observers, finish)
+    with ExitStack() as stack:
+        processor: Processor[Frame, FrameResult] = session
+        if source is not None:
+            processor = stack.enter_context(working_ahead(session, source, [drive.config], jobs))
+        return run_logged(drive.frames, processor, drive.config, outputs.or_file(default), observers, finish)
 
 
 def run_logged(

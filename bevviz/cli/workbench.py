@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
+from urllib.parse import urlencode
 
 from bevviz.cli.interrupts import interruptible, wait_for_interrupt
 from bevviz.cli.options import (
@@ -18,12 +21,14 @@ from bevviz.cli.options import (
     load_config,
     port,
 )
-from bevviz.cli.outputs import announce_viewer, has_display, print_hints, say, warn
+from bevviz.cli.outputs import announce, has_display, print_hints, say, warn
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
+    from bevviz.config import Config
     from bevviz.workbench.session import WorkbenchSession
 
+EMPTY: Mapping[str, str] = MappingProxyType({})
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
   bevviz open drive.mcap --model yolo11n.onnx           a page: click what you see, and it answers
@@ -60,6 +65,17 @@ def add(commands: Commands) -> None:
 def _open(options: argparse.Namespace) -> int:
     if (recording := getattr(options, "shown", None)) is not None:
         return _show(recording, options)
+    return open_page(options, load_config(options))
+
+
+def open_page(options: argparse.Namespace, config: Config, shown: Mapping[str, str] = EMPTY) -> int:
+    """Serve the workbench until the user ends it.
+
+    Args:
+        options: options of ``bevviz open``.
+        config: configuration of the run.
+        shown: state of the page, as its address holds it.
+    """
     try:
         from bevviz.workbench.server import serve
         from bevviz.workbench.startup import LabelledSource
@@ -67,15 +83,17 @@ def _open(options: argparse.Namespace) -> int:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    config = load_config(options)
+    from bevviz.bags.remote import beside
+
     with ExitStack() as stack:
-        source, second_source = (stack.enter_context(LabelledSource(options.paths, config)) for _ in range(2))
+        source = stack.enter_context(LabelledSource(options.paths, config))
         number = options.at_frame or 0
         first = source.checked(number) if options.at is None else source.number_at(options.at)
         warn(source.warnings)
 
         def make() -> WorkbenchSession:
             _arrow_without_pandas()
+            second_source = stack.enter_context(LabelledSource(options.paths, config))
             print_hints(source.scene, config)
             from bevviz.drive import Drive
             from bevviz.evaluate import truth_source
@@ -84,18 +102,15 @@ def _open(options: argparse.Namespace) -> int:
             truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
             if options.truth is not None or options.kitti_labels is not None:
                 source.truth_of = second_source.truth_of = truth_of
-            return recorded_session(Drive(source, config), second_source, options.paths, truth_of, first)
+            labels = options.truth, options.kitti_labels
+            drive = Drive(source, config)
+            return recorded_session(drive, second_source, options.paths, truth_of, first, labels)
 
         def ready(address: str) -> None:
-            say(f"workbench at {address}", always=True)
-            if options.browser and has_display():
-                import webbrowser
-
-                webbrowser.open(address)
-            say("open until Ctrl-C; only this machine can reach it")
+            announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, options.browser)
 
         with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
-            drive = "\n".join(str(path.resolve()) for path in options.paths)
+            drive = "\n".join(str(beside(path)) for path in options.paths)
             serve(make, drive, options.port, ready)
     return 0
 
@@ -111,7 +126,7 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
     if larger := rerun_cli.too_large_for_web(recording, recording.stat().st_size):
         warn([larger])
     with rerun_cli.serve_in_browser(recording, options.port) as address:
-        announce_viewer(address)
+        announce("viewer", address)
         wait_for_interrupt()
     return 0
 
