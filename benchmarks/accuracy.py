@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import platform
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,10 +23,16 @@ from bevviz.model.geometry import iou
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.synthetic import Snapshot, SyntheticSource
-from tests.support.track_metrics import Tallies, TrackTally, add_tracks, truth_of
+from tests.support.track_metrics import Tallies, TrackTally, add_tracks, moved, truth_of, without_pose
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")
 CLASSES = ("person", "cyclist", "car")
+# Source of the robot's motion, and the setting that makes it.
+MOTIONS = {
+    "stated": "odometry.method=auto",
+    "estimated": "odometry.method=auto",
+    "unknown": "odometry.method=none",
+}
 MIN_HEIGHT = 20  # visible pixels in height of an object that must be found
 
 SYNTHETIC = f"""## Objects on synthetic drives
@@ -82,7 +89,7 @@ def main() -> None:
             add_clusters(tally, shot, result)
             add_detections(tally, shot, result)
             add_objects(tally, shot, result)
-    tracked = Tallies(TrackTally)
+    tracked = {motion: Tallies(TrackTally) for motion in MOTIONS}
     for seed in options.tracked_seeds:
         track(tracked, SyntheticSource(options.frames, seed), options.tracked)
     sections = [kitti.section(options.data)] if (options.data / "kitti").is_dir() else []
@@ -101,14 +108,18 @@ def main() -> None:
         print(details(tallies))
 
 
-def track(tallies: Tallies, source: SyntheticSource, frames: int) -> None:
-    """Run the default preset over the first ``frames`` scans of a drive and tally the tracks."""
-    session = Session(load(settings=["detector.model=demo"]))
+def track(tallies: Mapping[str, Tallies], source: SyntheticSource, frames: int) -> None:
+    """Run the default preset over the first ``frames`` scans of a drive and tally the tracks by motion."""
+    model = "detector.model=demo"
+    sessions = {motion: Session(load(settings=[model, setting])) for motion, setting in MOTIONS.items()}
     for index in tqdm(range(min(frames, source.total)), unit="scan", disable=None):
         shot = source.snapshot(index)
-        tracks = session.run(shot.frame).tracks
-        assert tracks is not None
-        add_tracks(tallies, source.seed, tracks, truth_of(source, shot, required(shot)[0]))
+        truth = truth_of(source, shot, required(shot)[0])
+        for motion, session in sessions.items():
+            result = session.run(shot.frame if motion == "stated" else without_pose(shot.frame))
+            assert result.tracks is not None
+            world_from_map = result.frame.pose @ np.linalg.inv(shot.frame.pose)
+            add_tracks(tallies[motion], source.seed, result.tracks, moved(truth, world_from_map))
 
 
 def add_ground(tally: Tally, shot: Snapshot, result: FrameResult) -> None:
@@ -258,7 +269,7 @@ def tables(tallies: dict[Preset, Tally]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def track_table(tallies: Tallies, frames: int, seeds: list[int]) -> str:
+def track_table(tallies: Mapping[str, Tallies], frames: int, seeds: list[int]) -> str:
     lines = [
         "\n### Tracks: ids and speeds, `default` preset\n",
         f"{frames} scans in a row of each of the drives {seeds}. Tracks count that are shown and have a",
@@ -267,13 +278,24 @@ def track_table(tallies: Tallies, frames: int, seeds: list[int]) -> str:
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for name in CLASSES:
-        tally, c = tallies[name], tallies[name].counts
+        tally, c = tallies["stated"][name], tallies["stated"][name].counts
         precision, recall = c["tp"] / max(c["tp"] + c["fp"], 1), c["tp"] / max(c["tp"] + c["fn"], 1)
         middle, most = np.quantile(tally.speeds, (0.5, 0.9)) if tally.speeds else (np.nan, np.nan)
         lines.append(
             f"| {name} | {tally.mota:.3f} | {tally.idf1:.3f} | {precision:.3f} | {recall:.3f} "
             f"| {c['switches']} | {middle:.2f} | {most:.2f} |"
         )
+    lines += [
+        "\nThe same if the motion is stated, estimated (`odometry.method`) or unknown:\n",
+        f"| motion | MOTA {', '.join(CLASSES)} | id switches | speed error, median m/s |",
+        "| --- | ---: | ---: | ---: |",
+    ]
+    for motion, tally_of in tallies.items():
+        classes = [tally_of[name] for name in CLASSES]
+        mota = ", ".join(f"{tally.mota:.3f}" for tally in classes)
+        switches = sum(tally.counts["switches"] for tally in classes)
+        speed = np.median(np.concatenate([tally.speeds for tally in classes]))
+        lines.append(f"| {motion} | {mota} | {switches} | {speed:.2f} |")
     return "\n".join(lines) + "\n"
 
 

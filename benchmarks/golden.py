@@ -117,7 +117,7 @@ def _drives(folder: Path) -> dict[str, list[str]]:
 
     demo = folder / "demo.mcap"
     if not demo.exists():
-        _run(["demo", "--frames", "40", "--plant", "flat_car", "--weave", "--bag", str(demo)], folder)
+        _run(["demo", "--frames", "40", "--plant", "flat_car", "--weave", "-o", str(demo)], folder)
     drives = {"demo mcap": [str(demo)]}
     for name, options in {
         "sqlite": ["--dst-storage", "sqlite3"],

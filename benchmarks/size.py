@@ -44,7 +44,6 @@ def main() -> None:
             "## Size of a recording, by what it keeps",
             "",
             f"`python -m benchmarks.size`, {datetime.now(UTC):%Y-%m-%d}: {machine()}.",
-            "Rows of explanations, objects, tracks and anomalies are the same in each.",
             "",
             "| drive | keep | MB | of everything | MB a frame | raw clouds |",
             "| --- | --- | ---: | ---: | ---: | ---: |",

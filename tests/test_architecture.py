@@ -27,6 +27,15 @@ def layers_of_page() -> list[set[str]]:
     return [{name.removesuffix(".py").strip("/") for name in re.findall(r"`(.+?)`", cell)} for cell in cells]
 
 
+def test_every_name_on_the_page_is_in_the_code() -> None:
+    files = [*ROOT.glob("bevviz/**/*.py"), *ROOT.glob("blueprints/*.py"), ROOT / "pyproject.toml"]
+    words = set(re.findall(r"\w+", "\n".join(file.read_text() for file in files)))
+    for name in re.findall(r"`([^` ]+)`", PAGE):
+        is_path = any((folder / name).exists() for folder in (ROOT, ROOT / "bevviz"))
+        known = name == "lint-imports" or all(word in words for word in re.findall(r"\w{4,}", name))
+        assert is_path or ("/" not in name.strip("/") and known), name
+
+
 def test_the_page_has_the_layers_of_the_contract_in_order() -> None:
     inside = [name for layer in layers_of_page() for name in layer]
     found = [layer - {"__main__", "renamed"} for layer in contract()]

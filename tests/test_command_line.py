@@ -107,10 +107,11 @@ def test_colour_is_asked_for_and_refused(capsys: Capture, monkeypatch: pytest.Mo
 # --- without a display ---------------------------------------------------------------------------------
 
 
-def test_a_demo_without_a_display_names_the_viewer_command(
+def test_a_run_without_a_display_names_the_viewer_command(
     monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    """The line is typed as it stands. A project's network (there is none of that name) is not the demo's."""
+    """The line is typed as it stands. Without the workbench, the demo is such a run."""
+    monkeypatch.setattr("bevviz.cli.demo.find_spec", lambda name: None)
     monkeypatch.setenv("BEVVIZ_MODEL", "absent.onnx")
     monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr("sys.argv", [str(Path(sys.executable).with_name("bevviz"))])

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +22,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from bevviz.cli import main
+from bevviz.cli import main, outputs
 from bevviz.cli.options import join_negative_numbers
 from bevviz.model.results import FrameResult
 from bevviz.recording.frame_logger import FrameLogger
+from bevviz.support import progress
 from bevviz.support.files import unfinished_files
 from tests.support import bags
 from tests.support.commands import Capture, environment, error_of
@@ -61,16 +66,59 @@ def without(*topics: str) -> Callable[..., None]:
 # --- runs --------------------------------------------------------------------------------------
 
 
-def test_demo_saves_where_there_is_no_display(tmp_path: Path, capsys: Capture) -> None:
-    assert main(["demo", "--frames", "2"]) == 0
-    assert "no display: saving demo.rrd" in capsys.readouterr().err
+def test_demo_shows_a_missed_pedestrian(tmp_path: Path) -> None:
+    """The terminal says why it is missed, and the page opens on it; a second call opens the same drive."""
+    command = [sys.executable, "-m", "bevviz", "demo"]
+    for call in ("first", "second"):
+        with subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment(),
+            cwd=tmp_path,
+        ) as process:
+            assert process.stdout is not None and process.stderr is not None
+            try:
+                sentence = process.stdout.readline()
+                said = list(takewhile(lambda line: "open until Ctrl-C" not in line, process.stderr))
+            finally:
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=PATIENCE)
+        assert sentence.startswith(
+            "0.5 s into demo.mcap: The person at 7.3 m was not reported because it was"
+        )
+        assert "taken for ground" in sentence and "change ground.distance_threshold=0.3" in sentence
+        (address,) = [line for line in said if "workbench at" in line]
+        assert "#bag=demo.mcap&at=1750000000500000000&pick=truth" in address
+        assert any(f"ssh -N -L {port_of(address)}:localhost:{port_of(address)}" in line for line in said)
+        assert any("is there already" in line for line in said) == (call == "second")
+    done = subprocess.run(
+        [*command, "--seed", "1"],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 2 and "demo.mcap exists already" in done.stderr
+
+
+def port_of(address: str) -> str:
+    found = re.search(r":(\d+)/", address)
+    assert found is not None
+    return found[1]
+
+
+def test_demo_is_saved_where_asked(tmp_path: Path) -> None:
+    assert main(["demo", "--frames", "2", "--save", "demo.rrd"]) == 0
     recording = Recording(tmp_path / "demo.rrd")
     assert len(recording.rows["/bev"]) == 2
     assert "/world/fused" in recording.at
 
 
 def test_demo_writes_a_bag_that_runs(tmp_path: Path, capsys: Capture) -> None:
-    assert main(["demo", "--frames", "3", "--bag", "drive.mcap"]) == 0
+    assert main(["demo", "--frames", "3", "-o", "drive.mcap"]) == 0
     assert main(["bag", "drive.mcap", "--model", "demo", "--save", "out.rrd"]) == 0
     assert "3 frames in out.rrd" in capsys.readouterr().err
     assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 3
@@ -381,9 +429,8 @@ def test_a_failing_stage_prints_one_line_unless_debugging(
     assert main(run) == 0
     said = capsys.readouterr().err
     failed = [line for line in said.splitlines() if "clustering failed in 3 of 3 frames" in line]
-    assert len(failed) == 1 and failed[0].endswith(
-        "first: ZeroDivisionError: integer division or modulo by zero"
-    )
+    error = "broken:cluster raised ZeroDivisionError: integer division or modulo by zero (broken.py, line 2)"
+    assert len(failed) == 1 and failed[0].endswith(f"first: {error}")
     assert "Traceback" not in said
     try:
         assert main([*run, "--verbose"]) == 0
@@ -430,3 +477,26 @@ def test_points_beyond_any_sensor_cause_no_warning(preset: str, tmp_path: Path) 
     recording = Recording(tmp_path / "out.rrd")
     assert recording.column("/health/count/invalid_points", "Scalars:scalars") == [[7.0]] * 5
     assert recording.column("/health/count/failures", "Scalars:scalars") == [[0.0]] * 5
+
+
+def test_a_message_does_not_share_a_line_with_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    with progress.bar(total=3, file=terminal, ncols=60) as bar:
+        bar.update()
+        outputs.say("the clouds are back")
+    before, _, _ = terminal.getvalue().partition("bevviz: the clouds are back\n")
+    assert "1/3" in before or "0/3" in before
+    assert before.endswith("\r") and not before.rpartition("\r")[0].rpartition("\r")[2].strip()
+
+
+def test_a_taken_port_of_the_page_is_told_before_the_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        assert f"--workbench {port}: the port is in use" in error_of(capsys, "live", "--workbench", port)

@@ -25,6 +25,26 @@ print(dbscan(points, 0.5, 2).tolist())
 """
 
 
+IN_BOXES = """
+import sys
+import numpy as np
+from bevviz.model.box_points import inside_each
+from bevviz.model.frame import Boxes3D
+three = np.ones((1, 3), np.float32)
+print([rows.tolist() for _, rows in inside_each(three, Boxes3D(three, three, np.zeros(1, np.float32)))])
+print("scipy.linalg" in sys.modules)
+"""
+
+
+def test_loaded_loops_import_no_scipy() -> None:
+    """The import would take half a second before the first frame of the workbench."""
+    runs = [  # The first one may compile.
+        subprocess.run([sys.executable, "-c", IN_BOXES], capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert runs[1].stdout.splitlines() == ["[[0]]", "False"]
+
+
 def test_without_a_cache_folder_loops_are_recompiled() -> None:
     done = subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr

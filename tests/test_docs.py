@@ -6,11 +6,13 @@ import argparse
 import re
 import shlex
 from collections.abc import Iterator
+from html import unescape
 from pathlib import Path
 
 import pytest
 
 from bevviz.cli import main
+from tests.support.recordings import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -69,9 +71,36 @@ def test_the_tutorial_and_the_page_of_why_show_what_comes_out(
         done.append(command)
     assert len(done) >= 6
     assert {path.name for path in folder.iterdir()} >= {"bug.rrd", "bug.html", "bug.mcap", "compare.rrd"}
+    check_report(Path("bug.rrd"))
     Path("bevviz.toml").write_text(project_on("docs/index.md"))
     assert main(["why", "drive.mcap", "--at-frame", "30", "--box", "479,229"]) == 0
     assert "The car at 10.1 m was reported" in capsys.readouterr().out
+
+
+def check_report(rrd: Path) -> None:
+    """Check that page and recording open on the cause, and that the subject is marked in its frame alone."""
+    text = unescape(re.sub(r"<[^>]*>", " ", rrd.with_suffix(".html").read_text()))
+    parts = (
+        "Missed: the car at 10.1 m",
+        "because it was taken for ground",
+        "in frame 30 of the drive",
+        "ground.distance_threshold=0.3",
+    )
+    places = [text.index(part) for part in (*parts, "The whole frame")]
+    assert places == sorted(places)
+    recording = Recording(rrd)
+    document = recording.static["/report"]["TextDocument:text"][0]
+    assert all(part in document.replace("\\", "") for part in parts)
+    for entity in ("/explain/why/place", "/explain/why/points", "/explain/why/zed/place", "/bev/overlay/why"):
+        drawn = {
+            name: frames for name, frames in recording.at[entity].items() if not name.startswith("Clear")
+        }
+        assert drawn and all(set(frames) == {1} for frames in drawn.values()), entity
+    assert max(row["report"] for row in recording.rows["/explain"] if row.get("report") is not None) == 1
+    assert {row["StateChange:state"][0] for row in recording.rows["/explain/states/report"]} == {
+        "the car at 10.1 m: ground",
+        "",
+    }
 
 
 def test_the_page_of_projects_explains_as_the_command_does(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
+from bevviz.fleet.causes import Causes, Findings, find_causes
+from bevviz.fleet.findings import SCHEMA
 from bevviz.fleet.summary import BagTotals, page
 from bevviz.fleet.table import RunInfo
 from bevviz.model.frame import Scene
@@ -49,7 +53,13 @@ def batch(text: str) -> str:
         "link": None,
         **COUNTED,
     }
-    return page(text, [totals(text)], [row], [(text, text)], "")
+    return page(text, [totals(text)], [row], [(text, text)], "", causes(text))
+
+
+def causes(text: str) -> Causes:
+    words = dict.fromkeys(("bag", "recording", "reason", "text", "class", "object"), text)
+    found = {**words, "outcome": "missed", "frame": 0, "stamp": 0}
+    return find_causes(Findings(pa.Table.from_pylist([found], schema=SCHEMA), Path()))
 
 
 @given(st.one_of(st.text(max_size=40), st.just(EVIL)))
@@ -66,7 +76,7 @@ def test_only_addresses_of_recordings_are_linked() -> None:
     row = {"badness": 1, "recording": "a", "frame": 0, "stamp": 0, "remarks": [], **COUNTED}
     row |= {"sync_error_ms": None, "tf_age_ms": None, "link": "javascript:alert(1)"}
     with pytest.raises(ValueError, match="no address of a recording"):
-        page("x", [], [row], [], "")
+        page("x", [], [row], [], "", causes("x"))
 
 
 def test_a_missing_value_of_a_template_is_an_error() -> None:
@@ -76,7 +86,9 @@ def test_a_missing_value_of_a_template_is_an_error() -> None:
 
 def test_a_page_loads_nothing() -> None:
     (policy,) = (a["content"] for tag, a in Page(batch("x")).tags if "http-equiv" in a)
-    assert policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    assert (
+        policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+    )
 
 
 def test_a_plot_draws_its_values() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import bevviz
 from bevviz import renamed
+from bevviz.cli import _parser
 from bevviz.config import load
 from bevviz.model.frame import Scene
 from bevviz.recording import blueprints, views
@@ -54,6 +55,19 @@ def test_a_layout_of_the_last_version_works(tmp_path: Path) -> None:
     path.write_text(LAYOUT)
     with pytest.warns(FutureWarning):
         assert blueprints.load(str(path), Scene("a", "lidar", ("lidar",)), load()) is not None
+
+
+@pytest.mark.parametrize(("command", "former"), renamed.FORMER_OPTIONS)
+def test_a_former_option_is_the_present_one(command: str, former: str) -> None:
+    """It is accepted with its value in either form, and a line names the present option."""
+    present = renamed.FORMER_OPTIONS[command, former]
+    for given, wanted in (([former, "x"], [present, "x"]), ([f"{former}=x"], [f"{present}=x"])):
+        line, said = renamed.present_options([command, "a.mcap", *given])
+        assert line == [command, "a.mcap", *wanted]
+        assert said == [f"bevviz {command} {former} is called {present} now"]
+    parser = _parser()[1][command]
+    assert present in parser._option_string_actions
+    assert renamed.present_options(["why", "a.mcap", former]) == (["why", "a.mcap", former], [])
 
 
 def test_a_name_that_never_was_is_not_found() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import bevviz
+from bevviz.agents.drives import agent_config
 from bevviz.cli import importer, main
 from bevviz.config import changed_config, load, plugins
 from bevviz.config.project import named_code, read_project_layers
@@ -144,6 +145,14 @@ def _page(trusts: bool) -> None:
         )
 
 
+def _agent(trusts: bool) -> None:
+    with pytest.raises(UserError):
+        agent_config(load(), [FUNCTION])
+    assert not Path("ran").exists()
+    if trusts:
+        assert agent_config(load(settings=[FUNCTION]), ["clustering.eps=0.7"]).clustering.eps == 0.7
+
+
 def _registered(trusts: bool) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plugins, "registered", lambda: {"cells": "page_tools:cells"})
@@ -167,6 +176,7 @@ INPUTS: dict[str, Input] = {
     "a bag opened in Rerun's viewer": _viewer,
     "a parameter of ROS (of other nodes, `--ros-args -p`)": _ros,
     "a message of the workbench's page": _page,
+    "a value from an agent (`mcp`)": _agent,
     "a name that an installed package registered": _registered,
     "`--blueprint FILE.py`": _blueprint,
 }

@@ -366,6 +366,9 @@ class Node:
     def declare_parameter(self, name: str, value: Any, descriptor: Any) -> Any:
         return Parameter(name, value)
 
+    def set_descriptor(self, name: str, descriptor: Any) -> None:
+        pass
+
     def add_on_set_parameters_callback(self, callback: Any) -> None:
         self.on_set = callback
 
@@ -378,7 +381,8 @@ class Parameter:
 def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
-    msg = SimpleNamespace(ParameterDescriptor=SimpleNamespace, SetParametersResult=SimpleNamespace)
+    names = ("FloatingPointRange", "IntegerRange", "ParameterDescriptor", "SetParametersResult")
+    msg = SimpleNamespace(**dict.fromkeys(names, SimpleNamespace))
     monkeypatch.setitem(sys.modules, "rcl_interfaces", SimpleNamespace(msg=msg))
     monkeypatch.setitem(sys.modules, "rcl_interfaces.msg", msg)
     write_project(received, "")
@@ -523,6 +527,7 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         "config/loading.py",
         "config/reloading.py",
         "drive.py",
+        "fleet/fix.py",  # its own values of numbers and methods, over a configuration that is loaded
         "recording/source_lookup.py",
         "report/check.py",
     }

@@ -67,7 +67,7 @@ def test_the_workbench_opens(bag: Path, tmp_path: Path) -> None:
 
 
 def test_the_synthetic_drive_says_in_one_line_what_it_lacks(tmp_path: Path) -> None:
-    done = run(tmp_path, "demo", "--frames", "1", "--bag", "drive.mcap", "--quiet")
+    done = run(tmp_path, "demo", "--frames", "1", "-o", "drive.mcap", "--quiet")
     assert done.returncode != 0
     assert done.stderr.startswith("bevviz: error: the synthetic drive needs Open3D, which cannot be imported")
     assert "pip install open3d" in done.stderr and done.stderr.count("\n") == 1

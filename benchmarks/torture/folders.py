@@ -487,7 +487,7 @@ def _prepared(name: str, trial: Path, rng: random.Random) -> tuple[str, list[lis
 
 def judged(what: str, worker: Worker, folder: Path, commands: Sequence[Sequence[str]]) -> Tally:
     """Run the commands of one case, and judge how they ended."""
-    outcome = worker.do("commands", (folder, commands))
+    outcome = worker.do(run_commands, (folder, commands))
     tally = Tally(cases=1, memory=outcome.memory)
     if outcome.hung or (outcome.traceback and not outcome.said):
         tally.hangs, tally.failed = int(outcome.hung), int(not outcome.hung)

@@ -227,7 +227,7 @@ def read_messages(path: Path) -> Outcome:
     """Decode every message of a bag by itself. ``said``: the slowest one's seconds, and the lines."""
     from bevviz.bags.bag import Recording
     from bevviz.messages import camera_info, clouds, detections, images, transforms
-    from bevviz.messages.decoding import MessageError
+    from bevviz.messages.decoders import MessageError
     from bevviz.messages.guard import guard
 
     of_type: dict[str, Callable[[Any, str], object]] = {
@@ -280,7 +280,7 @@ def run(seed: int, messages: int) -> Iterator[Fuzzed]:
     with tempfile.TemporaryDirectory(prefix="bevviz-torture-") as folder, Worker() as worker:
         bar = tqdm(total=messages, unit="message", desc="fuzz", disable=None)
         write(Path(folder) / "sound.mcap", rows)
-        worker.do("messages", Path(folder) / "sound.mcap")  # so that what is loaded once counts for nobody
+        worker.do(read_messages, Path(folder) / "sound.mcap")  # so that what is loaded once counts for nobody
         with bar:
             while total.messages < messages:
                 batch = [fuzzed(rows, rng) for _ in range(min(BATCH, messages - total.messages))]
@@ -294,14 +294,14 @@ def run(seed: int, messages: int) -> Iterator[Fuzzed]:
 def _try(worker: Worker, folder: Path, rows: Sequence[Row], batch: Sequence[Row], total: Fuzzed) -> None:
     alone, among = folder / "alone.mcap", folder / "among.mcap"
     write(alone, batch)
-    outcome = worker.do("messages", alone)
+    outcome = worker.do(read_messages, alone)
     total.messages += len(batch)
     total.refused += max(0, len(outcome.said) - 1)
     total.tracebacks += outcome.traceback.count("Traceback (most recent call last)")
     total.memory = max(total.memory, outcome.memory)
     total.slowest = max([total.slowest, *map(float, outcome.said[:1])])
     write(among, [*rows, *((t, at + 1, data, text) for t, at, data, text in batch)])
-    ran = worker.do("run", among)
+    ran = worker.do(run_over, among)
     total.runs += 1
     total.broken += int(ran.said[:1] != ["0"])
     for one in (outcome, ran):

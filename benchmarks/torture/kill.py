@@ -78,7 +78,7 @@ COMMANDS: dict[str, Command] = {
         ("calib", "drive", "--write", "c.yaml"), lambda folder, _: (folder / "c.yaml").exists(), ("c.yaml",)
     ),
     "demo --bag": Command(
-        ("demo", "--frames", "20", "--bag", "demo.mcap"),
+        ("demo", "--frames", "20", "-o", "demo.mcap"),
         lambda folder, out: (folder / "demo.mcap").exists(),
         ("demo.mcap",),
     ),

@@ -618,7 +618,7 @@ class Trial:
     def read(self, cases: Mapping[int, Row]) -> Outcome:
         """Read the drive with these rows in the places of its own."""
         write(self._path, [cases.get(place, row) for place, row in enumerate(self.rows)])
-        return self._worker.do("frames", (self._path, KINDS[self._name].settings))
+        return self._worker.do(read_frames, (self._path, KINDS[self._name].settings))
 
     def judge(self, cases: Mapping[int, Row], numbers: Mapping[int, int], tally: Tally) -> None:
         """Count what comes of a drive with these cases; ``numbers`` has the case of each place."""

@@ -516,6 +516,7 @@ def _limited(outcome: Outcome) -> bool:
 def _load_and_run(case: Case) -> None:
     from bevviz.config import load
     from bevviz.pipeline.stage_loader import StageLoader
+    from bevviz.stages.user_stages import UserStage
 
     rng = np.random.default_rng(0)
     config = load(settings=list(case.settings))
@@ -525,7 +526,7 @@ def _load_and_run(case: Case) -> None:
         for size in ((H, W, 3), (120, 50, 3)):
             stages.detector(rng.integers(0, 255, size, np.uint8))
     else:
-        assert callable(stages.objects)
+        assert stages.objects is not None and not isinstance(stages.objects, UserStage)
         for count in (500, 20):
             stages.objects(rng.uniform((0, -8, -3), (24, 8, 1), (count, 3)).astype(np.float32))
 
@@ -568,7 +569,7 @@ def run(seed: int, files: int) -> Iterator[Tried]:
         sound = samples(folder)
         contents = {path: path.read_bytes() for path, _ in sound}
         for path, case in dict(sound).items():  # so that what is loaded once counts for nobody
-            outcome = worker.do("model", case)
+            outcome = worker.do(try_model, case)
             if outcome.said or outcome.traceback:
                 raise RuntimeError(f"{path.name} is not sound: {outcome.said} {outcome.traceback}")
         for number in tqdm(range(files), unit="file", desc="models", disable=None):
@@ -585,7 +586,7 @@ def run(seed: int, files: int) -> Iterator[Tried]:
 
 def _try(worker: Worker, case: Case, title: str, total: Tried) -> None:
     start = time.monotonic()
-    outcome = worker.do("model", case)
+    outcome = worker.do(try_model, case)
     seconds = time.monotonic() - start
     if _limited(outcome):
         worker.restart()

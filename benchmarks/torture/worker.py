@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import multiprocessing
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -73,10 +74,10 @@ class Worker:
         self._end()
 
     def read(self, path: Path) -> Outcome:
-        return self.do("bag", path)
+        return self.do(read_bag, path)
 
-    def do(self, task: str, argument: object) -> Outcome:
-        """Have a task done; one that takes longer than ``LIMIT`` or takes the process down says so."""
+    def do(self, task: Callable[[Any], Outcome], argument: object) -> Outcome:
+        """Run a function in the process. The outcome tells a hang beyond ``LIMIT`` and a dead process."""
         self._pipe.send((task, argument))
         try:
             if self._pipe.poll(LIMIT):
@@ -108,13 +109,6 @@ class Worker:
 
 
 def _serve(pipe: Connection) -> None:
-    from benchmarks.torture.folders import run_commands
-    from benchmarks.torture.fuzz import read_messages, run_over
-    from benchmarks.torture.messages import read_frames
-    from benchmarks.torture.models import try_model
-
-    tasks: dict[str, Any] = {"bag": read_bag, "messages": read_messages, "run": run_over}
-    tasks |= {"commands": run_commands, "model": try_model, "frames": read_frames}
     while True:
         try:
             task, argument = pipe.recv()
@@ -122,7 +116,7 @@ def _serve(pipe: Connection) -> None:
             return
         before = _reset_peak()
         faulthandler.dump_traceback_later(0.9 * LIMIT)  # what hangs says where
-        outcome = tasks[task](argument)
+        outcome = task(argument)
         faulthandler.cancel_dump_traceback_later()
         outcome.memory = max(0.0, _peak() - before)
         pipe.send(outcome)

@@ -10,7 +10,9 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-PATIENCE = 180.0  # seconds for what takes one or two on an idle machine
+PATIENCE = (
+    120.0  # seconds for what takes one or two on an idle machine; two tries stay below faulthandler_timeout
+)
 
 
 def until(done: Callable[[], T | None], what: str = "what was waited for", every: float = 0.05) -> T:
