@@ -272,6 +272,28 @@ def test_copies_of_kitti_name_its_folders(tmp_path: Path, names: tuple[str, str,
     assert focal == [72, 72, 99]
 
 
+def test_labels_of_copies_count_if_they_are_kittis(tmp_path: Path) -> None:
+    root = datasets.kitti_object(tmp_path / "data")
+    (root / "label_2").rename(root / "labels")
+    truth = bevviz.open(root).raw(1).truth
+    assert truth is not None and truth.labels == ("Car",)
+    for file in (root / "labels").iterdir():
+        file.write_text("2 0.5 0.5 0.1 0.1\n")  # as YOLO is trained
+    loader = KittiObject(root, "")
+    assert "labels is not read: its lines have 5 columns, KITTI's have 15" in loader.warnings
+    assert bevviz.open(root).raw(1).truth is None
+
+
+def test_calibrations_of_sixteen_cameras_are_read(tmp_path: Path) -> None:
+    folder = write_drive(tmp_path)
+    (folder / "calib").mkdir()
+    for number in range(16):
+        other = {"extrinsic": np.eye(4).reshape(-1).tolist(), "intrinsic": K}
+        (folder / f"calib/camera_{number}.json").write_text(json.dumps(other))
+    (folder / "calib/front.json").write_text(SUSTECH)
+    np.testing.assert_allclose(camera_of(folder)[1], CAMERA_FROM_LIDAR, atol=1e-6)
+
+
 def test_kitti_archives_each_in_its_folder(tmp_path: Path) -> None:
     root = datasets.kitti_object(tmp_path / "copied")
     for name in ("velodyne", "calib", "image_2", "label_2"):

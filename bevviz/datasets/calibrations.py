@@ -32,7 +32,8 @@ from bevviz.support.files import read_text
 
 SUFFIXES = (".json", ".yaml", ".yml", ".txt")
 LEVELS = 3  # folders deep that are searched
-MAX_FILES = 12  # of one folder; others of it are of single frames
+FEW, MAX_FILES = 12, 64  # of one folder: more than few of numbered names are of single frames
+FRAME_NAME = re.compile(r"\d{4}")  # in the name of a file of one frame: its number or stamp
 MAX_SIZE = 1 << 20  # bytes of a calibration
 LABELS = re.compile(r"label|annot|result|pred", re.IGNORECASE)  # folders that are not searched
 OPENCV_TAG = re.compile(r"!!opencv-matrix|^%YAML.*$", re.MULTILINE)
@@ -83,13 +84,20 @@ def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[s
         cameras: names of its cameras.
     """
     found = FoundCalibration()
+    stated_in = dict[Path, list[FoundSensor]]()
     for file in _candidates(path):
         try:
-            sensors = _sensors_of(file)
+            stated_in[file] = _sensors_of(file)
         except (UserError, *NOT_AS_DOCUMENTED) as error:
             why = str(error) if isinstance(error, UserError) else describe_error(error)
             found.warnings.append(f"{file.relative_to(path)}: is not used: {why}")
-            continue
+
+    def names_none(file: Path) -> bool:
+        """Return whether a file names no camera of the folder."""
+        return not any(match_name(sensor.name, cameras, alone=False) for sensor in stated_in[file])
+
+    for file in sorted(stated_in, key=names_none):
+        sensors = stated_in[file]
         single = len([sensor for sensor in sensors if not sensor.is_lidar]) == 1
         before = {name: stated["K"] for name, stated in found.cameras.items() if "K" in stated}
         used = [_note(found, sensor, lidars, cameras, single) for sensor in sensors]
@@ -163,7 +171,8 @@ def _candidates(path: Path) -> Iterator[Path]:
     for depth in range(LEVELS):
         for folder in level:
             files = [f for f in files_in(folder, SUFFIXES) if f.stat().st_size <= MAX_SIZE]
-            yield from files if len(files) <= MAX_FILES else files[:1]
+            of_frames = len(files) > FEW and all(FRAME_NAME.search(file.stem) for file in files)
+            yield from files[: 1 if of_frames else MAX_FILES]
         if depth + 1 < LEVELS:
             level = [d for folder in level for d in subfolders(folder) if not LABELS.search(d.name)][:200]
 

@@ -49,6 +49,7 @@ from bevviz.errors import UserError
 from bevviz.messages.encode import encode_labels, encode_points, encode_transforms
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
+from bevviz.support.files import read_lines
 
 LIDAR, IMU = "velodyne", "imu_link"
 CLOUDS = "/velodyne_points"
@@ -61,6 +62,9 @@ FOLDER_NAMES = {
 }
 ARCHIVE = "data_object_velodyne"  # folder of the benchmark's scans where each archive has one
 LABEL_FOLDERS = ("label_2", "label_all", "label_0")
+COPIED_LABELS = ("labels", "label")  # names in copies, where the files may be of another format
+KITTI_LABEL = (15, 16)  # columns, without or with a score
+MAX_LABELS = 1 << 20  # bytes of a file of labels
 FRAME_GAP = 100 * SECOND  # between unrelated frames, of which none may influence the next
 # Reasons why a camera gets no role by default; empty: it gets one.
 RIGHT_EYE, GREY = "the right eye of a stereo pair", "grey, beside a colour camera"
@@ -105,11 +109,8 @@ class KittiObject(Dataset):
         fields = _columns(self, scans, path / "velodyne/000000.bin")
         times = FRAME_GAP * np.arange(1, len(scans) + 1, dtype=np.int64)
         names = [scan.stem for scan in scans]
-        labelled = next(
-            (name for name in LABEL_FOLDERS if _object_folder(path, name).is_dir()), LABEL_FOLDERS[0]
-        )
         with_labels, labels = _matching(
-            files_in(_object_folder(path, labelled), [".txt"]), names, lambda file: file.stem
+            files_in(self._label_folder(), [".txt"]), names, lambda file: file.stem
         )
 
         calibrations = _object_folder(path, "calib")
@@ -140,6 +141,18 @@ class KittiObject(Dataset):
                 _truth_stream(BOXES, times[with_labels], lambda row: read_labels(labels[row], calibrations))
             )
         self.streams.append(_cloud_stream(times, scans, fields))
+
+    def _label_folder(self) -> Path:
+        """Return the folder of the labels. That of a copy counts only if its first label is KITTI's."""
+        folders = [_object_folder(self.path, name) for name in LABEL_FOLDERS]
+        for folder in (_object_folder(self.path, name) for name in COPIED_LABELS):
+            lines = (line for file in files_in(folder, [".txt"])[:100] for line in read_lines(file, MAX_LABELS))
+            first = next((line.split() for line in lines if line.strip()), [])
+            if len(first) in KITTI_LABEL:
+                folders.append(folder)
+            elif first:
+                self.warn(f"{folder.name} is not read: its lines have {len(first)} columns, KITTI's have 15")
+        return next((folder for folder in folders if folder.is_dir()), folders[0])
 
     def _images(self, camera: str) -> Path:
         """Return the folder of a camera. The left colour camera's may have any name if it is the only one."""
