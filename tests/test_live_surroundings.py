@@ -158,6 +158,7 @@ def fly(folder: Path) -> Flight:
     heard: list[Any] = []
     said: list[str] = []
     asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
+    asked += ["live.flight_size=2000 MB", "live.raw_size=2000 MB"]  # A slow machine needs minutes for it all.
     asked.append("live.log_queue=100")  # no frame is left out, least of all the one with the mark
     settings = ReloadableConfig(None, ["live.flight_time=600 s", *asked])
     Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is

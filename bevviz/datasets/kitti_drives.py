@@ -146,7 +146,9 @@ class KittiObject(Dataset):
         """Return the folder of the labels. That of a copy counts only if its first label is KITTI's."""
         folders = [_object_folder(self.path, name) for name in LABEL_FOLDERS]
         for folder in (_object_folder(self.path, name) for name in COPIED_LABELS):
-            lines = (line for file in files_in(folder, [".txt"])[:100] for line in read_lines(file, MAX_LABELS))
+            lines = (
+                line for file in files_in(folder, [".txt"])[:100] for line in read_lines(file, MAX_LABELS)
+            )
             first = next((line.split() for line in lines if line.strip()), [])
             if len(first) in KITTI_LABEL:
                 folders.append(folder)
