@@ -76,6 +76,20 @@ def test_a_change_of_limits_is_named_for_a_certain_detection() -> None:
     assert named.own and named.right
 
 
+@pytest.mark.parametrize(
+    "wrong", ["fusion.min_points=300", "fusion.min_rating=0.9", "clustering.min_cluster_points=400"]
+)
+def test_a_value_that_was_changed_is_set_back(wrong: str) -> None:
+    """The preset's value is the hint, not the smallest step that helps this object alone."""
+    key = wrong.partition("=")[0]
+    config = load(None, ["detector.model=demo", wrong])
+    asked = FrameExplainer(Session(config).run(at("flat_car").frame), classes=CLASSES)
+    hints = [hint for answer in asked.missed()[:4] for hint in asked.with_hints(answer).hints]
+    section, _, name = key.partition(".")
+    preset = getattr(getattr(load(), section), name)
+    assert (f"{key}={preset:g}",) in [hint.settings for hint in hints]
+
+
 def test_without_a_remedy_each_tried_change_is_named() -> None:
     vain = [a for a in near("reference") if not a.hints and a.verdict.kind is not ReasonKind.REPORTED]
     assert any(len(answer.tried) > 1 for answer in vain)

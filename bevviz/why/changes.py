@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from bevviz.config import Config, plugin_of
+from bevviz.config import Config, Preset, load, plugin_of, values
 from bevviz.errors import UserError
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
@@ -31,6 +32,21 @@ _SECTION = {  # kind of reason -> section whose parameters may help
     ReasonKind.BELOW_THRESHOLD: "detector",
     ReasonKind.NOT_AMONG: "objects",
     ReasonKind.MISNAMED: "objects",
+}
+_CLUSTERING = ("clustering", "ground", "fusion")
+_DETECTION = ("detector", "fusion")
+_FUSION = ("fusion", "clustering", "detector")
+_STAGES = {  # kind of reason -> sections whose values may be the cause, the nearest first
+    ReasonKind.GROUND: ("ground", "clustering"),
+    ReasonKind.NOISE: _CLUSTERING,
+    ReasonKind.NO_CLUSTER: _CLUSTERING,
+    ReasonKind.TOO_SMALL: _CLUSTERING,
+    ReasonKind.TOO_LARGE: _CLUSTERING,
+    ReasonKind.MERGED: _CLUSTERING,
+    ReasonKind.SPLIT: _CLUSTERING,
+    ReasonKind.NOT_DETECTED: _DETECTION,
+    ReasonKind.BELOW_THRESHOLD: _DETECTION,
+    ReasonKind.SUPPRESSED: _DETECTION,
 }
 _OTHER_OWNER = {  # another subject has the detection or the cluster
     ReasonKind.SHARED_BOX,
@@ -98,6 +114,7 @@ def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
 def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false: bool) -> Iterator[Change]:
     """Yield changes of our parameters that may help against the reason."""
     kind, clustering, best = reason.kind, config.clustering, evidence.best
+    yield from _restored_values(kind, config)
     if kind is ReasonKind.GROUND:
         yield from _ground_changes(config)
     elif kind is ReasonKind.NOISE:
@@ -134,6 +151,22 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif best is not None:
         yield from _detection_changes(kind, best, config)
+
+
+def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
+    """Yield the preset's value of each number that was changed in a stage that may have lost the subject."""
+    current, presets = values(config), _preset_values(config.preset)
+    for section in _STAGES.get(kind, _FUSION):
+        for key, value in presets.items():
+            number = isinstance(value, int | float) and isinstance(current.get(key), int | float)
+            if number and key.startswith(f"{section}.") and current[key] != value:
+                yield {key: value}
+
+
+@cache
+def _preset_values(preset: Preset) -> Mapping[str, Any]:
+    """Return the value of each parameter in a preset."""
+    return values(load(preset=preset))
 
 
 def _changes_against_false(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
