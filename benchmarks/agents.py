@@ -57,6 +57,7 @@ class Complaint:
 HOPELESS = ("hidden", "no points", "out of view")
 NO_PARAMETER = (*HOPELESS, "not detected", "detector not run")
 NEAR = 20.0  # metres
+ASKED = 3  # findings: three calls are left for comparisons and the calibration
 
 
 async def conclude(client: Client, complaint: Complaint | None) -> str:
@@ -95,17 +96,22 @@ async def explain_complaint(client: Client, complaint: Complaint) -> str:
 
 
 def typical(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return a missed object of each of the three most frequent causes that a parameter may have.
+    """Return missed objects of the most frequent causes that a parameter may have, one of each in turn.
 
-    Near objects count first, since any detector misses far ones.
+    Near objects come first, since any detector misses far ones.
     """
     missed = [row for row in rows if row["kind"] == "missed" and row["cause"] not in NO_PARAMETER]
     near = [row for row in missed if row["distance_m"] is not None and row["distance_m"] < NEAR]
-    causes: Counter[str] = Counter()
+    frames: Counter[str] = Counter()
     for row in near or missed:
-        causes[row["cause"]] += row["frames"]
+        frames[row["cause"]] += row["frames"]
     nearest = sorted(near or missed, key=lambda row: (row["distance_m"] is None, row["distance_m"]))
-    return [next(r for r in nearest if r["cause"] == cause) for cause, _ in causes.most_common(3)]
+    rounds: Counter[str] = Counter()
+    turns = []
+    for row in nearest:
+        turns.append((rounds[row["cause"]], -frames[row["cause"]]))
+        rounds[row["cause"]] += 1
+    return [nearest[i] for i in sorted(range(len(turns)), key=turns.__getitem__)]
 
 
 def key_of(hint: Mapping[str, Any]) -> str:
@@ -114,16 +120,18 @@ def key_of(hint: Mapping[str, Any]) -> str:
 
 
 async def best_settings(client: Client, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the hints of some findings, those that fix most in their frame first."""
+    """Return the hints of some findings: of one parameter first, those that fix most in their frame first."""
     gains: dict[tuple[str, ...], int] = {}
-    for row in rows:
+    for row in rows[:ASKED]:
         answer = await client.ask("why", frame=row["frame"], about=row["about"])
         for one in answer.get("answers", ())[:1]:
             for hint in one["hints"][:2]:
                 gain = len(hint.get("fixed", ())) - len(hint.get("false", ())) - len(hint.get("right", ()))
                 settings = tuple(hint["settings"])
                 gains[settings] = max(gain, gains.get(settings, gain))
-    return [list(settings) for settings, _ in sorted(gains.items(), key=lambda item: -item[1])]
+    return [
+        list(settings) for settings, _ in sorted(gains.items(), key=lambda item: (len(item[0]), -item[1]))
+    ]
 
 
 async def confirmed(client: Client, settings: Sequence[list[str]]) -> str:
@@ -177,6 +185,7 @@ DECOYS = (
     "bev.range_x=40",
 )
 
+UNSPLIT = "fusion.split=false"  # Fusion that splits clusters repairs what a clustering gets wrong.
 PARAMETERS = {
     "detector.conf_threshold": ("0.9",),
     "detector.iou_threshold": ("0.01",),
@@ -188,7 +197,7 @@ PARAMETERS = {
     "fusion.min_iou": ("0.9",),
     "fusion.max_depth": ("8",),
     "fusion.min_rating": ("0.9",),
-    "ground.max_step": ("1.5",),
+    "ground.distance_threshold": ("1.5",),
 }
 
 
@@ -317,8 +326,12 @@ def incidents(seeds: Sequence[int] = SEEDS) -> Iterator[Incident]:
         for key, wrong_values in PARAMETERS.items():
             for value in wrong_values:
                 decoys = [decoy for decoy in DECOYS if not decoy.startswith(f"{key}=")]
+                if key in ("clustering.eps", "clustering.min_points"):
+                    decoys.append(UNSPLIT)
                 options = tuple(word for s in (*decoys, f"{key}={value}") for word in ("--set", s))
-                yield Incident(f"{key}={value}", rf"parameter {re.escape(key)}$", writer(seed), options)
+                causes = [key, "fusion.split"] if UNSPLIT in decoys else [key]  # Either one repairs it.
+                pattern = "|".join(map(re.escape, causes))
+                yield Incident(f"{key}={value}", rf"parameter ({pattern})$", writer(seed), options)
         yield from sensor_incidents(seed)
         yield from scene_incidents(seed)
 
