@@ -24,6 +24,7 @@ from bevviz.model.frame import F32, I64, Bool
 from bevviz.support import table as text_table
 
 MOST = 30  # causes of one kind
+LEAST_LIFT = 1.2  # of a cause; less is as usual
 EXAMPLES = 3
 SAME_OBJECT = 10  # consecutive frames whose findings of one class count as one object, where no id is known
 CHANGED = 2.0  # ratio of rates from which a cause has come or gone between two batches
@@ -499,7 +500,8 @@ def _causes_of(findings: Findings, kind: str, rows: I64) -> list[Cause]:
     scales = [*_attributes(findings, kind, rows, positive)]
     slices = find_slices([attribute for attribute, _ in scales], targets, units, MOST)
     resolve = {attribute.name: resolve for attribute, resolve in scales}
-    return [_cause(findings, kind, rows, found, resolve, targets) for found in slices]
+    causes = (_cause(findings, kind, rows, found, resolve, targets) for found in slices)
+    return [cause for cause in causes if cause.lift >= LEAST_LIFT]
 
 
 def _cause(
