@@ -48,6 +48,14 @@ _STAGES = {  # kind of reason -> sections whose values may be the cause, the nea
     ReasonKind.BELOW_THRESHOLD: _DETECTION,
     ReasonKind.SUPPRESSED: _DETECTION,
 }
+_NO_STAGE = {  # No value of a stage lost these.
+    ReasonKind.REPORTED,
+    ReasonKind.FAILED,
+    ReasonKind.OUT_OF_VIEW,
+    ReasonKind.HIDDEN,
+    ReasonKind.NO_POINTS,
+    ReasonKind.NOT_RUN,
+}
 _OTHER_OWNER = {  # another subject has the detection or the cluster
     ReasonKind.SHARED_BOX,
     ReasonKind.BORROWED,
@@ -156,7 +164,7 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
 def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
     """Yield the preset's value of each number that was changed in a stage that may have lost the subject."""
     current, presets = values(config), _preset_values(config.preset)
-    for section in _STAGES.get(kind, _FUSION):
+    for section in () if kind in _NO_STAGE else _STAGES.get(kind, _FUSION):
         for key, value in presets.items():
             number = isinstance(value, int | float) and isinstance(current.get(key), int | float)
             if number and key.startswith(f"{section}.") and current[key] != value:

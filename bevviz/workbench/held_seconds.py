@@ -147,11 +147,7 @@ def _as_delivered(frame: Frame, delivered: DeliveredFrame) -> Frame:
     if len(delivered.images) == len(frame.cameras):
         late = [stamp is None for stamp in delivered.images]
         cameras = [
-            replace(
-                camera, image=None, problems=(*camera.problems, "its image came too late for the live run")
-            )
-            if is_late and camera.image is not None
-            else camera
+            _without_late_image(camera) if is_late else camera
             for camera, is_late in zip(frame.cameras, late, strict=True)
         ]
         frame = replace(frame, cameras=tuple(cameras))
@@ -162,6 +158,7 @@ def _as_delivered(frame: Frame, delivered: DeliveredFrame) -> Frame:
 
 
 def _without_late_image(camera: Camera) -> Camera:
+    """Return a camera without the image that the live run had not."""
     if camera.image is None:
         return camera
     return replace(
