@@ -1,6 +1,6 @@
 """Record a minute of the workbench: from a missed object to a filed report, in a headless Chromium.
 
-    python tools/record_screen.py docs/images/workbench.webp
+    python tools/record_screen.py docs/images/workbench.webp --picture docs/images/workbench.png
 
 The pictures are those that the browser draws. A picture that does not change is shown for two seconds at
 most, so that a slow machine makes the same film as a fast one. A caption says each step.
@@ -75,8 +75,8 @@ class Film:
         return sum(durations) / 1000
 
 
-def play(page: Any, film: Film) -> None:
-    """Go from the missed object to the report."""
+def play(page: Any, film: Film, picture: Path | None) -> None:
+    """Go from the missed object to the report. Save a picture of the page before the report."""
 
     def step(caption: str, act: Callable[[], Any], done: Callable[[], Any]) -> None:
         film.caption = caption
@@ -104,6 +104,11 @@ def play(page: Any, film: Film) -> None:
         lambda: page.locator("#trial").is_visible() and page.locator("#drive-cancel").is_hidden(),
     )
 
+    if picture is not None:
+        page.mouse.move(SIZE[0] / 4, SIZE[1] / 2)  # so that the viewer draws what it has read
+        page.wait_for_timeout(15_000)
+        page.screenshot(path=picture, timeout=120e3)
+
     def report() -> None:
         page.fill("#words", "missed, although it is plainly there")
         page.click("#report")
@@ -119,6 +124,7 @@ def main() -> int:
     """Record the film."""
     parser = argparse.ArgumentParser(description="Record a minute of the workbench.")
     parser.add_argument("film", type=Path, help=".webp file")
+    parser.add_argument("--picture", type=Path, help="PNG file of the page, too")
     parser.add_argument("--seconds", type=float, default=60.0, help="length at most (default: 60)")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="Chromium or Chrome")
     options = parser.parse_args()
@@ -132,7 +138,7 @@ def main() -> int:
             until(lambda: page.locator("#bar").is_hidden(), 0.5)  # the drive is loaded
             page.wait_for_timeout(8000)  # and drawn
             film = Film(page)
-            play(page, film)
+            play(page, film, options.picture)
             film.stop()
             page.wait_for_timeout(500)
         browser.close()
