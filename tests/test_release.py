@@ -71,7 +71,7 @@ def test_the_actions_inputs_reach_its_script_by_variables() -> None:
     assert named == set(yaml("action.yml")["inputs"])
 
 
-@pytest.mark.parametrize("name", ["ci", "release"])
+@pytest.mark.parametrize("name", ["ci", "docs", "release"])
 def test_workflows_name_files_and_targets_that_exist(name: str) -> None:
     jobs = yaml(f".github/workflows/{name}.yml")["jobs"].values()
     commands = "\n".join(step.get("run", "") for job in jobs for step in job["steps"])
