@@ -10,7 +10,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
 from bevviz.bags import remote
 from bevviz.bags.bag import Recording
@@ -91,12 +93,13 @@ def web(folder: Path) -> Iterator[WebServer]:
     server.server_close()
 
 
-def test_a_bag_at_an_address_gives_the_same_messages(web: WebServer, folder: Path) -> None:
-    def messages(path: str | Path) -> list[tuple[str, int, bytes]]:
-        with Recording([Path(path)]) as recording:
-            topics = [topic.name for topic in recording.topics]
-            return [(m.topic, m.received, bytes(m.data)) for m in recording.messages(topics)]
+def messages(path: str | Path) -> list[tuple[str, int, bytes]]:
+    with Recording([Path(path)]) as recording:
+        topics = [topic.name for topic in recording.topics]
+        return [(m.topic, m.received, bytes(m.data)) for m in recording.messages(topics)]
 
+
+def test_a_bag_at_an_address_gives_the_same_messages(web: WebServer, folder: Path) -> None:
     assert messages(f"{web.address}/drive.mcap") == messages(folder / "drive.mcap")
 
 
@@ -149,3 +152,44 @@ def test_a_server_without_ranges_is_told(web: WebServer) -> None:
     web.ranges = False
     with pytest.raises(UserError, match="download it"):
         Recording([Path(f"{web.address}/drive.mcap")])
+
+
+class Storage(MemoryFileSystem):  # type: ignore[misc]
+    """Object storage that refuses to answer without credentials."""
+
+    protocol = "s3"
+    credentials = True
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return "/" + path.removeprefix("s3://").lstrip("/")
+
+    def info(self, path: str, **options: object) -> dict[str, object]:
+        if not self.credentials:
+            raise type("NoCredentialsError", (Exception,), {})
+        return dict(super().info(path, **options))
+
+
+def test_a_bag_in_object_storage_is_read_as_a_file(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fsspec.register_implementation("s3", Storage, clobber=True)
+    address = "s3://drives/drive.mcap"
+    Storage().pipe_file(address, (folder / "drive.mcap").read_bytes())
+    assert messages(address) == messages(folder / "drive.mcap")
+    assert main(["info", address]) == 0 and address in capsys.readouterr().out
+    monkeypatch.setattr(Storage, "credentials", False)
+    assert main(["info", address]) != 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("bevviz: error: drive.mcap: no credentials for s3://: set AWS_PROFILE")
+
+
+def test_a_batch_refuses_an_address(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["batch", "s3://drives/drive.mcap", "-o", str(tmp_path / "runs")]) != 0
+    assert "drive.mcap: a batch reads no bags at addresses: download it" in capsys.readouterr().err
+
+
+def test_a_missing_package_for_object_storage_is_named() -> None:
+    fsspec.register_implementation("gs", "no_such_package.System", clobber=True)
+    with pytest.raises(UserError, match=r"^drive\.mcap: reading gs:// needs more packages: .* gcsfs$"):
+        Recording([Path("gs://drives/drive.mcap")])

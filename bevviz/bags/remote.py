@@ -18,6 +18,8 @@ PART = 1 << 16  # bytes loaded at least: many records of an index lie in one par
 CACHE = 1 << 26  # bytes kept in memory
 TRIES = 3
 PAUSE = 0.5  # seconds before the second try; twice as long before the third
+PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
+NO_CREDENTIALS = ("NoCredentialsError", "PartialCredentialsError")  # errors of s3fs
 
 
 def address_of(path: Path) -> str:
@@ -50,6 +52,7 @@ class RemoteBytes(FileBytes):
 
     def __init__(self, path: Path) -> None:
         self._address, self._name = address_of(path), name_of(path)
+        self._protocol = self._address.partition(":")[0]
         self._parts: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._kept = 0
         self._lock = Lock()
@@ -57,10 +60,11 @@ class RemoteBytes(FileBytes):
             import fsspec
 
             self._system, self._inner = fsspec.core.url_to_fs(self._address)
-        except ImportError as error:
+        except ImportError:
+            also = f" {PACKAGES[self._protocol]}" if self._protocol in PACKAGES else ""
             raise UserError(
-                f"{self._name}: reading it needs more packages ({first_line(error)}): "
-                "pip install 'bevviz[remote]', for s3:// also s3fs"
+                f"{self._name}: reading {self._protocol}:// needs more packages: "
+                f"pip install 'bevviz[remote]'{also}"
             ) from None
         except ValueError as error:
             raise UserError(f"{self._name}: {first_line(error)}") from None
@@ -109,7 +113,8 @@ class RemoteBytes(FileBytes):
 
     def _request(self, request: Any) -> Any:
         """Return what a request gives. A failure of the network is tried again."""
-        for number in range(1, TRIES + 1):
+        tries = 1 if self._protocol in PACKAGES else TRIES  # the packages for storage try again themselves
+        for number in range(1, tries + 1):
             try:
                 return request()
             except FileNotFoundError:
@@ -117,7 +122,12 @@ class RemoteBytes(FileBytes):
             except PermissionError:
                 raise UserError(f"{self._name}: the server permits no reading of it") from None
             except Exception as error:  # each protocol's package has errors of its own
-                if number == TRIES:
+                if type(error).__name__ in NO_CREDENTIALS:
+                    raise UserError(
+                        f"{self._name}: no credentials for {self._protocol}://: set AWS_PROFILE, or "
+                        "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY; for a public bucket FSSPEC_S3_ANON=true"
+                    ) from None
+                if number == tries:
                     # The text of an error may hold the address with its signature.
                     raise UserError(
                         f"{self._name}: cannot be read over the network ({type(error).__name__})"

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 from bevviz.bags.bag import METADATA
+from bevviz.bags.remote import address_of, name_of
 from bevviz.bags.source import FrameSelection
 from bevviz.config import Config, with_object_files
 from bevviz.datasets import find_loader
@@ -156,6 +157,8 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
     """
     unique_bags: dict[Path, None] = {}
     for path in paths:
+        if address_of(path):
+            raise UserError(f"{name_of(path)}: a batch reads no bags at addresses: download it")
         matches = (
             [path] if path.exists() else sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
         )

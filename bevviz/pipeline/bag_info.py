@@ -12,6 +12,7 @@ import numpy as np
 
 from bevviz.bags.bag import Recording
 from bevviz.bags.reader import megabytes
+from bevviz.bags.remote import address_of
 from bevviz.bags.source import SECOND, BagSource, iso
 from bevviz.config import (
     Config,
@@ -135,7 +136,7 @@ def _describe(
     networks, missing_networks = network_providers(config)
     missing = [*missing, *missing_networks]
     return BagInfo(
-        paths=tuple(map(str, recording.paths)),
+        paths=tuple(address_of(path) or str(path) for path in recording.paths),
         formats=tuple(", ".join(filter(None, [f.format, f.compression])) for f in recording.files),
         size=recording.size,
         start=recording.start,
