@@ -11,11 +11,12 @@ import pytest
 from pyarrow import parquet
 
 import bevviz
+from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.model.results import FrameResult, Objects
 from bevviz.report.facts import shareable
-from tests.support import datasets
+from tests.support import bags, datasets
 
 LABEL = "Car 0.00 0 0.0 {left} 5 70 30 1.5 1.6 4.0 0.0 1.7 {ahead} -1.57 {score}\n"
 
@@ -103,6 +104,66 @@ def test_a_table_of_our_own_objects_comes_back(tmp_path: Path) -> None:
     assert objects.names == made.names
     np.testing.assert_allclose(objects.boxes.center, made.boxes.center)
     np.testing.assert_allclose(objects.boxes.yaw, made.boxes.yaw)
+
+
+def numbered_results(folder: Path, scans: int) -> dict[str, str]:
+    """Write 3D and image boxes for each scan, whose names are the number of the scan."""
+    columns = {name: [1.0] * scans for name in ("x", "y", "z", "length", "width", "height", "yaw")}
+    named = {"frame": range(scans), "name": [f"n{n}" for n in range(scans)], "score": [0.5] * scans}
+    parquet.write_table(pa.table({**named, **columns}), folder / "boxes.parquet")
+    rows = [{"image_id": n, "category_id": n, "bbox": [n, 5, 40, 20], "score": 0.8} for n in range(scans)]
+    names = [{"id": n, "name": f"n{n}"} for n in range(scans)]
+    (folder / "coco.json").write_text(json.dumps({"categories": names, "annotations": rows}))
+    return {"mine": str(folder / "boxes.parquet"), "net": str(folder / "coco.json")}
+
+
+def labels_of(source: BagSource) -> list[tuple[float, set[str]]]:
+    """Return the time and the labels of each frame."""
+    return [
+        (
+            frame.stamp * 1e-9,
+            {n for boxes in (*frame.robot_boxes, *frame.robot_detections) for n in boxes.labels},
+        )
+        for frame in source
+    ]
+
+
+def test_a_part_of_a_drive_has_the_rows_of_its_scans(tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=20))
+    config = load(settings=[f"source.results={json.dumps(numbered_results(tmp_path, 20))}"])
+    with BagSource([bag], config) as source:
+        whole = labels_of(source)
+        assert [names for _, names in whole] == [{f"n{n}"} for n in range(20)]
+    with BagSource([bag], config, start="1") as source:
+        assert labels_of(source) == whole[-source.total :] and source.total < 20
+
+
+@pytest.mark.parametrize("form", ["mcap", "ros1"])
+def test_a_report_has_the_boxes_of_its_result_files(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    messages = bags.Messages(form == "ros1")
+    bag = bags.write(tmp_path / "drive.bag", bags.small_items(messages, scans=60), messages, form=form)
+    results = numbered_results(tmp_path, 60)
+    given = [part for name, path in results.items() for part in ("--results", f"{name}={path}")]
+    whole = dict(labels_of(BagSource([bag], load(settings=[f"source.results={json.dumps(results)}"]))))
+    out = tmp_path / "report" / "bug.rrd"
+    out.parent.mkdir()
+    monkeypatch.chdir(out.parent)
+    window = ["--at", "4", "--before", "0.3", "--after", "0.3"]
+    assert main(["report", str(bag), *given, *window, "--redact"]) == 2
+    assert "--redact needs a detector" in capsys.readouterr().err
+    assert main(["report", str(bag), *given, *window, "-o", str(out)]) == 0
+    for path in results.values():
+        Path(path).unlink()
+    assert main(["report", "--check", str(out)]) == 0
+    assert "the same in every bit" in capsys.readouterr().out
+    page = out.with_suffix(".html").read_text()
+    assert "topic:/results/mine" in page and "boxes.parquet" not in page
+    stages = ["objects.method=topic:/results/mine", "detector.model=topic:/results/net"]
+    with BagSource([out.with_suffix(".mcap")], load(settings=stages)) as source:
+        reported = labels_of(source)
+    assert len(reported) > 7 and all(whole[time] == names for time, names in reported)
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,10 @@ class BagSource(Closable):
         handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
         self._feed_latched(state, handlers, low)
         frames = self._deliver(state, handlers, low, high, first, chosen)
-        return map(self._with_results, frames) if self.results else frames
+        if not self.results:
+            return frames
+        skipped = int(np.searchsorted(self.scans, low)) - first  # Result files number the whole recording.
+        return (self._with_results(frame, frame.index + skipped) for frame in frames)
 
     def _deliver(
         self,
@@ -346,12 +349,12 @@ class BagSource(Closable):
         scans = len(self.recording.scan_times(driver)) if driver else 0
         return open_results(results, self.recording.folder, scans, self.recording.sample_stamps)
 
-    def _with_results(self, frame: Frame) -> Frame:
-        """Return a frame with the boxes of the result files."""
+    def _with_results(self, frame: Frame, number: int) -> Frame:
+        """Return a frame with the boxes of the result files. ``number``: that of its scan."""
         boxes, detections, problems = [*frame.robot_boxes], [*frame.robot_detections], [*frame.problems]
         for file in self.results:
             try:
-                labelled = file.of(frame)
+                labelled = file.of(replace(frame, index=number))
             except UserError as error:
                 problems.append(str(error))
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -15,6 +15,7 @@ from rosbags.interfaces import Connection
 from bevviz.bags.bag import ATTACHED, Recording
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.message import RawMessage, is_ros1
+from bevviz.bags.reader import LAST_TIME
 from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
 from bevviz.drivers.ouster import metadata_topic
@@ -44,6 +45,15 @@ class ReportWindow:
     low: int  # first scan, inclusive
     high: int  # last scan, exclusive
     start: int  # start of the whole recording
+
+
+@dataclass(frozen=True, slots=True)
+class MadeMessage:
+    """Message that the bag of a report has beside the recorded ones."""
+
+    connection: Connection
+    received: int
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +126,7 @@ def cut_bag(
     path: Path,
     edit: Edit = unchanged,
     margin: int = MARGIN,
+    made: Sequence[MadeMessage] = (),
 ) -> CutContent:
     """Write the messages of a window to an MCAP file, byte for byte, with all that a run of it needs.
 
@@ -136,12 +147,16 @@ def cut_bag(
         path: path of the MCAP file.
         edit: returns the connection and the bytes to write for a message. None: leave it out.
         margin: nanoseconds.
+        made: messages to add, in order of time. Recorded messages of their topics are left out.
 
     Raises:
         UserError: the file cannot be written.
     """
     low, high = window.low - margin, window.high + margin
+    added = {message.connection.topic for message in made}
+    topics = [name for name in topics if name not in added]
     chosen = [name for name in topics if name not in static]
+    waiting = deque(made)
     counts: Counter[str] = Counter()
     damage = UnusableMessages()
     ros1 = is_ros1(next(c for f in recording.files for c in f.connections))
@@ -150,7 +165,14 @@ def cut_bag(
             file = Path(recording.calibrations[topic])
             bag.attach(f"{ATTACHED}{topic}/{file.name}", file.read_bytes())
 
+        def put_made(before: int) -> None:
+            while waiting and waiting[0].received < before:
+                message = waiting.popleft()
+                bag.write(message.connection, message.received, message.data)
+                counts[message.connection.topic] += 1
+
         def put(message: RawMessage) -> None:
+            put_made(message.received)
             try:
                 content = message.content()
             except zstd.ZstdError:
@@ -176,6 +198,7 @@ def cut_bag(
         messages_after += recording.messages(static, high)
         for message in sorted(messages_after, key=lambda message: message.received):
             put(message)
+        put_made(LAST_TIME)
     return CutContent(counts, tuple(damage.sentences))
 
 

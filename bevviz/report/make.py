@@ -34,8 +34,10 @@ from bevviz.recording.recorder import DiskWatch, Recorder
 from bevviz.recording.sinks import open_recording
 from bevviz.recording.source_lookup import Origin
 from bevviz.report.bag_window import (
+    MILLISECOND,
     CutContent,
     Edited,
+    MadeMessage,
     ReportWindow,
     check_patterns,
     choose_topics,
@@ -57,6 +59,7 @@ from bevviz.report.facts import (
 from bevviz.report.fingerprints import digest, pack
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
+from bevviz.report.result_topics import result_messages, without_result_files
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress
@@ -171,8 +174,15 @@ def make(
         loader = StageLoader(store=not request.redact)  # Nothing of a redacted report is kept.
         asked = _ask(request, whole_bag, loader)
         answers = () if asked is None else asked.answers
+        made: list[MadeMessage] = []
+        if whole_bag.results:
+            low = max(window.low - MARGIN, whole_bag.recording.start)  # The bag has the scans beside it, too.
+            high = min(window.high + MARGIN, whole_bag.recording.end + MILLISECOND)
+            with open_window(request.paths, request.config, low, high) as source_of_results:
+                made = list(result_messages(source_of_results))
+            request = replace(request, config=without_result_files(request.config))
         session = Session(request.config, detect, loader=loader)
-        content = _cut(whole_bag, window, topics, bag, redactor)
+        content = _cut(whole_bag, window, topics, bag, redactor, made)
         cleanup.register(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
         stack.callback(cleanup.unregister, bag)
         written.files.append(bag)
@@ -372,7 +382,12 @@ def _detect(request: ReportRequest, window: ReportWindow) -> DetectionsByImage:
 
 
 def _cut(
-    source: BagSource, window: ReportWindow, topics: Sequence[str], bag: Path, redactor: Redactor | None
+    source: BagSource,
+    window: ReportWindow,
+    topics: Sequence[str],
+    bag: Path,
+    redactor: Redactor | None,
+    made: Sequence[MadeMessage],
 ) -> CutContent:
     """Cut the window out of the bag, with a progress bar."""
     low, high = window.low - MARGIN, window.high + MARGIN
@@ -384,7 +399,8 @@ def _cut(
             bar.update()
             return unchanged(message, data) if redactor is None else redactor(message, data)
 
-        return cut_bag(source.recording, window, topics, source.roles.tf_static, bag, edit)
+        static = source.roles.tf_static
+        return cut_bag(source.recording, window, topics, static, bag, edit, made=made)
 
 
 def _info(

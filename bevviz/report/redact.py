@@ -19,6 +19,7 @@ from bevviz.bags.bag import Recording
 from bevviz.bags.message import RawMessage
 from bevviz.bags.reader import normalized
 from bevviz.config import DetectorConfig
+from bevviz.config.plugins import TOPIC
 from bevviz.drivers.video import decode_packet
 from bevviz.errors import UserError
 from bevviz.messages.decoders import MessageError
@@ -80,7 +81,7 @@ class Redactor:
         lidars: Collection[str] = (),
         unredacted: Sequence[str] = (),
     ) -> None:
-        if not config.model:
+        if not config.model or config.model.startswith(TOPIC):
             raise UserError(
                 "--redact needs a detector that finds people and vehicles: give --model FILE.onnx"
             )
