@@ -14,6 +14,7 @@ import bevviz
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
+from bevviz.datasets.result_files import Labelled
 from bevviz.model.results import FrameResult, Objects
 from bevviz.report.facts import shareable
 from tests.support import bags, datasets
@@ -119,13 +120,11 @@ def numbered_results(folder: Path, scans: int) -> dict[str, str]:
 
 def labels_of(source: BagSource) -> list[tuple[float, set[str]]]:
     """Return the time and the labels of each frame."""
-    return [
-        (
-            frame.stamp * 1e-9,
-            {n for boxes in (*frame.robot_boxes, *frame.robot_detections) for n in boxes.labels},
-        )
-        for frame in source
-    ]
+    labels = []
+    for frame in source:
+        boxes: list[Labelled] = [*frame.robot_boxes, *frame.robot_detections]
+        labels.append((frame.stamp * 1e-9, {name for labelled in boxes for name in labelled.labels}))
+    return labels
 
 
 def test_a_part_of_a_drive_has_the_rows_of_its_scans(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ import numpy as np
 from bevviz.bags.source import BagSource
 from bevviz.config import Config
 from bevviz.datasets.dataset import make_connection
-from bevviz.datasets.result_files import BOXES_2D, BOXES_3D
+from bevviz.datasets.result_files import BOXES_2D, BOXES_3D, Labelled
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_boxes_2d, encode_boxes_3d
-from bevviz.model.frame import Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.frame import Frame, LabelledBoxes3D
 from bevviz.report.bag_window import MadeMessage
 from bevviz.stages.robot_results import in_points_frame
 
@@ -21,7 +21,8 @@ def result_messages(source: BagSource) -> Iterator[MadeMessage]:
     """Yield the boxes of the result files for each selected frame, as messages of the topics of the files."""
     topics = {file.topic for file in source.results}
     for frame in source if topics else ():
-        for labelled in (*frame.robot_boxes, *frame.robot_detections):
+        boxes: list[Labelled] = [*frame.robot_boxes, *frame.robot_detections]
+        for labelled in boxes:
             if labelled.topic in topics:
                 yield _message(frame, labelled)
 
@@ -31,7 +32,7 @@ def without_result_files(config: Config) -> Config:
     return config.model_copy(update={"source": config.source.model_copy(update={"results": {}})})
 
 
-def _message(frame: Frame, labelled: LabelledBoxes2D | LabelledBoxes3D) -> MadeMessage:
+def _message(frame: Frame, labelled: Labelled) -> MadeMessage:
     """Return the boxes of a frame as a message that is received with its scan."""
     hypotheses = [[pair] for pair in zip(labelled.labels, labelled.scores.tolist(), strict=True)]
     if isinstance(labelled, LabelledBoxes3D):
