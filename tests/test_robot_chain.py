@@ -9,12 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import bevviz
+from bevviz.bags.source import BagSource
 from bevviz.cli import main
+from bevviz.config import load
+from bevviz.errors import UserError
 from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
 from bevviz.why.robot_chain import ObjectMessage, RobotChain, verdict
+from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support import bags, documented_json
+from tests.support.live_sessions import live_bench
 from tests.support.robot_graphs import PARENT, TOPICS, Graph, Plant, make_graph
+from tests.support.workbench_pages import Talk, serving
 
 SEEDS = range(500, 508)
 PARENTS = {TOPICS[node]: {TOPICS[parent]} for node, parent in PARENT.items()}
@@ -72,6 +79,19 @@ def test_an_untouched_object_is_not_accused() -> None:
             accused += verdict(outcomes) is not None
     assert kept > 100
     assert accused <= 0.01 * kept
+
+
+def test_the_end_of_the_messages_accuses_no_node() -> None:
+    graph = make_graph(77, losses=0.0, plants=0)
+    last = graph.messages["/lidar/objects"][-1]
+    cut = {
+        topic: [one for one in messages if one.received <= last.received]
+        for topic, messages in graph.messages.items()
+    }
+    for center in last.center:
+        outcomes = RobotChain(cut, graph.sensors).follow(last.stamp, center)
+        assert verdict(outcomes) is None
+        assert "cannot be told" in outcomes[-1].text
 
 
 def test_copies_of_one_topic_cannot_be_told_apart() -> None:
@@ -146,3 +166,61 @@ def test_what_cannot_be_asked_is_said(
     plain = bags.write(tmp_path / "plain", bags.small_items(scans=5))
     assert main(["why", str(plain), "--at-frame", "2", "--robot"]) == 2
     assert "no topic has objects of the robot around that frame" in capsys.readouterr().err
+
+
+# --- shown by the workbench ----------------------------------------------------------------------
+
+
+def place_of(plant: Plant, graph: Graph) -> np.ndarray:
+    """Return where a planted thing is in the frame of the points."""
+    return graph.places[plant][1] - [plant.frame, 0, 1.8]
+
+
+def test_the_page_shows_which_node_lost_it(bag: tuple[Path, Graph]) -> None:
+    path, graph = bag
+    plant = next(plant for plant in graph.plants if plant.node == "tracker")
+    pick = "point//" + ",".join(f"{value:.3f}" for value in place_of(plant, graph))
+    (file,) = path.glob("*.mcap")
+    with serving(str(file)) as (address, _), Talk(address) as talk:
+        time = bags.START + plant.frame * bags.PERIOD
+        robot = talk.asked("robot", type="ask", time=time, set=[], pick=pick)
+    assert robot["text"].endswith("by the step that makes /tracks")
+    (changed,) = (step for step in robot["steps"] if step["changed"])
+    assert changed["text"].startswith("/tracks: ") and "/tracks: from /merged, " in changed["about"]
+    assert len(robot["steps"]) == len(TOPICS)
+
+
+def test_the_page_reads_the_chain_once(bag: tuple[Path, Graph], tmp_path: Path) -> None:
+    path, graph = bag
+    with bevviz.open(path) as drive, RecordedDrive(drive, BagSource([path], load())) as bench:
+        asked = [bench.follow_robot(plant.frame, place_of(plant, graph)) for plant in graph.plants]
+        right = [
+            one is not None and one[1].change is not None and one[1].change.topic == TOPICS[plant.node]
+            for plant, one in zip(graph.plants, asked, strict=True)
+        ]
+        assert sum(right) >= len(right) - 1
+        assert len({id(one[0].chain) for one in asked if one is not None}) == 1
+        with pytest.raises(UserError, match="where the object is in space"):
+            bench.follow_robot(3, None)
+    plain = bags.write(tmp_path / "plain", bags.small_items(scans=5))
+    with bevviz.open(plain) as drive, RecordedDrive(drive, BagSource([plain], load())) as bench:
+        assert bench.follow_robot(2, np.zeros(3)) is None
+        assert bench.robot_bag is None, "there is nothing to read"
+
+
+def test_a_running_robot_is_asked_for_its_nodes(bag: tuple[Path, Graph]) -> None:
+    path, graph = bag
+    with bevviz.open(path) as drive, BagSource([path], load()) as source:
+        topics = [topic.name for topic in source.recording.topics]
+        messages = list(source.recording.messages(topics))
+        results = [drive.at(frame=plant.frame) for plant in graph.plants]
+        with live_bench(results, messages=messages) as bench:
+            for result in results:
+                bench.observe(result)
+            right = 0
+            for plant in graph.plants:
+                followed = bench.follow_robot(plant.frame, place_of(plant, graph))
+                assert followed is not None
+                change = followed[1].change
+                right += change is not None and change.topic == TOPICS[plant.node]
+    assert right >= len(graph.plants) - 1

@@ -32,6 +32,7 @@ REST = 0.05  # share of the objects that remain, from which on a further parent 
 WAITS = 0.6  # ratio of the spread of a delay with a further parent to that without it
 REGULAR = 1.35  # ratio of two spreads that tells nothing
 CLOSE = 0.04  # difference of two costs that tells nothing
+ENDED = "cannot be told, as the messages end before it"
 
 State = Literal["kept", "dropped", "not made", "message lost", "moved", "renamed", "delayed", "unknown"]
 
@@ -144,6 +145,7 @@ class RobotChain:
         self._stamps = {topic: _by_stamp(those) for topic, those in self.messages.items()}
         self._periods = {topic: _period(those) for topic, those in self.messages.items()}
         self._received = {topic: [one.received for one in those] for topic, those in self.messages.items()}
+        self._end = max((times[-1] for times in self._received.values()), default=0)
         self.steps: tuple[ChainStep, ...] = ()
         self._infer(sensors or {})
 
@@ -379,6 +381,8 @@ class RobotChain:
         """Return whether a topic at the beginning of the chain has an object at a place."""
         message = self._stamps[step.topic].get(stamp) or self.nearest(step.topic, stamp)
         source = step.parents[0] if step.parents else ""
+        if message is None and self._ends_before(step, stamp):
+            return StepOutcome(step.topic, source, "unknown", f"{step.topic}: {ENDED}"), None
         if message is None:
             text = f"{step.topic}: no message at that time"
             return StepOutcome(step.topic, source, "message lost", text), None
@@ -394,6 +398,10 @@ class RobotChain:
         text = f"{step.topic}: has it, {message.labels[row] or 'without a name'}"
         return StepOutcome(step.topic, source, "kept", text, row), message
 
+    def _ends_before(self, step: ChainStep, time: int) -> bool:
+        """Return whether the messages end before the one that a step makes of an earlier one."""
+        return time + (step.delay + 5 * step.spread) * SECOND > self._end
+
     def nearest(self, topic: str, stamp: int) -> ObjectMessage | None:
         """Return the message nearest to a stamp, within the usual distance of two messages."""
         best = min(self._stamps[topic], key=lambda other: abs(other - stamp))
@@ -405,6 +413,8 @@ class RobotChain:
         """Return what a step did with an object of its parent."""
         message = self._child_of(step, parent, before)
         name = before.labels[row] or "the object"
+        if message is None and self._ends_before(step, before.received):
+            return StepOutcome(step.topic, parent, "unknown", f"{step.topic}: {ENDED}"), None
         if message is None:
             text = f"{step.topic}: no message was made from that of {parent}"
             return StepOutcome(step.topic, parent, "message lost", text), None
@@ -476,7 +486,7 @@ def _ancestors(topic: str, steps: Mapping[str, ChainStep]) -> set[str]:
 
 def verdict(outcomes: Sequence[StepOutcome]) -> StepOutcome | None:
     """Return the first step that lost, renamed, delayed or moved the object. None: all have kept it."""
-    changed = [one for one in outcomes if one.state not in ("kept", "not made")]
+    changed = [one for one in outcomes if one.state not in ("kept", "not made", "unknown")]
     if changed:
         return changed[0]
     made = any(one.row >= 0 for one in outcomes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,6 +30,12 @@ from bevviz.why.robot_chain import (
 
 AROUND = 10 * SECOND  # nanoseconds before and after the frame that the chain is inferred from
 LEAST = 4  # messages of a topic that the chain needs
+
+
+def object_topics(source: BagSource) -> list[str]:
+    """Return the topics of a bag with objects of the robot."""
+    roles, names = source.roles, {topic.name for topic in source.recording.topics}
+    return sorted(names & {*roles.robot_detections_3d, *roles.stages} - {*roles.robot_clouds})
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +103,13 @@ class RobotQuestions:
 
     def __init__(self, source: BagSource, frame: Frame) -> None:
         self._source, self._frame = source, frame
-        self._world = frame.world_frame
+        self._world, self._middle = frame.world_frame, frame.received
         self.notes: list[str] = []
         low, high = frame.received - AROUND, frame.received + AROUND
         self._tf = TransformBuffer(4 * AROUND / SECOND)
         self._read_transforms(low, high)
         roles = source.roles
-        names = sorted({*roles.robot_detections_3d, *roles.stages} - {*roles.robot_clouds})
+        names = object_topics(source)
         messages: dict[str, list[ObjectMessage]] = {name: [] for name in names}
         problems: dict[str, str] = {}
         for message in source.recording.messages(names, low, high):
@@ -118,12 +125,24 @@ class RobotQuestions:
         ]
         if len(messages) == len(few):
             raise UserError(
-                "--robot: no topic has objects of the robot around that frame; 'bevviz info' lists the topics"
+                "no topic has objects of the robot around that frame; 'bevviz info' lists the topics"
             )
         sensors = {
             name: self._stamps(name, low, high) for name in (*roles.lidars, *(c.topic for c in roles.cameras))
         }
         self.chain = RobotChain({name: those for name, those in messages.items() if name not in few}, sensors)
+
+    def about(self, frame: Frame) -> RobotQuestions:
+        """Return the questions about another frame. The chain is the same where the frame is near.
+
+        Raises:
+            UserError: the robot published no objects around the frame.
+        """
+        if frame.world_frame != self._world or abs(frame.received - self._middle) > AROUND // 2:
+            return RobotQuestions(self._source, frame)
+        questions = copy.copy(self)
+        questions._frame = frame
+        return questions
 
     # --- questions -----------------------------------------------------------------------------
 

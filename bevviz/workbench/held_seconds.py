@@ -19,6 +19,7 @@ from bevviz.model.frame import Camera, Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.support.contexts import Closable
 from bevviz.support.scratch_folder import ScratchFolder
+from bevviz.why.robot_messages import RobotQuestions
 
 NEIGHBOURS = (0, -1, 1)  # scans that are tried where the time of receipt is that of one of many packets
 
@@ -79,13 +80,15 @@ class HeldSeconds(Closable):
     Attributes:
         path: path of the bag.
         frames: facts about its frames, by number.
+        made: time when it was made, in nanoseconds.
 
     Raises:
         UserError: the bag cannot be written.
     """
 
     def __init__(self, messages: Sequence[RawMessage], frames: Mapping[int, DeliveredFrame]) -> None:
-        self.frames = frames
+        self.frames, self.made = frames, time.time_ns()
+        self._robot: RobotQuestions | None = None
         self._folder = ScratchFolder()
         self._sources: dict[str, BagSource] = {}  # by topic of the scans
         self.path = self._folder.new() / time.strftime("robot_%Y%m%dT%H%M%S.mcap")
@@ -124,6 +127,16 @@ class HeldSeconds(Closable):
             ):
                 return _as_delivered(frame, delivered)
         raise UserError(f"frame {delivered.number} cannot be made again: its scan is not among the messages")
+
+    def robot_questions(self, delivered: DeliveredFrame, frame: Frame) -> RobotQuestions:
+        """Return the questions about the robot's own chain around a frame.
+
+        Raises:
+            UserError: the robot published no objects around the frame.
+        """
+        known = self._robot
+        self._robot = RobotQuestions(self._source(delivered), frame) if known is None else known.about(frame)
+        return self._robot
 
     def _source(self, delivered: DeliveredFrame) -> BagSource:
         """Return the bag with the scans of a topic first: the first LiDAR by name may have been silent."""

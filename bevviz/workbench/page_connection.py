@@ -248,13 +248,39 @@ class PageConnection:
             return
         selection, result, answer, tree = answered
         await self._send({"type": "answer", **head, **tree})
-        await self._at_desk(number, lambda: self._source.mark(result, answer, self._page_desk))
-        hints = await self._at_desk(
-            number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
-        )
-        if hints is not None:
-            asked = str(message.get("pick", tree["pick"]))
-            await self._send({"type": "hints", **head, "row_pick": asked, **hints_dict(hints)})
+
+        async def follow_up() -> None:
+            await self._at_desk(number, lambda: self._source.mark(result, answer, self._page_desk))
+            hints = await self._at_desk(
+                number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
+            )
+            if hints is not None:
+                asked = str(message.get("pick", tree["pick"]))
+                await self._send({"type": "hints", **head, "row_pick": asked, **hints_dict(hints)})
+
+        async def follow_robot() -> None:
+            robot = await asyncio.to_thread(self._followed, number, result, answer)
+            if robot is not None:
+                await self._send({"type": "robot", **head, **robot})
+
+        await asyncio.gather(follow_up(), follow_robot())
+
+    def _followed(self, number: int, result: FrameResult, answer: Answer) -> dict[str, Any] | None:
+        """Return what the robot's own nodes did with an object. None: nothing is to be shown."""
+        from bevviz.why.log import focus_point
+        from bevviz.workbench.page_messages import robot_dict
+
+        if number != self._asked:
+            return None
+        place, frame = focus_point(result.frame, answer), result.frame.index
+        try:
+            with self._source.quiet():
+                followed = self._source.follow_robot(frame, place)
+        except UserError as error:
+            return {"text": f"what the robot's nodes did cannot be told: {error}", "steps": [], "notes": []}
+        if followed is None or (answer.empty and all(one.row < 0 for one in followed[1].outcomes)):
+            return None
+        return robot_dict(*followed)
 
     def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.anomalies import Onsets
+from bevviz.bags.source import BagSource
 from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
@@ -29,6 +30,7 @@ from bevviz.recording import entities
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
+from bevviz.why.robot_messages import RobotQuestions, object_topics
 from bevviz.workbench.buffers import BufferReader, FilmReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.film import Film
@@ -96,6 +98,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         film: recording of the drive.
         lanes: buffers by name: ``film``, the desk of each page, and the runs with other values.
         over: whether the run over the drive has ended.
+        robot_bag: the bag a third time, for the robot's own chain. None: nobody has asked.
     """
 
     def __init__(
@@ -127,6 +130,8 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self._variants = Variants(drive.session.loader)
         self._looking = threading.RLock()  # guards the reading of frames, _raw, _results and _making
         self._making: defaultdict[tuple[int, Settings], threading.Lock] = defaultdict(threading.Lock)
+        self.robot_bag: BagSource | None = None
+        self._robot: RobotQuestions | None = None
         self._asking, self._counting = 0, threading.Lock()  # number of questions that are being answered
         self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
         self._quiet.set()
@@ -148,6 +153,9 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self.film.close()
         self.drive.close()
         self.again.close()
+        with self.following:
+            if self.robot_bag is not None:
+                self.robot_bag.close()
 
     @property
     def on_demand(self) -> bool:
@@ -470,6 +478,20 @@ class RecordedDrive(Source, Observer[FrameResult]):
             UserError: a parameter is unknown, or a value is wrong.
         """
         return changed_config(self.drive.config, settings) if settings else self.drive.config
+
+    def robot_questions(self, number: int) -> RobotQuestions | None:
+        """Return the questions about the robot's chain around a frame, see ``Source``."""
+        frames = self.drive.frames
+        if not isinstance(frames, BagSource) or len(object_topics(frames)) < 2:
+            return None
+        if self.robot_bag is None:  # A bag of its own: other questions need not wait for it.
+            self.robot_bag = frames.opener()
+        frame = self.robot_bag.frame(number)
+        if frame is None:
+            raise UserError(f"frame {number} cannot be read")
+        known = self._robot
+        self._robot = RobotQuestions(self.robot_bag, frame) if known is None else known.about(frame)
+        return self._robot
 
     def select(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]

@@ -31,6 +31,7 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
+from bevviz.why.robot_messages import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.findings import find_findings
@@ -43,6 +44,7 @@ from bevviz.workbench.source import Message, Settings, Source
 KEPT = 4  # held frames that are kept
 MADE = 3  # frames made again that are kept
 BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame needs
+AFTER = 1_000_000_000  # nanoseconds after a scan in which the robot's last node has made something of it
 BAGS = 2  # bags of held seconds that are kept: a report may be cut from the one before the newest
 LISTED_FRAMES = 64  # frames of the held seconds that are listed
 TRIED = 2  # results of held frames with other values that are kept
@@ -265,10 +267,15 @@ class RunningRobot(Source):
                 self._made.popitem(last=False)
         return result
 
-    def _bag(self, number: int) -> tuple[HeldSeconds, DeliveredFrame]:
-        """Return the bag that has a frame, which is made if no bag has it, and facts about the frame."""
+    def _bag(self, number: int, end: int = 0) -> tuple[HeldSeconds, DeliveredFrame]:
+        """Return the bag that has a frame, which is made if no bag has it, and facts about the frame.
+
+        Args:
+            number: number of the frame.
+            end: time up to which the bag must have messages, in nanoseconds.
+        """
         for bag in reversed(self._bags):
-            if number in bag.frames:
+            if number in bag.frames and bag.made >= end:
                 return bag, bag.frames[number]
         with self._lock:
             frames = dict(self._delivered)
@@ -295,6 +302,18 @@ class RunningRobot(Source):
         return self.look(number).tracks
 
     # --- questions -----------------------------------------------------------------------------
+
+    def robot_questions(self, number: int) -> RobotQuestions | None:
+        """Return the questions about the robot's chain in the held seconds, see ``Source``."""
+        frames = [result.frame for result in self._held()]
+        if self.live.raw is None or len({one.topic for frame in frames for one in frame.robot_boxes}) < 2:
+            return None
+        frame = self.look(number).frame
+        end = frame.received + AFTER
+        time.sleep(min(max(0, end - time.time_ns()), AFTER) * 1e-9)
+        with self._making:
+            bag, delivered = self._bag(number, end)
+            return bag.robot_questions(delivered, frame)
 
     def asked_settings(self, settings: Settings, again: bool) -> Settings:
         """Return the settings that a question is about.

@@ -8,14 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+import numpy as np
+
 from bevviz.config import Config
+from bevviz.errors import UserError
 from bevviz.evaluate import Truth
 from bevviz.evaluate.ground_truth import TruthLookup
-from bevviz.model.frame import Frame
+from bevviz.model.frame import F32, F64, Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.session import Session
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.robot_messages import FollowedObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.findings import FindingList
@@ -48,6 +52,7 @@ class Source(Closable):
         self.opening: int | None = None
         self._remarks: dict[tuple[int, str], str] = {}  # by frame and text of the selection
         self._remarking = threading.Lock()
+        self.following = threading.Lock()  # guards the bag that the robot's chain is read from
         self._aside: FrameExplainer | None = None
         self.first = 0
         self.commands: Mapping[str, Callable[[Message], dict[str, Any]]] = {}
@@ -90,6 +95,32 @@ class Source(Closable):
                 answer = self._aside.about(Selection.parse(pick))
                 self._remarks[number, pick] = self._aside.with_hints(answer).remark
             return self._remarks[number, pick]
+
+    def robot_questions(self, number: int) -> RobotQuestions | None:
+        """Return the questions about the robot's own chain. None: the robot has not two topics of objects.
+
+        Call it with ``following``.
+
+        Raises:
+            UserError: the chain cannot be told.
+        """
+        return None
+
+    def follow_robot(
+        self, number: int, place: F32 | F64 | None
+    ) -> tuple[RobotQuestions, FollowedObject] | None:
+        """Follow the object at a place in the frame of the points through the robot's own chain.
+
+        Raises:
+            UserError: it cannot be told.
+        """
+        with self.following:
+            questions = self.robot_questions(number)
+            if questions is None:
+                return None
+            if place is None:
+                raise UserError("where the object is in space is unknown")
+            return questions, questions.at(np.asarray(place, np.float64))
 
     @property
     def on_demand(self) -> bool:

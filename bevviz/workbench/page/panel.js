@@ -52,8 +52,8 @@ function clear(className, text, where = "") {
   $("answer").className = className;
   $("verdict").textContent = text;
   $("where").textContent = where;
-  for (const id of ["chain", "beside", "hints"]) $(id).replaceChildren();
-  $("beside-title").hidden = true;
+  for (const id of ["chain", "beside", "hints", "robot-chain"]) $(id).replaceChildren();
+  for (const id of ["beside-title", "robot-title"]) $(id).hidden = true;
   freshness();
 }
 
@@ -107,6 +107,8 @@ function answer(message) {
   $("where").textContent = `${parts.join(" · ")} · answered in ${(took / 1000).toFixed(2)} s`;
   $("chain").replaceChildren(...message.chain.map((step) => (
     element("li", "", "", element("b", "", `${step.stage}: `), step.text))));
+  $("robot-chain").replaceChildren();
+  $("robot-title").hidden = true;
   const from = { time: Number(state.time), set: message.set };
   $("beside").replaceChildren(...message.beside.map((other) => {
     const button = element("button", other.reported ? "" : "missed", `${other.name}: ${other.reason}`);
@@ -133,6 +135,17 @@ function absent(message) {
   clear("", message.text, `frame ${message.frame}${withValues(message.set)}`);
   state.answer = { id: message.id, frame: message.frame, set: message.set };
   freshness();
+}
+
+// The robot's own chain: what each of its nodes did with the object, with the usual delay and loss of the node.
+function robotChain(message) {
+  if (message.id !== asking) return;
+  $("robot-title").hidden = false;
+  $("robot-chain").replaceChildren(
+    element("li", "", "", element("b", "", message.text)),
+    ...message.steps.map((step) => element("li", step.changed ? "missed" : "", step.text, element("small", "", step.about))),
+    ...message.notes.map((note) => element("li", "", "", element("small", "", note))),
+  );
 }
 
 function failed(message) {
@@ -333,7 +346,7 @@ function legend(classes) {
 }
 
 on({
-  welcome, controls: (message) => parameters.offer(message.controls), answer, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
+  welcome, controls: (message) => parameters.offer(message.controls), answer, robot: robotChain, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
   tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, notes: list.notes, noted: jobs.noted,
   remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text),
   made: (frame) => { made.add(frame); freshness(); },
