@@ -35,6 +35,12 @@ def matrix_yaml(name: str, rows: int, columns: int, values: Any) -> str:
     return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: {np.reshape(values, -1).tolist()}\n"
 
 
+SUPERVISELY = {
+    "sensorsData": {
+        "extrinsicMatrix": np.reshape(ROWS[:3], -1).tolist(),
+        "intrinsicMatrix": K,
+    }
+}
 OPENCALIB = {
     "calib/center_camera-intrinsic.json": json.dumps(
         {
@@ -126,6 +132,7 @@ def write_drive(folder: Path, camera: str = "front", lidar: str = "lidar") -> Pa
     ("camera", "files", "model"),
     [
         ("front", {"calib/camera/front.json": SUSTECH}, ""),
+        ("img", {f"cam_info/{n:06}.json": json.dumps(SUPERVISELY) for n in range(2)}, ""),
         ("center_camera", OPENCALIB, "plumb_bob"),
         ("camera", {"autoware.yaml": AUTOWARE_AI}, "plumb_bob"),
         ("cam0", {"calib/camchain.yaml": KALIBR}, "plumb_bob"),
@@ -144,6 +151,7 @@ def write_drive(folder: Path, camera: str = "front", lidar: str = "lidar") -> Pa
     ],
     ids=[
         "SUSTechPOINTS",
+        "Supervisely",
         "OpenCalib",
         "Autoware.AI",
         "Kalibr",
@@ -175,6 +183,27 @@ def test_calibrations_of_tools_place_the_camera(
     warnings = loader(folder, "").warnings
     assert loader is not Folder or any(text.startswith("calibrated by ") for text in warnings)
     assert not any("is not read" in text for text in warnings)
+
+
+@pytest.mark.parametrize("cameras", [("img",), ("left", "right")])
+def test_images_in_a_folder_for_each_cloud(tmp_path: Path, cameras: tuple[str, ...]) -> None:
+    """The folders of images, not their names, tell the clouds that they belong to."""
+    for number in range(2):
+        (tmp_path / "pointcloud").mkdir(exist_ok=True)
+        datasets.scan(number).tofile(tmp_path / f"pointcloud/scene{number}.bin")
+        folder = tmp_path / f"related_images/scene{number}_bin"
+        for place, camera in enumerate(cameras):
+            name = f"scene{number}_{camera}.png" if len(cameras) > 1 else f"img{9 - number}.png"
+            datasets.image(folder / name, 40 + 50 * number + 20 * place)
+            calibrated = SUPERVISELY if place == 0 else {"sensorsData": {"intrinsicMatrix": [0] * 9}}
+            (folder / f"{name}.json").write_text(json.dumps({"name": name, "meta": calibrated}))
+    drive = bevviz.open(tmp_path)
+    for number in range(2):
+        frame = drive.raw(number)
+        assert [c.name for c in frame.cameras] == (["camera"] if len(cameras) == 1 else [*cameras])
+        grey = [int(c.image.bgr.mean()) for c in frame.cameras if c.image is not None]
+        assert grey == [40 + 50 * number + 20 * place for place in range(len(cameras))]
+        assert frame.cameras[0].camera_from_points is not None
 
 
 def test_what_calibration_yaml_states_wins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -139,6 +139,11 @@ def test_walls_alone_tell_no_mounting() -> None:
     assert ground_normal(in_a_hall((14.0, 7.0, 8.0), np.linspace(-7, 52, 32))) is None
 
 
+def test_few_points_in_a_small_place_tell_no_mounting() -> None:
+    cubes = [np.random.default_rng(seed).uniform(0, 1, (200, 3)) for seed in range(50)]
+    assert all(ground_normal(cube.astype(np.float32)) is None for cube in cubes)
+
+
 def test_the_base_frame_tells_what_is_ahead_too(scan: Cloud) -> None:
     frame, sync = built(scan, turned(x=180, z=90), by_base)
     assert np.abs(frame.points - scan.xyz).max() < 1e-3

@@ -248,6 +248,18 @@ def _sustech(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
         yield FoundSensor(name, {"K": _square(tree["intrinsic"])}, _rigid(tree["extrinsic"]))
 
 
+def _supervisely(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read the JSON of an image in Supervisely: ``sensorsData`` has the transform from the LiDAR, and K.
+
+    Images without a calibration have zeros.
+    """
+    about = tree.get("meta", tree)
+    about = about.get("sensorsData") if isinstance(about, dict) else None
+    if isinstance(about, dict) and any(_flat(about["intrinsicMatrix"])):
+        K, camera_from_lidar = about["intrinsicMatrix"], about["extrinsicMatrix"]
+        yield FoundSensor(name, {"K": _square(K)}, _rigid(camera_from_lidar))
+
+
 def _opencalib(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
     """Read OpenCalib: ``NAME-intrinsic``, and ``LIDAR-to-CAMERA-extrinsic``."""
     for key, about in tree.items():
@@ -346,6 +358,7 @@ def _named_sensors(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
 
 PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
     _sustech,
+    _supervisely,
     _opencalib,
     _camera_info,
     _kalibr,

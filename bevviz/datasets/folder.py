@@ -42,6 +42,7 @@ from bevviz.support.files import (
 
 MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
 NOTE_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")
+RELATED = "related_images"  # Supervisely's: a folder of images for each cloud
 CALIBRATION, STAMPS, POSES = "calibration.yaml", "stamps.csv", "poses.txt"
 SENSOR_FOLDER = re.compile(  # folders that contain one folder per camera or LiDAR
     "cam|im(g|age)|lidar|velo|point|cloud|pcd|scan", re.IGNORECASE
@@ -104,6 +105,8 @@ class Folder(Dataset):
             raise UserError(f"{path}: no cloud in it{others and '; '}{others}; expected {self.expects}")
         if others:
             self.warn(others)
+        related = self._related_images(lidars)
+        alone, cameras = cameras, {**cameras, **{name: [*files] for name, files in related.items()}}
         about, read = self._with_found(about, lidars, cameras)
         if bare := [name for name in cameras if "K" not in about.get("cameras", {}).get(name, {})]:
             self.warn(f"{', '.join(bare)}: {CALIBRATION} does not state K{_unread_notes(path, read)}")
@@ -112,7 +115,11 @@ class Folder(Dataset):
                 names = f"there are {', '.join(sensors)}" if sensors else "there is none"
                 names += others and f"; {others}"
                 raise UserError(f"{path / CALIBRATION}: no {unknown[0]} among the {kind}; {names}")
-        stamped = self._stamps({"lidars": lidars, "cameras": cameras}, about)
+        stamped = self._stamps({"lidars": lidars, "cameras": alone}, about)
+        for name, clouds in related.items():
+            alone[name] = [file for file, cloud in clouds.items() if cloud in stamped]
+            stamped |= {file: stamped[clouds[file]] for file in alone[name]}
+        cameras = alone
         edges, streams = [], list[Stream]()
         # Without a stated mounting, the only LiDAR's frame may be tilted.
         has_base = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
@@ -184,6 +191,21 @@ class Folder(Dataset):
             if reason := why_no_points(max(lidars[name], key=lambda file: file.stat().st_size)):
                 self.warn(f"{self._name_files(lidars.pop(name))}: {reason}: left out")
         return lidars, sensors["cameras"]
+
+    def _related_images(self, lidars: Mapping[str, Sequence[Path]]) -> dict[str, dict[Path, Path]]:
+        """Return the images that lie in a folder for each cloud: by camera, with their clouds."""
+        related = [
+            (cloud, files_in(self.path / RELATED / cloud.name.replace(".", "_"), IMAGES))
+            for clouds in lidars.values()
+            for cloud in clouds
+        ]
+        single = all(len(images) < 2 for _, images in related)
+        cameras = dict[str, dict[Path, Path]]()
+        for cloud, images in related:
+            for image in images:
+                own_name = image.stem.replace(cloud.stem, "").strip("_-. ")
+                cameras.setdefault("camera" if single else own_name or "camera", {})[image] = cloud
+        return cameras
 
     def _split_by_sensor(
         self, sensor: str, files: Sequence[Path], stated: Collection[str]

@@ -30,6 +30,7 @@ DISAGREEMENT = math.radians(12.0)  # between transforms and ground; more means t
 GRAVITY_TIME = 2.0  # seconds of smoothing: braking is no slope
 # Metres from the LiDAR, points and planes of the search for the ground.
 NEAR, POINTS, PLANES = 25.0, 4000, 400
+FEWEST = 200  # near points in cubes of their own; a plane fits fewer by chance
 LOW = 0.2  # share of points, the lowest by z, from which more planes are drawn
 THICKNESS = 0.12  # metres between the ground's points and its plane
 SUPPORT, BELOW = 0.15, 0.02  # shares of the near points: least in the ground, most below it
@@ -179,13 +180,15 @@ def ground_normal(points: F32) -> F64 | None:
         (3,) unit vector; z if a small floor agrees with it; None if there is no ground.
     """
     near = points[np.einsum("ij,ij->i", points, points) < NEAR**2]
-    if len(near) < 200:
+    if len(near) < FEWEST:
         return None
     random = np.random.default_rng(0)
     sample = near[random.integers(0, len(near), POINTS)].astype(np.float64)
     # Each cube of 0.3 m counts once. Otherwise the dense rings near the LiDAR would decide.
     _, first = np.unique(np.floor(sample / 0.3).astype(np.int64), axis=0, return_index=True)
     sample = sample[first]
+    if len(sample) < FEWEST:
+        return None
     # Otherwise few planes of a small floor are drawn.
     low = sample[sample[:, 2] <= np.quantile(sample[:, 2], LOW)]
     normals, heights = (
