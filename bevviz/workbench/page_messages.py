@@ -51,7 +51,7 @@ def robot_dict(questions: RobotQuestions, followed: FollowedObject) -> dict[str,
         "text": followed.text,
         "steps": [
             {
-                "about": step_line(step.topic, chain),
+                "about": step_line(step.topic, chain).removeprefix(f"{step.topic}: "),
                 "text": outcomes[step.topic].text if step.topic in outcomes else "",
                 "changed": change is not None and step.topic == change.topic,
             }

@@ -141,11 +141,13 @@ function absent(message) {
 function robotChain(message) {
   if (message.id !== asking) return;
   $("robot-title").hidden = false;
+  $("robot-title").textContent = `The robot's own nodes: ${message.text}.`;
   $("robot-chain").replaceChildren(
-    element("li", "", "", element("b", "", message.text)),
-    ...message.steps.map((step) => element("li", step.changed ? "missed" : "", step.text, element("small", "", step.about))),
+    ...message.steps.map((step) => element("li", step.changed ? "missed" : "", step.text || "not reached", element("small", "", step.about))),
     ...message.notes.map((note) => element("li", "", "", element("small", "", note))),
   );
+  const [list, changed] = [$("robot-chain"), $("robot-chain").querySelector(".missed")];
+  if (changed) list.scrollTop = changed.offsetTop - list.offsetTop - list.clientHeight / 2;
 }
 
 function failed(message) {
