@@ -133,6 +133,11 @@ def write_drive(folder: Path, camera: str = "front", lidar: str = "lidar") -> Pa
     [
         ("front", {"calib/camera/front.json": SUSTECH}, ""),
         ("img", {f"cam_info/{n:06}.json": json.dumps(SUPERVISELY) for n in range(2)}, ""),
+        (
+            "image_orig",
+            {"config.json": json.dumps({"cam": {"D": D, "K": [K[:3], K[3:6], K[6:]]}, "tf": ROWS})},
+            "plumb_bob",
+        ),
         ("center_camera", OPENCALIB, "plumb_bob"),
         ("camera", {"autoware.yaml": AUTOWARE_AI}, "plumb_bob"),
         ("cam0", {"calib/camchain.yaml": KALIBR}, "plumb_bob"),
@@ -152,6 +157,7 @@ def write_drive(folder: Path, camera: str = "front", lidar: str = "lidar") -> Pa
     ids=[
         "SUSTechPOINTS",
         "Supervisely",
+        "PlyCal",
         "OpenCalib",
         "Autoware.AI",
         "Kalibr",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -260,6 +260,13 @@ def _supervisely(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
         yield FoundSensor(name, {"K": _square(K)}, _rigid(camera_from_lidar))
 
 
+def _plycal(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read PlyCal: the lens in ``cam``, and ``tf`` from the LiDAR to the camera."""
+    if isinstance(tree.get("cam"), dict) and "tf" in tree:
+        for sensor in _camera_info(tree["cam"], ANY_CAMERA):
+            yield replace(sensor, sensor_from_lidar=_rigid(tree["tf"]))
+
+
 def _opencalib(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
     """Read OpenCalib: ``NAME-intrinsic``, and ``LIDAR-to-CAMERA-extrinsic``."""
     for key, about in tree.items():
@@ -359,6 +366,7 @@ def _named_sensors(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
 PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
     _sustech,
     _supervisely,
+    _plycal,
     _opencalib,
     _camera_info,
     _kalibr,
