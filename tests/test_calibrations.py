@@ -319,6 +319,15 @@ def test_labels_of_copies_count_if_they_are_kittis(tmp_path: Path) -> None:
     assert bevviz.open(root).raw(1).truth is None
 
 
+def test_labels_of_another_format_are_named(tmp_path: Path) -> None:
+    """View of Delft has JSON for its radar."""
+    root = datasets.kitti_object(tmp_path / "data")
+    for file in (root / "label_2").iterdir():
+        file.rename(file.with_suffix(".json"))
+    assert "label_2 is not read: no .txt in it has the name of a scan" in KittiObject(root, "").warnings
+    assert bevviz.open(root).raw(1).truth is None
+
+
 def test_calibrations_of_sixteen_cameras_are_read(tmp_path: Path) -> None:
     folder = write_drive(tmp_path)
     (folder / "calib").mkdir()

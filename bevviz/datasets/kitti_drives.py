@@ -109,9 +109,10 @@ class KittiObject(Dataset):
         fields = _columns(self, scans, path / "velodyne/000000.bin")
         times = FRAME_GAP * np.arange(1, len(scans) + 1, dtype=np.int64)
         names = [scan.stem for scan in scans]
-        with_labels, labels = _matching(
-            files_in(self._label_folder(), [".txt"]), names, lambda file: file.stem
-        )
+        folder = self._label_folder()
+        with_labels, labels = _matching(files_in(folder, [".txt"]), names, lambda file: file.stem)
+        if not labels and files_in(folder, [""]):
+            self.warn(f"{folder.name} is not read: no .txt in it has the name of a scan")
 
         calibrations = _object_folder(path, "calib")
 
