@@ -7,10 +7,11 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -114,17 +115,29 @@ class Channel:
 
 
 class Shown:
-    """What a page's viewer would show."""
+    """What a page's viewer would show. A thread takes each piece at once: a slow page skips pieces."""
 
     def __init__(self, address: str, folder: Path) -> None:
         self.channel, self._file = Channel(address, "/film"), folder / "piece.rrd"
         self.stamp, self.texts, self.marked = 0, list[str](), False
+        self._pieces = deque[bytes]()
+        threading.Thread(target=self._receive, daemon=True).start()
+
+    def _receive(self) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        with suppress(ConnectionClosed, TimeoutError):
+            while True:
+                self._pieces.append(self.channel.piece())
 
     def until(self, done: Callable[[], Any]) -> None:
         end = time.monotonic() + PATIENCE
         while not done():
             assert time.monotonic() < end
-            self._take(self.channel.piece())
+            if self._pieces:
+                self._take(self._pieces.popleft())
+            else:
+                time.sleep(0.02)
 
     def _take(self, piece: bytes) -> None:
         from rerun.chunk import RrdReader
