@@ -28,6 +28,7 @@ from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.support.contexts import Closable
 
 WHOLE = 1.0  # seconds from one whole packet to the next
+BATCH = 100_000  # bytes from which on Rerun's threads compress what is logged, while the rest is being logged
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,8 @@ class _Stream(Closable):
     ) -> None:
         self._file = os.memfd_create("recording")
         self._end = 0
-        self.recording = rr.RecordingStream(application, recording_id=recording_id)
+        batches = rr.ChunkBatcherConfig(flush_num_bytes=BATCH)
+        self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
         self.recording.set_log_time_enabled(False)
         # A footer would keep a list of every logged chunk in memory.
         sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)
