@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
+import cv2
 import numpy as np
 import pytest
 
@@ -149,6 +150,36 @@ def test_a_click_is_answered(browser: Browser, address: str, bag: Path) -> None:
         assert subject(page)["id"] == pick
         answered_at(150, 300)
         assert subject(page).get("id") != pick
+
+
+def test_the_viewer_shows_the_frame_of_the_panel(browser: Browser, address: str, bag: Path) -> None:
+    """Soon after the last frame was chosen, although the viewer reads all of them without a graphics card."""
+    with bevviz.open(bag) as drive:
+        images = [cameras[0].image for n in range(FRAMES) if (cameras := drive.raw(n).cameras)]
+    with opened(browser, address) as page:
+        until(lambda: listed(page))
+        for _ in range(FRAMES - 1):
+            page.keyboard.press(".")
+        until(lambda: f"Frame {FRAMES - 1}" in page.inner_text("body"))
+        width = page.evaluate("document.getElementById('viewer').clientWidth / 2")
+
+        def shown() -> int:
+            """Return the number of the frame whose image is most like a part of the page."""
+            data = page.screenshot(timeout=1000 * PATIENCE)
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            assert picture is not None
+            likeness = []
+            for image in images:
+                assert image is not None
+                height, scale = image.bgr.shape[0], width / image.bgr.shape[1]
+                small = cv2.resize(
+                    image.bgr, (int(width), round(scale * height)), interpolation=cv2.INTER_AREA
+                )
+                part = small[10:-10, 10:-20]
+                likeness.append(float(cv2.matchTemplate(picture, part, cv2.TM_CCOEFF_NORMED).max()))
+            return int(np.argmax(likeness))
+
+        until(lambda: shown() == FRAMES - 1)
 
 
 def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:

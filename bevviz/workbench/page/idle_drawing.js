@@ -10,6 +10,36 @@ const READ = 200e3; // bytes that it reads for one picture, on a slow machine: i
 const SIGNS = ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "touchstart", "touchmove", "resize",
   "focus", "blur", "dragover", "drop", "paste"];
 
+// Without a graphics card a picture takes a second, after which the viewer reads data for 10 ms. So while it has much to
+// read, only one picture in some is drawn: the commands that draw the others are left out.
+const DRAWN = 12; // of so many pictures one is drawn
+const HELD = 2000; // ms after the pointer was in the viewer in which each picture is drawn, since it finds what is there
+const DRAWING = ["clear", "clearBufferfi", "clearBufferfv", "clearBufferiv", "clearBufferuiv", "drawArrays", "drawArraysInstanced",
+  "drawElements", "drawElementsInstanced", "drawRangeElements", "blitFramebuffer"];
+const FINISH = 200; // ms after the last picture that was left out until the viewer is asked for one that is drawn
+let skipping = false;
+let painted = false; // whether the viewer has painted in the present picture
+let pictures = 0;
+let finish = 0;
+let pointed = -HELD;
+const drawnInSoftware = () => {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const names = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = names ? gl.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+};
+const slow = drawnInSoftware();
+if (slow) {
+  for (const name of DRAWING) {
+    const draw = WebGL2RenderingContext.prototype[name];
+    WebGL2RenderingContext.prototype[name] = function (...values) {
+      painted = true;
+      return skipping ? undefined : draw.apply(this, values);
+    };
+  }
+}
+
 export const nextPicture = window.requestAnimationFrame.bind(window);
 const held = [];
 let last = performance.now();
@@ -24,8 +54,33 @@ export function wake(bytes = 0) {
 
 window.requestAnimationFrame = (draw) => {
   if (left <= 0 && performance.now() - last > AWAKE) return held.push(draw) && 0;
-  left -= 1;
-  return nextPicture(draw);
+  if (!slow) left -= 1;
+  return nextPicture(slow ? (now) => drawOrSkip(draw, now) : draw);
 };
-for (const sign of SIGNS) window.addEventListener(sign, () => wake(), { capture: true, passive: true });
+
+// Call the viewer for a picture, and count it if it has painted one.
+function drawOrSkip(draw, now) {
+  painted = false;
+  skipping = left > PICTURES && pictures % DRAWN !== 0 && now - pointed > HELD;
+  draw(now);
+  if (painted) {
+    pictures += 1;
+    left -= 1;
+    clearTimeout(finish);
+    if (skipping) finish = setTimeout(redraw, FINISH);
+  }
+  skipping = false;
+}
+
+// Ask the viewer, which has read all, for a picture that is drawn.
+function redraw() {
+  left = Math.min(left, PICTURES);
+  wake();
+  window.dispatchEvent(new Event("hashchange")); // It repaints then.
+}
+function signed(event) {
+  if (event.type.startsWith("pointer") && event.target.closest?.("#viewer")) pointed = performance.now();
+  wake();
+}
+for (const sign of SIGNS) window.addEventListener(sign, signed, { capture: true, passive: true });
 document.addEventListener("visibilitychange", () => wake());

@@ -13,7 +13,8 @@ export function start() {
     await navigator.clipboard.writeText(`${location.origin}/shared#${parts}`);
     $("shared").textContent = `Copied. It opens wherever 'bevviz open' shows ${state.bag}.`;
   };
-  window.addEventListener("hashchange", () => location.reload()); // A link was put into the address.
+  // A link was put into the address. Ours is only a sign to the viewer.
+  window.addEventListener("hashchange", (event) => event.isTrusted && location.reload());
 }
 
 export const welcomed = (message) => { opened = message.opened; };
