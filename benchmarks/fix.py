@@ -116,7 +116,7 @@ def main() -> None:
         if before > default - WORSE:
             continue
         start = time.perf_counter()
-        keys = keys_for(choosing.reasons(config))
+        keys = keys_for(choosing.reasons(config), config)
         fix = find_fix(
             config, keys, choosing, confirming, options.trials, defaults=not options.without_defaults
         )

@@ -111,6 +111,9 @@ def test_values_to_try_are_valid_and_ordered() -> None:
 def test_frequent_reasons_name_the_parameters() -> None:
     assert keys_for({"suppressed": 90, "too far": 2, "hidden": 8}) == ["detector.iou_threshold"]
     assert keys_for({"hidden": 3}) == []
+    wrong = load(settings=["fusion.min_points=30", "voxel.size=0.2", "bev.range_x=40"])
+    assert keys_for({"hidden": 3}, wrong) == []
+    assert keys_for({"suppressed": 3}, wrong) == ["detector.iou_threshold", "voxel.size", "fusion.min_points"]
     assert keys_for(Counter({"ground": 5, "below threshold": 9}))[0] == "detector.conf_threshold"
 
 

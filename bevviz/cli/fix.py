@@ -73,7 +73,7 @@ def _fix(options: argparse.Namespace) -> int:
         choosing, confirming, parts = draw_samples(
             drives, config, options.sample, options.truth, options.kitti_labels, bar.update
         )
-    keys = options.parameter or keys or keys_for(choosing.reasons(config))
+    keys = options.parameter or keys or keys_for(choosing.reasons(config), config)
     if not keys:
         say("nothing that a parameter decides is missed or false in the sample", always=True)
         return 1
@@ -125,7 +125,8 @@ def _of_batch(options: argparse.Namespace) -> tuple[Config, list[DriveFrames], l
         raise UserError(f"{folder}: nothing missed, nothing false; or the batch ran without --truth")
     options.recorded = find_source(folder / f"{drives[0].name}.rrd", (), collect_settings(options))
     reasons = findings.reasons() if cause is None else cause.reasons
-    return load_config(options), drives, keys_for(reasons)
+    config = load_config(options)
+    return config, drives, keys_for(reasons, config)
 
 
 def _of_drive(options: argparse.Namespace) -> tuple[Config, list[DriveFrames], list[str]]:

@@ -19,7 +19,7 @@ from bevviz.config.keys import (
     unknown_key,
     values,
 )
-from bevviz.config.loading import changed_config, load, untrusted_layers
+from bevviz.config.loading import changed_config, load, preset_differences, untrusted_layers
 from bevviz.config.methods import (
     BUILTIN_METHODS,
     METHOD_KEYS,
@@ -88,6 +88,7 @@ __all__ = [
     "object_network_params",
     "params_of",
     "plugin_of",
+    "preset_differences",
     "read_layer",
     "stage_topics",
     "stated_lines",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,21 @@ def load(
     }
     loaded._functions = functions
     return loaded
+
+
+def preset_differences(config: Config) -> dict[str, Any]:
+    """Return the preset's value of each parameter that has another value in a configuration."""
+    current = values(config)
+    return {
+        key: value
+        for key, value in _preset_values(config.preset).items()
+        if key in current and current[key] != value
+    }
+
+
+@cache
+def _preset_values(preset: Preset) -> Mapping[str, Any]:
+    return values(load(preset=preset))
 
 
 def changed_config(config: Config, settings: Iterable[str], trust: Trust = MESSAGE) -> Config:

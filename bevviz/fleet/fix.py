@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.bags.source import BagSource
-from bevviz.config import Config, load
+from bevviz.config import Config, load, preset_differences
 from bevviz.errors import UserError
 from bevviz.evaluate.ground_truth import Truth, truth_source
 from bevviz.evaluate.matching import AcceptedNames, judge
@@ -360,13 +360,20 @@ def _confirmed(
     )  # fmt: skip
 
 
-def keys_for(reasons: Mapping[str, int]) -> list[str]:
-    """Return the parameters that reasons depend on, those of frequent reasons first."""
+def keys_for(reasons: Mapping[str, int], config: Config | None = None) -> list[str]:
+    """Return the parameters that reasons depend on, those of frequent reasons first.
+
+    If some do, those with another value in the configuration than in its preset follow: one error can show as
+    the reasons of another.
+    """
     total = sum(reasons.values())
     keys: dict[str, None] = {}
     for reason, number in sorted(reasons.items(), key=lambda item: -item[1]):
         if number >= COMMON * total:
             keys |= dict.fromkeys(PARAMETERS.get(reason, ()))
+    if keys and config is not None:
+        known = {key for of_reason in PARAMETERS.values() for key in of_reason}
+        keys |= dict.fromkeys(key for key in preset_differences(config) if key in known)
     return list(keys)
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from bevviz.config import Config, Preset, load, plugin_of, values
+from bevviz.config import Config, plugin_of, preset_differences
 from bevviz.errors import UserError
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
@@ -163,18 +162,11 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
 
 def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
     """Yield the preset's value of each number that was changed in a stage that may have lost the subject."""
-    current, presets = values(config), _preset_values(config.preset)
+    differing = preset_differences(config)
     for section in () if kind in _NO_STAGE else _STAGES.get(kind, _FUSION):
-        for key, value in presets.items():
-            number = isinstance(value, int | float) and isinstance(current.get(key), int | float)
-            if number and key.startswith(f"{section}.") and current[key] != value:
+        for key, value in differing.items():
+            if key.startswith(f"{section}.") and isinstance(value, int | float):
                 yield {key: value}
-
-
-@cache
-def _preset_values(preset: Preset) -> Mapping[str, Any]:
-    """Return the value of each parameter in a preset."""
-    return values(load(preset=preset))
 
 
 def _changes_against_false(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
