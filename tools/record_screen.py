@@ -105,8 +105,9 @@ def play(page: Any, film: Film, picture: Path | None) -> None:
     )
 
     if picture is not None:
-        page.mouse.move(SIZE[0] / 4, SIZE[1] / 2)  # so that the viewer draws what it has read
-        page.wait_for_timeout(15_000)
+        for i in range(12):  # The viewer draws what it has read while there is input.
+            page.mouse.move(SIZE[0] - 100 - i, 60)
+            page.wait_for_timeout(1500)
         page.screenshot(path=picture, timeout=120e3)
 
     def report() -> None:
