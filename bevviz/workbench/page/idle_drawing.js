@@ -13,7 +13,7 @@ const SIGNS = ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "k
 // Without a graphics card a picture takes a second, after which the viewer reads data for 10 ms. So while it has much to
 // read, only one picture in some is drawn: the commands that draw the others are left out.
 const DRAWN = 12; // of so many pictures one is drawn
-const HELD = 2000; // ms after the pointer was in the viewer in which each picture is drawn, since it finds what is there
+const HELD = 10000; // ms after the pointer was in the viewer in which each picture is drawn: it finds what is there to click
 const DRAWING = ["clear", "clearBufferfi", "clearBufferfv", "clearBufferiv", "clearBufferuiv", "drawArrays", "drawArraysInstanced",
   "drawElements", "drawElementsInstanced", "drawRangeElements", "blitFramebuffer"];
 const FINISH = 200; // ms after the last picture that was left out until the viewer is asked for one that is drawn
