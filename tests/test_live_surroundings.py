@@ -149,7 +149,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     with own_graph() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         patch.chdir(folder)
-        with playing(Play(frames=3, points=5_000)):
+        with playing(Play(frames=3, points=5_000, rate=4)):
             yield fly(folder)
 
 
