@@ -76,6 +76,8 @@ def test_units_and_tutorial_names(setting: str, key: str, value: object) -> None
         ("sync.tolerance=100", "less than or equal to 10, in seconds (given: 100)"),
         ("clustering.eps=abc", "must be a valid number"),
         ("clustering.eps=-1", "must be greater than 0"),
+        ("bev.resolution=0.001", "must leave 1 to 65500 cells a side"),
+        ("bev.resolution=0.004", "at most 300 million in all, not 20000 x 20000"),
         ("ground.method=plan", "must be one of polar, plane, module:function, or topic:"),
         ("nonsense", "expected key=value"),
         ("detector.names=[a", "is not valid YAML"),
@@ -103,6 +105,15 @@ def test_a_wrong_file_is_one_clear_line(tmp_path: Path) -> None:
         assert said in str(caught.value)
     with pytest.raises(UserError, match="No such file"):
         config.load(tmp_path / "absent.yaml")
+
+
+@pytest.mark.parametrize("ranges", [(500, 1, 0.012), (4, 40, 10)])
+def test_a_raster_that_is_no_image_is_refused(ranges: tuple[float, float, float]) -> None:
+    keys = ("bev.range_x", "bev.range_y", "bev.resolution")
+    settings = [f"{key}={value}" for key, value in zip(keys, ranges, strict=True)]
+    with pytest.raises(UserError, match=r"bev\.resolution must leave 1 to 65500 cells a side"):
+        config.load(settings=settings)
+    assert config.load(settings=["bev.resolution=0.011"]).bev.resolution == 0.011
 
 
 def test_clusters_that_could_have_no_size_are_refused() -> None:

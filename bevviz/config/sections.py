@@ -31,6 +31,9 @@ from bevviz.config.value_types import (
     with_default_sizes,
 )
 
+MAX_SIDE = 65_500  # pixels of a bird's-eye image: the JPEG encoder takes no more
+MAX_CELLS = 300_000_000  # cells of a bird's-eye image: 0.9 GB of pixels
+
 Preset = Literal["default", "reference"]
 Functions = Mapping[tuple[str, str], str]  # (section, module:function) -> folder of the module
 Keep = Literal["everything", "inspect", "report"]
@@ -336,6 +339,20 @@ class BevConfig(Section):
     channels: tuple[Literal["density", "height", "intensity", "occupancy"], ...] = Field(
         ("occupancy",), description="rasters logged beside the image: density, height, intensity, occupancy"
     )
+
+    @field_validator("resolution")
+    @classmethod
+    def _fits_an_image(cls, resolution: float, info: ValidationInfo) -> float:
+        """Check that the image can be encoded and fits into memory."""
+        rows, columns = (int(2 * info.data.get(key, 40.0) / resolution) for key in ("range_x", "range_y"))
+        if not (min(rows, columns) > 0 and max(rows, columns) <= MAX_SIDE and rows * columns <= MAX_CELLS):
+            raise PydanticCustomError(
+                "no_image",
+                "must leave 1 to {side} cells a side and at most {cells} million in all, "
+                "not {rows} x {columns}",
+                {"side": MAX_SIDE, "cells": MAX_CELLS // 1_000_000, "rows": rows, "columns": columns},
+            )
+        return resolution
 
 
 class LoggingConfig(Section):
