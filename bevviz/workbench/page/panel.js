@@ -76,7 +76,8 @@ function requestOften() {
 function freshness() {
   const frame = shownFrame();
   const making = state.demand && frame !== null && !made.has(frame) ? ", being made ..." : "";
-  $("shown").textContent = frame === null ? seconds(state.time) : `Frame ${frame} at ${seconds(state.time)}${making}`;
+  const at = seconds(state.time); // empty beside a robot
+  $("shown").textContent = frame === null ? at : `Frame ${frame}${at && ` at ${at}`}${making}`;
   const { answer } = state;
   const isOther = frame === null ? askedFor !== shownKey() : answer?.frame !== frame;
   const isOld = answer !== null && (isOther || answer.set.join() !== shownSet().join());
