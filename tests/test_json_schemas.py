@@ -22,6 +22,7 @@ EVALUATION = {
     "metrics": {"recall": None},
     "false_causes": {},
     "worst": [],
+    "estimated_recall": {},
     "limits": [LIMIT],
 }
 

@@ -98,6 +98,12 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
     return of_topic
 
 
+def has_truth(frames: FrameSource) -> bool:
+    """Return whether a drive has ground truth of its own."""
+    roles: Roles | None = getattr(frames, "roles", None)
+    return bool(frames.scene.truth if roles is None else roles.truth)
+
+
 def truth_in(frames: FrameSource, topic: str | None = None, kitti: Path | None = None) -> TruthLookup:
     """Return a function that returns the ground truth of a drive's frames.
 
@@ -130,8 +136,7 @@ def truth_in(frames: FrameSource, topic: str | None = None, kitti: Path | None =
 def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     """Return labelled boxes as the ground truth of a frame.
 
-    An object has to be found if its centre lies within 40 m, and in the image of some camera if there is one,
-    and if its box holds 10 LiDAR points or more. A box without a size holds none; ``unusable`` lists it.
+    A box without a size holds no points, and need not be found; ``unusable`` lists it.
 
     Args:
         frame: the frame.
@@ -139,9 +144,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
             of COCO's classes use for it. Any other label accepts its own name only.
     """
     boxes = in_points_frame(frame, labelled)
-    must = (boxes.distance <= RANGE) & _in_view(frame, boxes)
-    rows = np.flatnonzero(must)
-    must[rows] = [len(hits) >= MIN_HITS for _, hits in inside_each(frame.points, boxes.chosen(rows))]
+    must = must_be_found(frame, boxes)
     flat = [
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
@@ -158,6 +161,18 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         camera,
         (*labelled.unusable, *flat),
     )
+
+
+def must_be_found(frame: Frame, boxes: Boxes3D) -> Bool:
+    """Return (K,) whether the object of a box has to be found.
+
+    Its centre lies within 40 m, and in the image of some camera if there is one, and its box holds 10 LiDAR
+    points or more.
+    """
+    must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes), bool)
+    rows = np.flatnonzero(must)
+    must[rows] = [len(hits) >= MIN_HITS for _, hits in inside_each(frame.points, boxes.chosen(rows))]
+    return must
 
 
 def _in_view(frame: Frame, boxes: Boxes3D) -> Bool:
