@@ -199,6 +199,16 @@ def test_runs_are_kept_and_compared(page: Page) -> None:
     page.fill("#search", "")
 
 
+def test_a_fix_is_searched_until_it_is_cancelled(page: Page) -> None:
+    page.click("#fix")
+    until(page.locator("#fix-cancel").is_visible)
+    assert page.locator("#fix").is_disabled()
+    until(lambda: "settings tried" in page.inner_text("#fix-text"))
+    page.click("#fix-cancel")
+    until(lambda: page.inner_text("#fix-text") == "Cancelled.")
+    assert page.locator("#fix").is_enabled() and page.locator("#fix-use").is_hidden()
+
+
 def test_the_timeline_goes_to_a_finding(page: Page) -> None:
     """A click on a mark chooses its finding at that frame."""
     box = page.locator("#events").bounding_box()

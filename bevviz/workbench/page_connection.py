@@ -21,8 +21,11 @@ if TYPE_CHECKING:
     from bevviz.why import Answer, Selection
     from bevviz.why.identity import Identity
     from bevviz.workbench.buffers import News
+    from bevviz.workbench.fix_search import FixSearch
+    from bevviz.workbench.reports import ReportMaker
     from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.source import Message, Settings
+    from bevviz.workbench.trials import TrialRunner
 
 LEGEND = ("person", "cyclist", "car", "truck", "bus")  # classes in the legend of the page
 TOGETHER = 0.05  # seconds in which news are collected before they are sent
@@ -61,6 +64,7 @@ class PageConnection:
             "remarks": self._remark_rows,
             "shown": self._shown,
             "drive": self._drive,
+            "fix": self._fix,
             "cancel": self._cancel,
             "report": self._report,
             "note": self._note,
@@ -362,12 +366,19 @@ class PageConnection:
         settings = _settings(message)
         await asyncio.to_thread(self._workbench.tools.trials.begin, settings)
 
+    async def _fix(self, number: int, message: Message) -> None:
+        """Search values that repair the drive."""
+        self._workbench.tools.fix.begin()
+
     async def _cancel(self, number: int, message: Message) -> None:
         if message["what"] == "try":
             self._stop_try()
             return
         workbench = self._workbench
-        runner = workbench.reports if message["what"] == "report" else workbench.tools.trials
+        if message["what"] == "report":
+            runner: ReportMaker | FixSearch | TrialRunner = workbench.reports
+        else:
+            runner = workbench.tools.fix if message["what"] == "fix" else workbench.tools.trials
         await asyncio.to_thread(runner.end)
 
     async def _report(self, number: int, message: Message) -> None:

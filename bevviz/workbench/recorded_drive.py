@@ -35,6 +35,7 @@ from bevviz.workbench.buffers import BufferReader, FilmReader, PageState, Reader
 from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.film import Film
 from bevviz.workbench.findings import Finding, find_findings
+from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
 from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
@@ -54,7 +55,7 @@ def recorded_session(
     paths: Sequence[Path],
     truth_of: TruthLookup | None = None,
     first: int = 0,
-    labels: Sequence[str | Path | None] = (),
+    labels: tuple[str | None, Path | None] = (None, None),
 ) -> WorkbenchSession:
     """Return the workbench session of a recorded drive.
 
@@ -76,7 +77,8 @@ def recorded_session(
         return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
 
     reports = ReportMaker(session, bag_of, folder_beside(paths))
-    session.equip(reports, DriveTools(TrialRunner(source), Notes(paths)))
+    fix = FixSearch(source, paths, *labels)
+    session.equip(reports, DriveTools(TrialRunner(source), fix, Notes(paths)))
     return session
 
 

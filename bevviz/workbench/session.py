@@ -17,6 +17,7 @@ from bevviz.why.identity import Identity, find, identify
 from bevviz.why.resolve import select_subjects
 from bevviz.why.side_effects import effects
 from bevviz.workbench.desk import Attempt, Desk
+from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
@@ -26,14 +27,16 @@ ASKED = 8  # answers that are kept for reports
 
 @dataclass(frozen=True, slots=True)
 class DriveTools:
-    """Trials and notes of a recorded drive.
+    """Trials, search of a fix, and notes of a recorded drive.
 
     Attributes:
         trials: runs over the drive with other values.
+        fix: search of values that repair it.
         notes: notes of the user, saved beside the bag.
     """
 
     trials: TrialRunner
+    fix: FixSearch
     notes: Notes
 
 
@@ -58,7 +61,7 @@ class WorkbenchSession(Closable):
 
     @property
     def tools(self) -> DriveTools:
-        """Trials and notes.
+        """Trials, search of a fix, and notes.
 
         Raises:
             UserError: the source is a robot.
@@ -97,6 +100,7 @@ class WorkbenchSession(Closable):
     def close(self) -> None:
         """Stop the trials, the reports and the run, and release the files."""
         if self._tools is not None:
+            self._tools.fix.end()
             self._tools.trials.end()
         if self._reports is not None:
             self._reports.end()
@@ -109,6 +113,7 @@ class WorkbenchSession(Closable):
             message["reports"] = [report.as_dict() for report in self._reports.made]
         if self._tools is not None:
             message["trials"] = [trial.as_dict() for trial in self._tools.trials.trials]
+            message["fix"] = self._tools.fix.as_dict()
         return message
 
     # --- questions -----------------------------------------------------------------------------

@@ -16,6 +16,8 @@ export function start(using) {
   const say = (id) => ({ text }) => { $(id).textContent = text; $(id).className = "alarm"; };
   $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
   $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
+  $("fix").onclick = () => send({ type: "fix" }, say("fix-text"));
+  $("fix-cancel").onclick = () => send({ type: "cancel", what: "fix" });
   $("report").onclick = () => {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
@@ -50,6 +52,7 @@ export function progress(message) {
   $("run").className = message.error ? "alarm" : "faint";
   trials = message.trials;
   showRuns();
+  if (message.fix) showFix(message.fix);
   $("reports").replaceChildren(...message.reports.map(report));
 }
 
@@ -122,6 +125,22 @@ function strip(frames) {
   draw.fillRect(0, height / 2, width, 1);
   const worst = frames.reduce((a, b) => (b[2] - b[1] > a[2] - a[1] ? b : a));
   canvas.title = `each frame: better upwards, worse downwards; the worst is at ${seconds(worst[0])}`;
+}
+
+// --- search of a fix ----------------------------------------------------------------------------
+
+function showFix(fix) {
+  const going = fix.state === "running";
+  const steps = fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...";
+  $("fix").disabled = going;
+  for (const id of ["fix-bar", "fix-cancel"]) $(id).hidden = !going;
+  $("fix-bar").max = fix.total || 1;
+  $("fix-bar").value = fix.done;
+  $("fix-text").textContent = { "": "", running: steps, cancelled: "Cancelled." }[fix.state] ?? fix.text;
+  $("fix-text").className = fix.state === "failed" ? "alarm" : "faint";
+  $("fix-use").hidden = going || !fix.settings.length;
+  $("fix-use").textContent = `try ${fix.settings.join(", ")}`;
+  $("fix-use").onclick = () => use(fix.settings);
 }
 
 // --- reports ------------------------------------------------------------------------------------

@@ -333,6 +333,7 @@ function welcome(message) {
   $("bag").textContent = message.bag;
   opened = message.controls;
   share.welcomed(message);
+  $("fixing").hidden = kind === "live" || !message.truth;
   legend(message.classes);
   list.restart();
   $("detector").hidden = message.detector;
