@@ -16,7 +16,8 @@ from bevviz.bags.source import BagSource
 from bevviz.config import Config, DetectorConfig, load
 from bevviz.errors import UserError
 from bevviz.model import geometry
-from bevviz.model.frame import Source
+from bevviz.model.frame import Frame
+from bevviz.model.protocols import Items
 from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
 from bevviz.stages.detector import Detector
@@ -28,7 +29,7 @@ from bevviz.synthetic.world import SECTION
 
 @pytest.fixture(scope="module")
 def source() -> SyntheticSource:
-    drive: Source = SyntheticSource(frames=20, seed=3)
+    drive: Items[Frame] = SyntheticSource(frames=20, seed=3)
     assert isinstance(drive, SyntheticSource)
     return drive
 

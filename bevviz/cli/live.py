@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from bevviz.live.runtime import Live, Status
     from bevviz.live.source import LiveSource
     from bevviz.live.status import Notes
-    from bevviz.model.frame import Source
+    from bevviz.model.frame import Frame
+    from bevviz.model.protocols import Items
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -309,7 +310,7 @@ def _replay(frames: int) -> Replay:
 
 
 def _watch(
-    source: Source,
+    source: Items[Frame],
     settings: ReloadableConfig,
     options: argparse.Namespace,
     notes: Notes,

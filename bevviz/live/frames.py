@@ -22,10 +22,10 @@ from bevviz.model.frame import (
     Intrinsics,
     LateBoxes,
     Scene,
-    Source,
     UserMark,
 )
 from bevviz.model.geometry import inverse
+from bevviz.model.protocols import Items
 from bevviz.model.results import Detections, DetectionState, FrameResult, Masks
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -45,7 +45,7 @@ class ThinnedSource:
     """
 
     def __init__(
-        self, source: Source, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
+        self, source: Items[Frame], config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.thinned = 0
         self._source, self._config, self._clock = source, config, clock

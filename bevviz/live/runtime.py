@@ -26,7 +26,7 @@ from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.robot_comparison import RobotComparison
 from bevviz.live.status import Health, Notes, set_nice
-from bevviz.model.frame import Frame, RobotContext, Scene, Source
+from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import DropPolicy, run
@@ -86,7 +86,7 @@ class Live:
 
     def __init__(
         self,
-        source: Source,
+        source: Items[Frame],
         settings: ReloadableConfig,
         outputs: Outputs,
         notes: Notes,

@@ -11,10 +11,10 @@ Conventions, everywhere in the project:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -372,24 +372,3 @@ class Scene:
     above: tuple[float, float, float, float] | None = None  # u, v, u, v: start of a look from above
     raw: bool = True  # every raw cloud is logged
     color_by: tuple[Quantity, ...] = ()  # quantities that can colour the raw cloud
-
-
-class Source(Protocol):
-    """An iterable of frames, in order of stamp: a bag, the synthetic drive, or a running robot."""
-
-    @property
-    def scene(self) -> Scene:
-        """Names that entities and blueprints are made from."""
-        ...
-
-    @property
-    def total(self) -> int | None:
-        """Number of expected frames, for a progress bar. None if unknown."""
-        ...
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Losses and suspicious data so far, one sentence each."""
-        ...
-
-    def __iter__(self) -> Iterator[Frame]: ...

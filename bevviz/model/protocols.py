@@ -15,7 +15,7 @@ R_contra = TypeVar("R_contra", contravariant=True)
 
 
 class Items(Protocol[T_co]):
-    """Input of a run: a ``Source`` of frames, or any other iterable that describes its scene."""
+    """Input of a run, in order: frames of a bag, the synthetic drive or a robot, or anything made of them."""
 
     @property
     def scene(self) -> Scene:
@@ -35,13 +35,8 @@ class Items(Protocol[T_co]):
     def __iter__(self) -> Iterator[T_co]: ...
 
 
-class FrameSource(Protocol):
-    """Source whose frames can be read in order and one by one."""
-
-    @property
-    def scene(self) -> Scene:
-        """Names that entities and blueprints are made from."""
-        ...
+class FrameSource(Items[Frame], Protocol):
+    """Frames that can be read in order and one by one."""
 
     @property
     def total(self) -> int:
@@ -49,16 +44,9 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def warnings(self) -> Sequence[str]:
-        """Losses and suspicious data so far, one sentence each."""
-        ...
-
-    @property
     def scans(self) -> I64:
         """(N,) log time of every scan in nanoseconds, in order of the scan's number."""
         ...
-
-    def __iter__(self) -> Iterator[Frame]: ...
 
     def number_at(self, time: str | float) -> int:
         """Return the number of the frame at a time."""
