@@ -251,11 +251,15 @@ def test_only_the_newest_frames_and_those_held_are_there(
         bench.observe(result)
     assert bench.look(1) is first
     assert bench.number_at(results[-1].frame.stamp + 10**7) == results[-1].frame.index
-    with pytest.raises(UserError, match=r"that frame is gone: the last \d s can be asked about"):
-        bench.number_at(results[0].frame.stamp)
+    assert bench.number_at(first.frame.stamp) == 1
+    for gone in (0, 3):  # before the kept frame, and between it and the held seconds
+        with pytest.raises(UserError, match=r"that frame is gone: the last \d s can be asked about"):
+            bench.number_at(results[gone].frame.stamp)
+    held = [str(results[number].frame.stamp) for number in (1, -HELD)]
+    assert bench.progress()["held"] == held
     with pytest.raises(UserError, match="frame 0 is gone"):
         bench.look(0)
-    assert bench.hold(0) is first, "of a viewer that lags behind the oldest that is there"
+    assert bench.hold(0) is results[-HELD], "of a viewer that lags behind the first of the held seconds"
     for result in results[-KEPT:]:
         bench.hold(result.frame.stamp)
     with pytest.raises(UserError, match="frame 1 is gone"):

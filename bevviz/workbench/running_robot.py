@@ -147,10 +147,17 @@ class RunningRobot(Source):
         with self._lock:
             return [*self._kept.values(), *self._newest]
 
-    def _held_stamps(self) -> tuple[int, ...]:
-        """Return the first and last stamp of the frames that can be asked about. Empty: there are none."""
-        stamps = [stamp for stamp, _ in self.frame_times()]
-        return (min(stamps), max(stamps)) if stamps else ()
+    def _held_stamps(self) -> list[int]:
+        """Return the stamps of kept frames before the held seconds, and of the first frame of these."""
+        start = self._start()
+        return [stamp for stamp, _ in self.frame_times() if stamp <= start]
+
+    def _start(self) -> int:
+        """Return the first stamp of the held seconds. Frames that are kept from earlier do not count."""
+        with self._lock:
+            stamps = [frame.stamp for frame in self._delivered.values()]
+            stamps += [result.frame.stamp for result in self._newest]
+        return min(stamps, default=0)
 
     def frame_times(self) -> list[tuple[int, int]]:
         """Return stamp and number of each frame that can be asked about."""
@@ -160,16 +167,22 @@ class RunningRobot(Source):
         return sorted({**times, **{result.frame.stamp: result.frame.index for result in results}}.items())
 
     def _shown_at(self, stamp: int) -> tuple[int | None, int]:
-        """Return the number of the frame that a viewer shows at a stamp, or None, and that of the oldest.
+        """Return the number of the frame that a viewer shows at a stamp, and of the first of the held seconds.
+
+        The first number is None if the frame is gone. The frames between a kept one and the held seconds are.
 
         Raises:
             UserError: no frame has come yet.
         """
-        times = self.frame_times()
+        times, start = self.frame_times(), self._start()
         if not times:
             raise UserError("no frame has come yet")
-        earlier = [number for at, number in times if at <= stamp + entities.TIME_TOLERANCE]
-        return earlier[-1] if earlier else None, times[0][1]
+        first = next(number for at, number in times if at >= start)
+        at, shown = max(
+            (one for one in times if one[0] <= stamp + entities.TIME_TOLERANCE), default=(0, None)
+        )
+        is_gone = at < start and stamp > at + entities.TIME_TOLERANCE
+        return None if is_gone else shown, first
 
     def number_at(self, stamp: int) -> int:
         """Return the number of the frame that a viewer shows at a stamp.
@@ -179,9 +192,9 @@ class RunningRobot(Source):
         """
         number, _ = self._shown_at(stamp)
         if number is None:
-            first, last = self._held_stamps()
+            seconds = (self.frame_times()[-1][0] - self._start()) / 1e9
             raise UserError(
-                f"that frame is gone: the last {(last - first) / 1e9:.0f} s can be asked about "
+                f"that frame is gone: the last {seconds:.0f} s can be asked about "
                 "(live.flight_time, live.raw_size); hold a frame with H to keep it"
             )
         return number

@@ -7,6 +7,7 @@ export const state = {
   opening: null, // stamp of the frame that is shown first
   over: false, // the server has all frames
   first: 0, // stamp that seconds are counted from
+  start: 0, // stamp that the held seconds of a robot begin with; frames before it were held by hand
   demand: false, // whether the viewer gets a frame only when it is looked at
   answer: null, // frame and settings of the shown answer
 };
@@ -15,10 +16,11 @@ export function addFrames(message) {
   frames.push(...message.frames.map(([stamp, number]) => [Number(stamp), number, stamp]));
   frames.sort((a, b) => a[0] - b[0] || a[1] - b[1]);
 }
-// Forget the frames before a stamp, which the server of a robot has no longer.
-export function dropFrames(before) {
-  const row = frames.findIndex(([stamp]) => stamp >= Number(before));
-  if (row > 0) frames.splice(0, row);
+// Forget the frames that the server of a robot has no longer: all before the last of these stamps, but the others.
+export function dropFrames(held) {
+  state.start = Number(held.at(-1));
+  const rest = frames.filter(([at, , stamp]) => at >= state.start || held.includes(stamp));
+  frames.splice(0, frames.length, ...rest);
 }
 export const frameTimes = () => frames.map(([stamp]) => stamp); // sorted
 frameTimes.stamp = (row) => frames[row][2];
@@ -30,7 +32,8 @@ const follows = (row, by) => state.over || frames[row + by]?.[1] === frames[row]
 // Number of the shown frame. null: the server does not have it yet.
 export function shownFrame() {
   const row = rowAt(state.time);
-  const isKnown = row >= 0 && (follows(row, 1) || Number(state.time) - frames[row][0] <= TOLERANCE);
+  const isAlone = row >= 0 && (frames[row][0] < state.start || !follows(row, 1));
+  const isKnown = row >= 0 && (!isAlone || Number(state.time) - frames[row][0] <= TOLERANCE);
   return isKnown ? frames[row][1] : null;
 }
 

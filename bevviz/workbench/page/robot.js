@@ -1,7 +1,7 @@
 // Panel of a running robot: go back, hold a frame, follow the newest one, save the flight recorder, mark a frame.
 
 import { on, send } from "./connection.js";
-import { $, dropFrames, frameTimes } from "./page_state.js";
+import { $, dropFrames, frameTimes, state } from "./page_state.js";
 import { goTo, seek } from "./viewer.js";
 
 $("robot").hidden = false;
@@ -23,11 +23,13 @@ function say(text, wrong) {
 let sliding = null; // times of the frames when the slider was taken
 const ago = (times, row) => `${((times.at(-1) - times[row]) / 1e9).toFixed(1)} s ago`;
 export function progress({ held }) {
-  if (held.length) dropFrames(held[0]);
+  if (held.length) dropFrames(held);
   const times = frameTimes();
   $("past").disabled = times.length < 2;
   if (sliding || times.length < 2) return;
-  const shown = times.findLastIndex((one) => one <= (time ?? newest) + 1000);
+  const at = time ?? newest;
+  const row = times.findLastIndex((one) => one <= at + 1000);
+  const shown = times[row] < state.start && at > times[row] + 1000 ? -1 : row;
   $("past").max = times.length - 1;
   $("past").value = Math.max(shown, 0);
   const gone = time === null ? "" : "longer ago than is held"; // The viewer has drawn nothing yet.
