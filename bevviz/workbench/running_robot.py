@@ -167,7 +167,7 @@ class RunningRobot(Source):
         return sorted({**times, **{result.frame.stamp: result.frame.index for result in results}}.items())
 
     def _shown_at(self, stamp: int) -> tuple[int | None, int]:
-        """Return the number of the frame that a viewer shows at a stamp, and of the first of the held seconds.
+        """Return the numbers of the frame that a viewer shows and of the first of the held seconds.
 
         The first number is None if the frame is gone. The frames between a kept one and the held seconds are.
 
@@ -177,7 +177,7 @@ class RunningRobot(Source):
         times, start = self.frame_times(), self._start()
         if not times:
             raise UserError("no frame has come yet")
-        first = next(number for at, number in times if at >= start)
+        first = next((number for at, number in times if at >= start), times[-1][1])
         at, shown = max(
             (one for one in times if one[0] <= stamp + entities.TIME_TOLERANCE), default=(0, None)
         )
