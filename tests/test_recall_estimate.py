@@ -67,8 +67,13 @@ def test_a_drive_is_estimated_as_its_labels_tell() -> None:
     )
 
 
-def test_two_tracks_are_too_few() -> None:
-    estimator = RecallEstimator()
+def test_nothing_is_known_without_a_track() -> None:
+    config = bevviz.config.load(settings=["clustering.min_cluster_points=1_000_000"])
+    session, estimator = Session(config, loader=small_drives.KnownDetections()), RecallEstimator()
+    assert [estimate.known for estimate in estimator.estimates()] == [False] * 5
+    for snapshot in small_drives.snapshots(small_drives.source(4, 2), 2):
+        estimator.observe(session.run(snapshot.frame))
+    assert estimator.frames == 2
     assert [estimate.known for estimate in estimator.estimates()] == [False] * 5
     assert "unknown" not in estimator.table()  # no objects, no rows
 

@@ -151,7 +151,7 @@ class RecallEstimator(Observer[FrameResult]):
 
     def _histories(self) -> list[_TrackHistory]:
         """Return the tracks that are named often enough, from their first to their last cluster."""
-        if not self._frames:
+        if not any(len(ids) for ids, *_ in self._frames):
             return []
         ids, distance, must, reported, seen = map(np.concatenate, zip(*self._frames, strict=True))
         order = np.argsort(ids, kind="stable")
