@@ -16,6 +16,7 @@ from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.evaluate.marks import MarkRecorder
+from bevviz.evaluate.recall_estimate import RecallEstimator
 from bevviz.fleet.findings import FINDINGS, FindingCollector, judged_names
 from bevviz.fleet.jobs import PARTIAL, Job, JobResult
 from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
@@ -91,6 +92,7 @@ def _fill(
     """
     config = with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
+    estimator = RecallEstimator()
     with job.selection.source([job.bag], job.config) as source:
         session = Session(config)
         recording.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +111,7 @@ def _fill(
                 evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
             else:
-                observers.append(MarkRecorder(sinks.recording))
+                observers += [MarkRecorder(sinks.recording), estimator]
             assert sinks.file is not None
             collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation)
             watchers = [*observers, collector, DiskWatch(sinks)]
@@ -130,6 +132,7 @@ def _fill(
             None if evaluation is None else dict(evaluation.as_tree()["metrics"]),
             recording.stat().st_size,
             file_hash(recording),
+            estimator.estimates()[0].as_tree() if evaluation is None else None,
         )
 
 
