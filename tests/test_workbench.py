@@ -465,6 +465,15 @@ def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
     assert not Notes([bag]).path.exists()
 
 
+def test_a_note_about_a_place_names_it_as_the_answer_does(talk: Talk) -> None:
+    stamp = int(talk.of("missed")[0]["sights"][0][1])
+    answer = talk.asked("answer", type="ask", time=stamp, set=[], pick="pixel/zed/20,20")
+    said = talk.asked("noted", type="note", time=stamp, pick=answer["pick"], text="empty road")
+    assert said["text"].startswith("Noted about what is at pixel 20, 20 in frame ")
+    talk.say(type="unnote", stamp=str(stamp), text="empty road")
+    talk.until("notes", lambda message: not message["notes"])
+
+
 def test_a_report_has_what_was_asked_tried_and_noted(talk: Talk, address: str, bag: Path) -> None:
     """The verdict of the drive as it was run comes first; beside the bag; for who has the token."""
     stamp, pick, hint = helped(talk)

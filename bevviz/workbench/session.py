@@ -263,19 +263,17 @@ class WorkbenchSession(Closable):
         Raises:
             UserError: the note cannot be written.
         """
-        result, about, pick = self.source.look(number), "", ""
+        result, name, pick = self.source.look(number), "", ""
         selection = None if identity is None else self.follow(identity, number)[0]
         if selection is not None:
             answer = self.ask(number, (), selection)[0]
             self.source.mark(result, answer, desk)
-            about, pick = (
-                answer.subject.name.removeprefix("the "),
-                str(self.identity(number, (), selection, answer, identity)),
-            )
+            name = answer.subject.name
+            pick = str(self.identity(number, (), selection, answer, identity))
         frame = result.frame
-        self.tools.notes.add(Note(frame.stamp, frame.received, text.strip(), about, pick))
+        self.tools.notes.add(Note(frame.stamp, frame.received, text.strip(), name.removeprefix("the "), pick))
         self._tell_notes()
-        return f"the {about}" if about else "the frame"
+        return name or "the frame"
 
     def remove_note(self, stamp: int, text: str) -> None:
         """Remove a note.
