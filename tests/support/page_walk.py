@@ -38,6 +38,7 @@ Asked = tuple[Answer, int]  # an answer and the number of its frame
 
 PATIENCE = 90.0  # seconds until the page has to be at rest
 REST = 1.0  # seconds in which nothing changes on a page that is at rest
+SAME_BOX = 0.2  # IoU of the image boxes of one detection in two frames in a row
 MISS = 8.0  # seconds that the viewer has to report a click, which may have hit nothing
 WRONG = "-3"  # a value that is refused
 VALUES = [f"clustering.eps={one}" for one in ("0.3", "0.7", "0.9")]
@@ -156,6 +157,10 @@ class Oracle:
         kinds, owners = {one[0].subject.kind, other[0].subject.kind}, {self.owner(one), self.owner(other)}
         if "truth" in kinds:
             return kinds == {"truth"} and len(owners) == 1
+        if kinds == {"detection"} and abs(one[1] - other[1]) <= 1:
+            boxes = [np.array([a.subject.xyxy]) for a, _ in (one, other)]
+            if one[0].subject.camera == other[0].subject.camera and geometry.iou(*boxes)[0, 0] >= SAME_BOX:
+                return True  # Without a cluster the centre is anywhere in the frustum.
         if one[0].center is None or other[0].center is None:
             return "cluster" in kinds or one[0].subject.label == other[0].subject.label
         places = [geometry.apply(self.frames[n].pose, np.array([a.center]))[0] for a, n in (one, other)]
@@ -197,13 +202,19 @@ class Pane:
     before: bool = False  # the side without the values is shown
     subject: list[Asked] = field(default_factory=list)  # what was asked about can be any of these
     known: int = 0  # frame in which it was seen last
+    called: set[str] = field(default_factory=set)  # names of its class since it was asked about
 
     @property
     def side(self) -> Values:
         return () if self.before else self.values
 
     def ask(self, subject: list[Asked], known: int) -> None:
+        self.called = set()
+        self.follow(subject, known)
+
+    def follow(self, subject: list[Asked], known: int) -> None:
         self.subject, self.known = subject, known
+        self.called |= {(one.subject.label or one.subject.kind).lower() for one, _ in subject}
 
 
 class Walk:
@@ -216,12 +227,15 @@ class Walk:
         self.notes: list[str] = []  # rows of the notes
         self.panes: list[Pane] = []
 
-    def go(self, steps: int, within: float = np.inf) -> None:
-        """Take so many steps, or as many as so many seconds allow. The second page comes after a third."""
+    def go(self, steps: int, within: float = np.inf) -> int:
+        """Take so many steps, or as many as so many seconds allow. The second page comes after a third.
+
+        Return the number of steps taken.
+        """
         end = time.monotonic() + within
         for number in range(steps):
             if time.monotonic() > end:
-                return
+                return number
             if number in (0, steps // 3):
                 page = watched_page(self.browser, 1100, 700)
                 page.goto(self.address)
@@ -234,6 +248,7 @@ class Walk:
             for one in self.panes:
                 self.check(one)
             print(f"{self.done} ({time.monotonic() - start:.1f} s)", flush=True)
+        return steps
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -377,8 +392,12 @@ class Walk:
         )
         there = [one for one in pane.subject if self.owner_is_in(one, pane.frame)]
         subjects = self.oracle.named(pane.frame, (), about)
-        good = any(self.oracle.same(a, b) for a in subjects for b in pane.subject) or (
-            not there and about == "the frame"
+        good = (
+            any(self.oracle.same(a, b) for a in subjects for b in pane.subject)
+            or (not there and about == "the frame")
+            or (
+                about.startswith("what is at") and about == pane.page.inner_text("#where").partition(" · ")[0]
+            )
         )
         self.expect(good, f"{noted} The subject is {names(pane)}")
         self.notes.append(f"{self.oracle.times[pane.frame]} {about.removeprefix('the ')}: {words}")
@@ -430,8 +449,7 @@ class Walk:
             nothing = ("Click a", "Nothing can be asked", "There is", "What is", "Cannot tell")
             self.expect(verdict.startswith(nothing), about)
         elif gone:
-            labels = [(one.subject.label or one.subject.kind).lower() for one, _ in pane.subject]
-            named = any(label in gone[1].lower() for label in labels) and int(gone[2]) == pane.known
+            named = any(label in gone[1].lower() for label in pane.called) and int(gone[2]) == pane.known
             there = any(self.owner_is_in(one, pane.frame) for one in pane.subject)
             self.expect(named and not there and int(gone[3]) == pane.frame, about)
         else:
@@ -446,7 +464,7 @@ class Walk:
             self.expect(bool(found), about)
             if not found or parts is None:
                 return
-            pane.ask(found, pane.frame)
+            pane.follow(found, pane.frame)
             answer = found[0][0]
             chain = [" ".join(f"{step.stage}: {step.text}".split()) for step in answer.steps]
             self.expect(
