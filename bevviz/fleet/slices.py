@@ -24,7 +24,6 @@ DEPTH = 4  # conditions of a slice, at most
 KEPT_RATE = 0.9  # least rate without a condition, relative to the rate with it, if it is to be left out
 CHANCE = 0.01  # that a search returns any slice although nothing depends on the attributes
 LEAST_RATIO = 1.5  # least rate inside a slice, relative to the rate outside
-INNER_RATIO = 3.0  # the same of a slice inside a slice, from which the outer one is a mixture of several
 LEAST_UNITS = 4  # objects of a slice with the outcome, at least
 
 
@@ -116,7 +115,7 @@ def _purest(
     while found is not None:
         within = np.zeros(len(free), bool)
         within[found.rows] = True
-        inner = _Search(attributes, target, positive, within, units, INNER_RATIO).best()
+        inner = _Search(attributes, target, positive, within, units).best()
         if inner is None:
             break
         narrower = search.narrowed(found, inner)
@@ -130,15 +129,8 @@ class _Search:
     """Search of the best slice of one target among free rows."""
 
     def __init__(
-        self,
-        attributes: Sequence[Attribute],
-        target: str,
-        positive: Bool,
-        free: Bool,
-        units: I64,
-        ratio: float = LEAST_RATIO,
+        self, attributes: Sequence[Attribute], target: str, positive: Bool, free: Bool, units: I64
     ) -> None:
-        self._ratio = ratio
         self._attributes = {attribute.name: attribute for attribute in attributes}
         self._target, self._positive, self._free, self._units = target, positive, free, units
         self._number, self._positives = int(free.sum()), int((positive & free).sum())
@@ -254,7 +246,7 @@ class _Search:
         rest_n, rest_p = self._number - n, self._positives - p
         ratio = _likelihood(n, p) + _likelihood(rest_n, rest_p)
         ratio -= _likelihood(np.array([self._number]), np.array([self._positives]))
-        higher = p * np.maximum(rest_n, 1) > self._ratio * np.maximum(rest_p, 0) * n
+        higher = p * np.maximum(rest_n, 1) > LEAST_RATIO * np.maximum(rest_p, 0) * n
         return np.where(higher & (p * self._scale >= LEAST_UNITS), self._scale * ratio, -np.inf)
 
     def _slice(self, score: float, conditions: tuple[Condition, ...]) -> Slice | None:
