@@ -12,7 +12,9 @@ import bevviz
 from bevviz.cli import main
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_of
+from bevviz.evaluate.matching import judge
 from bevviz.evaluate.recall_estimate import RecallEstimator, estimate_recall
+from bevviz.fleet.findings import FindingCollector
 from bevviz.pipeline.session import Session
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import TRUTH_TOPIC
@@ -65,6 +67,31 @@ def test_a_drive_is_estimated_as_its_labels_tell() -> None:
     assert estimates["recall.car"].sightings == sum(
         e.sightings for name, e in estimates.items() if name.startswith("recall.car@")
     )
+
+
+def test_a_track_without_its_detection_is_a_finding_of_a_batch() -> None:
+    """The farthest object within 30 m that is found in the seventh frame loses its detections."""
+    loader, frames, victim, name = small_drives.KnownDetections(), 10, "", ""
+    session, collector = Session(bevviz.config.load(), loader=loader), FindingCollector(None)
+    told = 0
+    for snapshot in small_drives.snapshots(small_drives.source(4, frames), frames):
+        image, labels = snapshot.frame.cameras[0].image, snapshot.frame.truth
+        assert image is not None and labels is not None
+        loader.add(image.stamp, small_drives.candidates(snapshot, dropped={victim} if victim else set()))
+        result = session.run(snapshot.frame)
+        findings, truth = collector.of_frame(result), truth_of(snapshot.frame, labels)
+        place = dict(zip(map(str, snapshot.truth_object.tolist()), truth.boxes.distance, strict=True))
+        for finding in findings if victim else []:
+            is_track = finding["outcome"] == "unexplained" and finding.get("object", "").startswith("track")
+            if is_track and finding["class"] == name and abs(finding["range_m"] - place[victim]) < 1.5:
+                assert finding["reason"] and "was not reported because" in finding["text"]
+                told += 1
+        if snapshot.frame.index == 6:
+            assert result.objects is not None
+            found = truth.must & ~judge(result.objects, truth).missed
+            row = int(np.argmax(np.where(found & (truth.boxes.distance < 30), truth.boxes.distance, -1)))
+            victim, name = str(snapshot.truth_object[row]), truth.labels[row].lower()
+    assert told >= 1
 
 
 def test_nothing_is_known_without_a_track() -> None:

@@ -14,7 +14,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Bool, Boxes3D
 from bevviz.model.json_forms import RecallEstimateForm
 from bevviz.model.protocols import Observer
-from bevviz.model.results import CameraResult, FrameResult, Objects
+from bevviz.model.results import CameraResult, FrameResult, Objects, Tracks
 from bevviz.recording.images import unexplained_detections
 from bevviz.support import table
 
@@ -88,16 +88,10 @@ class RecallEstimator(Observer[FrameResult]):
         tracks, objects = result.tracks, result.objects
         if tracks is None or objects is None:
             return
-        boxes = tracks.boxes
-        if tracks.absolute:
-            boxes = geometry.transform_boxes(boxes, geometry.inverse(result.frame.pose))
         self._names.update(
             (id_, name.lower()) for id_, name in zip(tracks.id.tolist(), tracks.names, strict=True) if name
         )
-        agreeing = _agreeing_objects(result)
-        reported = np.append(agreeing, False)[tracks.object]
-        for row in np.flatnonzero(~reported).tolist():
-            reported[row] = _is_reported(boxes, row, tracks.names[row], objects, agreeing)
+        boxes, reported = _reported_tracks(result, tracks, objects)
         must = must_be_found(result.frame, boxes)
         distance = boxes.distance.astype(np.float64)
         self._frames.append((tracks.id, distance, must, reported, tracks.cluster >= 0))
@@ -163,6 +157,29 @@ class RecallEstimator(Observer[FrameResult]):
             if name and reported[wanted].any():
                 histories.append(_TrackHistory(name, distance[wanted], reported[wanted]))
         return histories
+
+
+def unreported_tracks(result: FrameResult) -> I64:
+    """Return the rows of named tracks with a cluster whose object had to be found, and is not reported."""
+    tracks, objects = result.tracks, result.objects
+    if tracks is None or objects is None or not len(tracks.id):
+        return np.zeros(0, np.int64)
+    boxes, reported = _reported_tracks(result, tracks, objects)
+    named = np.array([name != "" for name in tracks.names], bool)
+    rows: I64 = np.flatnonzero(named & ~reported & (tracks.cluster >= 0) & must_be_found(result.frame, boxes))
+    return rows
+
+
+def _reported_tracks(result: FrameResult, tracks: Tracks, objects: Objects) -> tuple[Boxes3D, Bool]:
+    """Return the boxes of the tracks in the frame's coordinates, and (T,) whether an object is each."""
+    boxes = tracks.boxes
+    if tracks.absolute:
+        boxes = geometry.transform_boxes(boxes, geometry.inverse(result.frame.pose))
+    agreeing = _agreeing_objects(result)
+    reported = np.append(agreeing, False)[tracks.object]
+    for row in np.flatnonzero(~reported).tolist():
+        reported[row] = _is_reported(boxes, row, tracks.names[row], objects, agreeing)
+    return boxes, reported
 
 
 def _agreeing_objects(result: FrameResult) -> Bool:
