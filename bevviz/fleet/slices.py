@@ -11,7 +11,7 @@ of any false slice. Rows of one object are not independent, so that the ratio is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,27 +159,33 @@ class _Search:
             if not beam or beam[0][0] <= top[0]:
                 break
             top = self._polished(*beam[0])
-        return self._slice(*top) if top[0] > 0 else None
+        return self._plain(top[1]) if top[0] > 0 else None
 
     def narrowed(self, outer: Slice, inner: Slice) -> Slice:
-        """Return the conditions of both slices, without those of the outer one that keep no rate up."""
+        """Return the slice with the conditions of both, without those that keep no rate up."""
         joint = {condition.attribute: condition for condition in outer.conditions}
         for condition in inner.conditions:
             wider = joint.get(condition.attribute, condition)
             first, last = max(wider.first, condition.first), min(wider.last, condition.last)
             joint[condition.attribute] = Condition(condition.attribute, first, last)
-        own = {condition.attribute for condition in inner.conditions}
-        for name in [name for name in joint if name not in own]:
-            fewer = {key: condition for key, condition in joint.items() if key != name}
-            if self._rate(fewer.values()) >= KEPT_RATE * self._rate(joint.values()):
-                joint = fewer
-        conditions = tuple(sorted(joint.values()))
-        rows = self._rows(conditions)
-        score = self._gain_of(rows) - self._cost(conditions)
-        return Slice(conditions, self._target, score, rows, rows[self._positive[rows]])
+        return self._plain(tuple(joint.values())) or outer
 
-    def _rate(self, conditions: Iterable[Condition]) -> float:
-        return float(self._positive[self._rows(tuple(conditions))].mean())
+    def _plain(self, conditions: tuple[Condition, ...]) -> Slice | None:
+        """Return a slice without the conditions that keep no rate up; None: of too few objects."""
+        for condition in conditions:
+            fewer = tuple(c for c in conditions if c is not condition)
+            if fewer and self._rate(fewer) >= KEPT_RATE * self._rate(conditions):
+                return self._plain(fewer)
+        conditions = tuple(sorted(conditions))
+        rows = self._rows(conditions)
+        positives = rows[self._positive[rows]]
+        if len(np.unique(self._units[positives])) < LEAST_UNITS:
+            return None
+        score = self._gain_of(rows) - self._cost(conditions)
+        return Slice(conditions, self._target, score, rows, positives)
+
+    def _rate(self, conditions: tuple[Condition, ...]) -> float:
+        return float(self._positive[self._rows(conditions)].mean())
 
     def _polished(
         self, score: float, conditions: tuple[Condition, ...]
@@ -248,13 +254,6 @@ class _Search:
         ratio -= _likelihood(np.array([self._number]), np.array([self._positives]))
         higher = p * np.maximum(rest_n, 1) > LEAST_RATIO * np.maximum(rest_p, 0) * n
         return np.where(higher & (p * self._scale >= LEAST_UNITS), self._scale * ratio, -np.inf)
-
-    def _slice(self, score: float, conditions: tuple[Condition, ...]) -> Slice | None:
-        rows = self._rows(conditions)
-        positives = rows[self._positive[rows]]
-        if len(np.unique(self._units[positives])) < LEAST_UNITS:
-            return None
-        return Slice(conditions, self._target, score, rows, positives)
 
 
 def _likelihood(n: I64, p: I64) -> F64:
