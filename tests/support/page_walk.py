@@ -169,7 +169,7 @@ class Oracle:
 
     def holds(self, asked: Asked, click: dict[str, Any]) -> bool:
         """Whether the subject of an answer is where a view was clicked. From above, its centre is near."""
-        (answer, number), place = asked, [one for one in click["position"] or () if one is not None]
+        (answer, number), place = asked, [one for one in click.get("position") or () if one is not None]
         frame, subject, path = self.frames[number], answer.subject, click["entity_path"]
         camera = next((one for one in frame.cameras if f"/{one.name}" in path), None)
         if len(place) == 3:
