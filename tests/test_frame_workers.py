@@ -24,7 +24,9 @@ from bevviz.fleet.jobs import make_jobs
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline import frame_workers, result_store
-from bevviz.pipeline.frame_workers import FrameParts, FrameWorkers, working_ahead
+from bevviz.pipeline.ahead import working_ahead
+from bevviz.pipeline.cluster import ClusterFrames
+from bevviz.pipeline.frame_workers import FrameParts, FrameWorkers
 from bevviz.pipeline.result_store import open_store
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -178,3 +180,44 @@ def test_evaluate_gives_the_same_with_jobs(bag: Path, capsys: pytest.CaptureFixt
         assert main(["evaluate", str(bag), "--model", "demo", "--json", *more]) == 0
         results.append(json.loads(capsys.readouterr().out))
     assert results[0] == results[1]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed", reason="needs Dask: pip install 'bevviz[dask]'")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as started:
+        yield started
+
+
+def test_a_dask_cluster_runs_the_networks(
+    cluster: Any, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The drive and the model are named by relative paths, and the workers have another folder."""
+    monkeypatch.chdir(bag.parent)
+    arguments = ["evaluate", bag.name, "--model", "demo", "--json"]
+    monkeypatch.setenv("BEVVIZ_STORE", "")
+    assert main(arguments) == 0
+    alone = json.loads(capsys.readouterr().out)
+    monkeypatch.setenv("BEVVIZ_STORE", str(bag.parent / "shared store"))
+    result_store._opened.cache_clear()
+    monkeypatch.setattr(Detector, "infer", lambda *_: pytest.fail("the network ran on this machine"))
+    assert main([*arguments, "--dask", cluster.scheduler_address]) == 0
+    assert json.loads(capsys.readouterr().out) == alone
+
+
+def test_a_cluster_that_fails_costs_only_time(cluster: Any, bag: Path, lines: list[str]) -> None:
+    store = open_store(CONFIG.store.size)
+    assert store is not None
+    lost = LostSource(range(3), fail)
+    with ClusterFrames(lost, [CONFIG], store, cluster.scheduler_address) as ahead:
+        for number in lost.numbers:
+            ahead.wait_for(number)
+    assert lines == ["--dask: the cluster failed (no bag here); the run goes on without it"]
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("distributed", reason="needs Dask: pip install 'bevviz[dask]'")
+    assert main(["evaluate", str(bag), "--model", "demo", "--dask", "tcp://127.0.0.1:9"]) == 2
+    assert "--dask tcp://127.0.0.1:9: nobody answers there" in capsys.readouterr().err

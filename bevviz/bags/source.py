@@ -231,7 +231,8 @@ class BagSource(Closable):
     @property
     def opener(self) -> Callable[[], BagSource]:
         """Function that opens the same frames again, also in another process."""
-        return partial(self.selection.source, self._paths, self.config)
+        paths = tuple(path if address_of(path) else path.absolute() for path in self._paths)
+        return partial(self.selection.source, paths, self.config)
 
     def part(self, first: int, stop: int) -> Iterator[Frame]:
         """Yield a part of the selected frames without reading those before it.

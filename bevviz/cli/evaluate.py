@@ -144,7 +144,7 @@ def _run(
         recorder: makes the observer that logs its results.
     """
     from bevviz.anomalies import FailureSummary
-    from bevviz.pipeline.frame_workers import working_ahead
+    from bevviz.pipeline.ahead import working_ahead
     from bevviz.pipeline.session import Session
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)

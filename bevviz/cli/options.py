@@ -235,13 +235,20 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
 
 
 def add_jobs(group: argparse._ActionsContainer) -> None:
-    """Add the option for processes that run the networks ahead."""
-    group.add_argument(
+    """Add the options for processes that run the networks ahead. Both go to ``options.jobs``."""
+    where = group.add_mutually_exclusive_group()
+    where.add_argument(
         "--jobs",
         type=positive,
         default=1,
         metavar="N",
         help="processes that run the networks on frames ahead (default: 1, no further process)",
+    )
+    where.add_argument(
+        "--dask",
+        dest="jobs",
+        metavar="ADDRESS",
+        help="the same on a Dask cluster with the same files and store, e.g. tcp://host:8786",
     )
 
 

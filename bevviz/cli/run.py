@@ -45,7 +45,7 @@ def table_status(end: RunEnd) -> int:
 
 
 def process(
-    drive: Drive, outputs: Outputs, default: Path, source: FrameParts | None = None, jobs: int = 1
+    drive: Drive, outputs: Outputs, default: Path, source: FrameParts | None = None, jobs: int | str = 1
 ) -> int:
     """Run every stage on every frame and log the results to every output. Return the exit status.
 
@@ -54,11 +54,11 @@ def process(
         outputs: requested outputs.
         default: file to save if nothing can be shown.
         source: the frames, if other processes can read them.
-        jobs: number of processes that run the networks ahead. 1: none.
+        jobs: number of processes that run the networks ahead, 1: none; or the address of a Dask cluster.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.evaluate.marks import MarkRecorder
-    from bevviz.pipeline.frame_workers import working_ahead
+    from bevviz.pipeline.ahead import working_ahead
     from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Any
-from urllib.parse import urlsplit
 
-from bevviz.errors import UserError, first_line
 from bevviz.fleet.jobs import Job, JobResult, JobResults
 from bevviz.fleet.work import run
-from bevviz.recording.ports import is_listening
+from bevviz.pipeline.cluster import connect
 from bevviz.support.contexts import Closable
 
 WAITING = 2  # jobs for each thread of the cluster, so that no thread has to wait for the next one
@@ -31,17 +29,7 @@ class Cluster(Closable):
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            from distributed import Client
-        except ImportError:
-            raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
-        url = urlsplit(address)
-        if url.hostname and url.port and not is_listening(url.hostname, url.port):
-            raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
-        try:
-            self._client = Client(address, timeout="10s")
-        except (OSError, ValueError, TimeoutError) as error:
-            raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
+        self._client = connect(address)
 
     def close(self) -> None:
         """Disconnect from the cluster."""

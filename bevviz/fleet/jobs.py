@@ -19,13 +19,13 @@ from typing import Any, TypeAlias, TypeVar, cast
 from bevviz.bags.bag import METADATA
 from bevviz.bags.remote import address_of, name_of
 from bevviz.bags.source import FrameSelection
-from bevviz.config import Config, with_object_files
+from bevviz.config import Config
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
 from bevviz.fleet.table import RESERVED, RunInfo, find_damage, read_info
-from bevviz.recording.provenance import dependencies_of, model_path
+from bevviz.recording.provenance import dependencies_of, with_absolute_files
 from bevviz.support import cleanup, progress
-from bevviz.support.files import bag_files, file_hash, sampled_files
+from bevviz.support.files import absolute, bag_files, file_hash, is_path, sampled_files
 from bevviz.support.text import path_text
 
 T = TypeVar("T")
@@ -71,7 +71,7 @@ class Job:
             ],
             "selection": asdict(self.selection),
             "config": self.config.model_dump(mode="json", exclude={"live": True, "store": True, **files}),
-            "blueprint": file_hash(Path(self.blueprint)) if _is_file(self.blueprint) else self.blueprint,
+            "blueprint": file_hash(Path(self.blueprint)) if is_path(self.blueprint) else self.blueprint,
             "dependencies": {name: [d.version, d.sha256] for name, d in dependencies_of(self.config).items()},
         }
         if self.truth is not None:
@@ -123,15 +123,9 @@ def make_jobs(
         UserError: a path does not exist, or there is no bag.
     """
     bags = find_bags(paths)
-    detector, model = config.detector, model_path(config)
-    files = {"names": _absolute(detector.names)}
-    if model is not None and detector.model != "demo":
-        files["model"] = str(model.resolve())
-    config = with_object_files(config, _absolute).model_copy(
-        update={"detector": detector.model_copy(update=files)}
-    )
+    config = with_absolute_files(config)
     folder = folder.resolve()
-    blueprint = _absolute(blueprint)
+    blueprint = absolute(blueprint)
     owners = {info.bag: table.stem for table, info in tables(folder)}
     names = name_bags(bags, owners)
     return [Job(names[bag], bag, folder, config, selection, blueprint, truth) for bag in bags]
@@ -329,13 +323,3 @@ def _files(bag: Path) -> list[Path]:
     if not bag_files(bag):
         return sampled_files(bag)[1]
     return [*bag_files(bag), *([metadata] if metadata.is_file() else [])]
-
-
-def _absolute(text: str) -> str:
-    """Return the absolute path of a file. Return a name as it is."""
-    return str(Path(text).resolve()) if _is_file(text) else text
-
-
-def _is_file(text: str) -> bool:
-    """Return whether the text is a path. "debug" and "demo" are names, even if such a file exists."""
-    return bool(Path(text).suffix) and Path(text).is_file()

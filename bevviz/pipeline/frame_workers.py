@@ -9,20 +9,16 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from multiprocessing.connection import Connection, wait
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import cv2
 
-from bevviz.config import Config, object_network_params
-from bevviz.config.plugins import TOPIC, is_user_function
+from bevviz.config import Config
 from bevviz.errors import first_line
 from bevviz.model.frame import Frame
-from bevviz.model.protocols import Processor
 from bevviz.pipeline.perceive import run_networks
-from bevviz.pipeline.result_store import open_store
 from bevviz.pipeline.stage_loader import StageLoader, Stages
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
@@ -56,36 +52,6 @@ class FrameParts(Protocol):
         ...
 
 
-@contextmanager
-def working_ahead(
-    processor: Processor[Frame, R], source: FrameParts, configs: Sequence[Config], jobs: int
-) -> Iterator[Processor[Frame, R]]:
-    """Return a context with a processor that has worker processes beside it.
-
-    Args:
-        processor: the processor of the run.
-        source: source of the run.
-        configs: configurations that the processor runs.
-        jobs: number of worker processes. 1: none.
-    """
-    configs = [config for config in configs if has_networks(config)]
-    if jobs < 2:
-        yield processor
-    elif not configs or (store := open_store(configs[0].store.size)) is None or not store.usable:
-        progress.say("--jobs: one process runs, since there is no network, or no store for its results")
-        yield processor
-    else:
-        with FrameWorkers(source, configs, jobs) as workers:
-            yield _AfterWorkers(processor, workers)
-
-
-def has_networks(config: Config) -> bool:
-    """Return whether a configuration has networks whose results the store keeps."""
-    model = config.detector.model
-    is_file = bool(model) and not model.startswith(TOPIC) and not is_user_function(model)
-    return is_file or object_network_params(config) is not None
-
-
 def with_threads(config: Config, threads: int) -> Config:
     """Return a configuration whose networks have this number of threads, unless it states another one."""
     detector = config.detector
@@ -93,7 +59,7 @@ def with_threads(config: Config, threads: int) -> Config:
     return config.model_copy(update={"detector": detector})
 
 
-def _fill(
+def run_ahead(
     source: FrameParts, networks: Sequence[tuple[Config, Stages]], first: int, stop: int
 ) -> Iterator[Frame]:
     """Run the networks on each frame of a part, then yield the frame."""
@@ -189,20 +155,6 @@ class FrameWorkers(Closable):
         return min((chunk + 1) * CHUNK, len(self._numbers))
 
 
-class _AfterWorkers(Generic[R]):
-    """Processor that takes a frame when the workers have finished it."""
-
-    def __init__(self, processor: Processor[Frame, R], workers: FrameWorkers) -> None:
-        self._processor, self._workers = processor, workers
-
-    def perceive(self, frame: Frame, network: Executor | None = None) -> R:
-        self._workers.wait_for(frame.index)
-        return self._processor.perceive(frame, network)
-
-    def finish(self, result: R) -> R:
-        return self._processor.finish(result)
-
-
 def _work(
     pipe: Connection, open_source: Callable[[], FrameParts], configs: Sequence[Config], threads: int
 ) -> None:
@@ -217,7 +169,7 @@ def _work(
             while True:
                 first, stop = pipe.recv()
                 pipe.send(first)
-                for frame in _fill(source, networks, first, stop):
+                for frame in run_ahead(source, networks, first, stop):
                     if frame.index in numbers:
                         pipe.send(min(numbers.index(frame.index) + 1, stop - 1))
                 pipe.send(stop)

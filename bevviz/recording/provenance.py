@@ -15,10 +15,10 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from bevviz.config import METHOD_KEYS, Config, object_files, plugin_of
+from bevviz.config import METHOD_KEYS, Config, object_files, plugin_of, with_object_files
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
-from bevviz.support.files import file_hash
+from bevviz.support.files import absolute, file_hash
 from bevviz.support.version import __version__
 
 PACKAGES = (  # packages that are not installed are skipped: some libraries have several packages
@@ -121,6 +121,17 @@ def model_path(config: Config) -> Path | None:
     if not name or name.startswith(TOPIC) or plugin_of(config, "detector") is not None:
         return None
     return DEMO_MODEL if name == "demo" else Path(name)
+
+
+def with_absolute_files(config: Config) -> Config:
+    """Return a configuration that names its files by absolute paths."""
+    detector, model = config.detector, model_path(config)
+    files = {"names": absolute(detector.names)}
+    if model is not None and detector.model != "demo":
+        files["model"] = str(model.resolve())
+    return with_object_files(config, absolute).model_copy(
+        update={"detector": detector.model_copy(update=files)}
+    )
 
 
 def names_path(config: Config) -> Path | None:

@@ -22,7 +22,7 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Camera, Frame, Scene
 from bevviz.model.protocols import Observer
 from bevviz.model.results import Detections, FrameResult
-from bevviz.pipeline.frame_workers import working_ahead
+from bevviz.pipeline.ahead import working_ahead
 from bevviz.pipeline.notes import Note
 from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
@@ -94,7 +94,7 @@ class ReportRequest:
         asked: answers about other frames.
         tried: values that the user tried.
         notes: notes of the whole drive.
-        jobs: number of processes that run the networks ahead. 1: none.
+        jobs: number of processes that run the networks ahead, 1: none; or the address of a Dask cluster.
     """
 
     paths: Sequence[Path]
@@ -115,7 +115,7 @@ class ReportRequest:
     asked: Sequence[Answer] = ()
     tried: TriedValues | None = None
     notes: Sequence[Note] = ()
-    jobs: int = 1
+    jobs: int | str = 1
 
 
 @dataclass(slots=True)

@@ -414,6 +414,16 @@ def check_owned(folder: Path, variable: str = "XDG_RUNTIME_DIR") -> None:
         raise UserError(f"{folder} can be written by others: chmod 700 it")
 
 
+def absolute(text: str) -> str:
+    """Return the absolute path of a file. Return a name as it is."""
+    return str(Path(text).resolve()) if is_path(text) else text
+
+
+def is_path(text: str) -> bool:
+    """Return whether the text is a path. "debug" and "demo" are names, even if such a file exists."""
+    return bool(Path(text).suffix) and Path(text).is_file()
+
+
 def bag_files(folder: Path) -> list[Path]:
     """Return the bag files of a folder by suffix, including compressed ones."""
     suffixes = {".mcap", ".db3", ".bag", ".active"}
