@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from bevviz.bags.bag import Recording
+from bevviz.bags.reader import FileBytes
 from bevviz.bags.source import BagSource, iso, parse_time
 from bevviz.config import Config, load
 from bevviz.errors import UserError
@@ -567,3 +568,75 @@ def test_a_source_can_be_read_twice(tmp_path: Path) -> None:
     with BagSource([bag], Config()) as source:
         assert scans(list(source)) == scans(list(source)) == list(range(5))
     shutil.rmtree(bag)  # nothing holds it
+
+
+# --- single frames -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("form", "compression"), FORMATS)
+def test_a_single_frame_is_that_of_the_run(tmp_path: Path, form: str, compression: str) -> None:
+    bag = make(tmp_path, form, compression)
+    with BagSource([bag], Config()) as source:
+        run = list(source)
+        for number in (len(run) - 1, 0, 14):
+            single = source.frame(number)
+            assert single is not None
+            assert (single.index, single.stamp, single.problems) == (
+                number,
+                run[number].stamp,
+                run[number].problems,
+            )
+            np.testing.assert_array_equal(single.points, run[number].points)
+            for camera, same in zip(single.cameras, run[number].cameras, strict=True):
+                assert (camera.image is None) == (same.image is None)
+                if camera.image is not None and same.image is not None:
+                    np.testing.assert_array_equal(camera.image.bgr, same.image.bgr)
+                if camera.camera_from_points is not None:
+                    np.testing.assert_array_equal(camera.camera_from_points, same.camera_from_points)
+
+
+@pytest.fixture(scope="module")
+def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drive of 60 clouds of 40,000 points, which is not packed."""
+    folder = tmp_path_factory.mktemp("long")
+    return make(folder, name="long", scans=60, points=40_000)
+
+
+def test_a_single_frame_reads_no_old_clouds(long_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = storage_file(long_drive).stat().st_size
+    read = 0
+
+    def counted(self: FileBytes, offset: int, length: int) -> bytes:
+        nonlocal read
+        data = pread(self, offset, length)
+        read += len(data)
+        return data
+
+    with BagSource([long_drive], Config()) as source:
+        run = list(source)
+        source.frame(0)
+        pread = FileBytes._pread
+        monkeypatch.setattr(FileBytes, "_pread", counted)
+        frame = source.frame(50)
+    assert frame is not None and frame.stamp == run[50].stamp
+    assert 0 < read < size / 4  # 15 clouds; the search for transforms goes back by 20
+
+
+def test_a_message_that_is_not_where_the_index_says_is_named(long_drive: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "wrong"
+    shutil.copytree(long_drive, bag)
+    file = storage_file(bag)
+    with BagSource([bag], Config()) as source:
+        whole = source.frame(50)
+        chunks = source.recording.files[0]._reader._index.chunks  # type: ignore[attr-defined]
+        stamp = int(source.scans[50]) - 1_500_000_000
+        chunk = next(one for one in chunks if one.start <= stamp <= one.end)
+        (tf,) = [c.id for c in source.recording.files[0].connections if c.topic == "/tf"]
+        at = chunk.index[tf]
+    data = bytearray(file.read_bytes())
+    data[at + 15 + 8 : at + 15 + 16] = (chunk.size - 5).to_bytes(8, "little")  # offset of its first message
+    file.write_bytes(data)
+    with BagSource([bag], Config()) as source:
+        frame = source.frame(50)
+        assert frame is not None and whole is not None and frame.stamp == whole.stamp
+        assert any("chunk" in text for text in source.warnings)

@@ -171,10 +171,22 @@ class Recording(Closable):
         )
 
     def messages(
-        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+        self,
+        topics: Collection[str],
+        start: int | None = None,
+        stop: int | None = None,
+        *,
+        few: bool = False,
     ) -> Iterator[RawMessage]:
-        """Yield messages of ``topics`` with start <= log time < stop in nanoseconds, in order of log time."""
-        sources = [_lazy_messages(f, topics, start, stop) for f in self.files]
+        """Yield messages of ``topics`` with start <= log time < stop in nanoseconds, in order of log time.
+
+        Args:
+            topics: names of topics.
+            start: first log time; None: that of the recording.
+            stop: end of the log times; None: that of the recording.
+            few: see ``ChunkReader.messages``.
+        """
+        sources = [_lazy_messages(f, topics, start, stop, few) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
                 yield message
@@ -466,7 +478,7 @@ class Recording(Closable):
 
 
 def _lazy_messages(
-    file: BagFile, topics: Collection[str], start: int | None, stop: int | None
+    file: BagFile, topics: Collection[str], start: int | None, stop: int | None, few: bool
 ) -> Iterator[tuple[int, RawMessage | None]]:
     """Yield the messages of one file after an empty item.
 
@@ -479,5 +491,5 @@ def _lazy_messages(
     if not connections:
         return
     yield file.span[0], None
-    for connection, time, data in file.messages(connections, start, stop):
+    for connection, time, data in file.messages(connections, start, stop, few):
         yield time, RawMessage(connection.topic, time, data, connection)

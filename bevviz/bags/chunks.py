@@ -68,6 +68,8 @@ class ChunkFormat:
     read_times: Callable[[FileBytes, Chunk, int], I64]  # log times of a connection by the index
     parse: Callable[[memoryview, Container[int]], tuple[list[ChunkMessage], bool]]
     """Messages in the content of a chunk, and whether the lengths of its records lead to its end."""
+    read_single: Callable[[FileBytes, Chunk, int, int, int], list[ChunkMessage]] | None = None
+    """Messages of a connection between two times, without the rest of a chunk that is not packed."""
 
 
 class ChunkReader:
@@ -105,10 +107,21 @@ class ChunkReader:
         """Warnings: none, for damage is an error."""
         return ()
 
-    def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
-        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
+    def messages(
+        self, ids: Collection[int], start: int, stop: int, *, few: bool = False
+    ) -> Iterator[Message]:
+        """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time.
+
+        Args:
+            ids: connections.
+            start: first log time.
+            stop: end of the log times.
+            few: the messages are a small part of the file. They are read without the checksum of their
+                chunk, if it is not packed.
+        """
         wanted = {c.id: c for c in self.connections if c.id in ids}
-        for time, connection, data in heapq.merge(*self._sources(wanted, start, stop), key=itemgetter(0)):
+        sources = self._sources(wanted, start, stop, few)
+        for time, connection, data in heapq.merge(*sources, key=itemgetter(0)):
             if connection is not None:
                 yield wanted[connection], time, data
 
@@ -125,18 +138,26 @@ class ChunkReader:
         """Close the file."""
         self._bytes.close()
 
-    def _sources(self, wanted: Collection[int], start: int, stop: int) -> list[Iterator[Item]]:
+    def _sources(self, wanted: Collection[int], start: int, stop: int, few: bool) -> list[Iterator[Item]]:
         """Return the messages of each chunk in order of log time."""
         return [
-            self._ordered(number, wanted, start, stop)
+            self._ordered(number, wanted, start, stop, few)
             for number, chunk in enumerate(self._index.chunks)
             if chunk.start < stop and chunk.end >= start and not chunk.counts.keys().isdisjoint(wanted)
         ]
 
-    def _ordered(self, number: int, wanted: Container[int], start: int, stop: int) -> Iterator[Item]:
+    def _ordered(
+        self, number: int, wanted: Collection[int], start: int, stop: int, few: bool
+    ) -> Iterator[Item]:
         # The merge draws the first item of every source at once. This empty item needs no reading.
-        yield self._index.chunks[number].start, None, b""
-        messages = [item for item in self._content(number) if item[1] in wanted and start <= item[0] < stop]
+        chunk, read = self._index.chunks[number], self._form.read_single
+        yield chunk.start, None, b""
+        if few and read is not None and chunk.compression in ("", "none") and not chunk.cut:
+            ids = sorted(chunk.counts.keys() & set(wanted))
+            messages = [item for id_ in ids for item in read(self._bytes, chunk, id_, start, stop)]
+        else:
+            content = self._content(number)
+            messages = [item for item in content if item[1] in wanted and start <= item[0] < stop]
         messages.sort(key=itemgetter(0))
         yield from messages
 

@@ -129,9 +129,20 @@ class BagFile:
         return [f"{self.path.name}: {note}" for note in (*self._notes, *self._reader.warnings)]
 
     def messages(
-        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+        few: bool = False,
     ) -> Iterator[Message]:
-        """Yield messages of ``connections`` with start <= log time < stop, in order of log time."""
+        """Yield messages of ``connections`` with start <= log time < stop, in order of log time.
+
+        Args:
+            connections: connections of the file.
+            start: first log time; None: that of the file.
+            stop: end of the log times; None: that of the file.
+            few: see ``ChunkReader.messages``.
+        """
         known = {c.id: c for c in connections}
         low = max(0, start or 0)
         high = LAST_TIME if stop is None else min(stop, LAST_TIME)
@@ -144,7 +155,11 @@ class BagFile:
         at_latest: list[tuple[int, bytes | memoryview]] = []  # yielded messages of the latest log time
         resume = low  # log time at which the reader of the damaged file begins
         try:
-            for connection, time, data in reader.messages(known, low, high):
+            if few and isinstance(reader, ChunkReader):
+                sound = reader.messages(known, low, high, few=True)
+            else:
+                sound = reader.messages(known, low, high)
+            for connection, time, data in sound:
                 if time != latest:
                     latest = resume = time
                     at_latest.clear()

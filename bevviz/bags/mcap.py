@@ -287,6 +287,34 @@ def read_times(file: FileBytes, chunk: Chunk, channel: int) -> I64:
     return times
 
 
+def read_single(file: FileBytes, chunk: Chunk, channel: int, start: int, stop: int) -> list[ChunkMessage]:
+    """Return the messages of a channel with start <= log time < stop, of a chunk that is not packed.
+
+    The checksum of the chunk is not checked.
+
+    Raises:
+        DamageError: a message is not where the index says.
+    """
+    times = read_times(file, chunk, channel)
+    entries = file.read(chunk.index[channel] + 15, 16 * chunk.counts[channel])
+    offsets = np.frombuffer(entries, "<u8")[1::2]
+    messages: list[ChunkMessage] = []
+    head = RECORD.size + MESSAGE_HEAD.size
+    for time, offset in zip(times.tolist(), offsets.tolist(), strict=True):
+        if not start <= time < stop:
+            continue
+        content = file.read(chunk.data + offset, head) if offset + head <= chunk.size else b""
+        if len(content) != head:
+            raise DamageError("the message index of a chunk leads out of it")
+        opcode, length = RECORD.unpack_from(content)
+        stated = MESSAGE_HEAD.unpack_from(content, RECORD.size)
+        end = offset + RECORD.size + length
+        if (opcode, stated[0], stated[2]) != (MESSAGE, channel, time) or end > chunk.size:
+            raise DamageError("a message is not where the index of its chunk says")
+        messages.append((time, channel, file.read(chunk.data + offset + head, length - MESSAGE_HEAD.size)))
+    return messages
+
+
 def parse(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage], bool]:
     """Return the messages of a chunk by the record lengths, and whether the lengths lead to its end."""
     messages: list[ChunkMessage] = []
@@ -330,4 +358,4 @@ def read_metadata(record: bytes) -> dict[str, str]:
     return dict(zip(texts[::2], texts[1::2], strict=True))
 
 
-FORM = ChunkFormat(read_index, read_times, parse)
+FORM = ChunkFormat(read_index, read_times, parse, read_single)

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from bevviz.messages.decoders import MessageError
 from bevviz.messages.guard import guard
 from bevviz.messages.roles import find_roles
 from bevviz.messages.topics import CLOUDS
-from bevviz.messages.transforms import decode_transforms
+from bevviz.messages.transforms import StampedTransform, decode_transforms
 from bevviz.model.frame import F64, I64, Frame, LabelledBoxes3D, Scene
 from bevviz.support.contexts import Closable
 from bevviz.sync.feed import Handler, make_handlers
@@ -31,6 +32,7 @@ from bevviz.sync.synchronizer import Synchronizer
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
+NEAR = SECOND // 2  # the same for clouds and images before a single cloud, at least
 MAX_LATCHED = 2000  # latched transform messages read before a start in the middle of a drive
 EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
@@ -276,7 +278,11 @@ class BagSource(Closable):
     ) -> Iterator[Frame]:
         """Yield the frames and update ``state``."""
         sync, number, stop = state.sync, -1, high + MARGIN
-        for message in self.recording.scans(handlers.keys(), low - MARGIN, high + MARGIN):
+        near = low - (self._near if chosen == range(1) else MARGIN)
+        # A single frame needs no old clouds and images, which are most of a drive.
+        light = handlers.keys() - {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
+        before = self.recording.messages(light, low - MARGIN, near, few=True)
+        for message in chain(before, self.recording.scans(handlers.keys(), near, high + MARGIN)):
             if message.received > stop:
                 break
             if message.topic == self._driver:
@@ -293,6 +299,15 @@ class BagSource(Closable):
             self._handle(handlers[message.topic], message, state)
             yield from self._numbered(sync.ready(message.received), state)
         yield from self._numbered(sync.flush(), state)
+
+    @cached_property
+    def _near(self) -> int:
+        """Nanoseconds before a cloud in which the cloud before it and an image of each camera are."""
+        heavy = {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
+        rates = [topic.rate or 0.0 for topic in self.recording.topics if topic.name in heavy]
+        slowest = min(rates, default=0.0)
+        nearest = max(NEAR, 2 * round(self.config.sync.tolerance * SECOND))
+        return min(MARGIN, max(nearest, round(3 * SECOND / slowest))) if slowest else MARGIN
 
     def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
         """Yield the frames with the numbers of their scans."""
@@ -319,27 +334,51 @@ class BagSource(Closable):
         Each static transform is the last one before the start, or else the first one after it. Latched
         transforms are those before the start, or only those of the first second if there are too many.
         """
-        counts = {topic.name: topic.count or 0 for topic in self.recording.topics}
-        for name in self.roles.tf_held:
-            few = counts[name] <= MAX_LATCHED
+        for name, few, messages in self._held:
             stop = low - MARGIN if few else min(low - MARGIN, self.recording.start + SECOND)
-            for message in self.recording.messages([name], None, stop):
-                self._handle(handlers[name], message, state)
+            for message in messages:
+                if message.received < stop:
+                    self._handle(handlers[name], message, state)
         static = {}
-        for message in self.recording.messages(self.roles.tf_static):
-            try:
-                content = self.recording.decode(message)
-                for transform in guard(message, decode_transforms, content, message.topic):
-                    if message.received <= low or transform.child not in static:
-                        static[transform.child] = transform
-            except MessageError:
-                continue  # The error is counted when the message itself is handled.
+        for received, transform in self._static:
+            if received <= low or transform.child not in static:
+                static[transform.child] = transform
         for transform in static.values():
             state.sync.add_transform(transform, static=True)
-        for topic in {camera.info_topic for camera in self.roles.cameras} - {""}:
-            if (info := self.recording.first(topic)) is not None:
-                with suppress(MessageError):  # The error is counted when the message itself is handled.
-                    handlers[topic](info)
+        for info in self._infos:
+            with suppress(MessageError):  # The error is counted when the message itself is handled.
+                handlers[info.topic](info)
+
+    # Every read begins with these messages. To find them takes time that grows with the length of the drive.
+
+    @cached_property
+    def _held(self) -> list[tuple[str, bool, list[RawMessage]]]:
+        """Latched transforms by topic, and whether these are all of it or those of the first second."""
+        counts = {topic.name: topic.count or 0 for topic in self.recording.topics}
+        few = {name: counts[name] <= MAX_LATCHED for name in self.roles.tf_held}
+        stops = {name: None if all_ else self.recording.start + SECOND for name, all_ in few.items()}
+        return [
+            (name, few[name], [*map(_copied, self.recording.messages([name], None, stop))])
+            for name, stop in stops.items()
+        ]
+
+    @cached_property
+    def _static(self) -> list[tuple[int, StampedTransform]]:
+        """Static transforms with the times at which they were received."""
+        transforms = list[tuple[int, StampedTransform]]()
+        for message in self.recording.messages(self.roles.tf_static):
+            with suppress(MessageError):  # The error is counted when the message itself is handled.
+                content = self.recording.decode(message)
+                found = guard(message, decode_transforms, content, message.topic)
+                transforms += [(message.received, transform) for transform in found]
+        return transforms
+
+    @cached_property
+    def _infos(self) -> list[RawMessage]:
+        """First calibration of each camera."""
+        topics = sorted({camera.info_topic for camera in self.roles.cameras} - {""})
+        first = (self.recording.first(topic) for topic in topics)
+        return [_copied(message) for message in first if message is not None]
 
     def _open_results(self) -> list[ResultFile]:
         """Open the result files that the configuration names."""
@@ -425,6 +464,11 @@ class BagSource(Closable):
                 else f"{self.recording.name}: {self._driver} has no {self.noun} in the time asked for"
             )
         return chosen
+
+
+def _copied(message: RawMessage) -> RawMessage:
+    """Return a message that does not hold the memory of its chunk."""
+    return replace(message, data=bytes(message.data))
 
 
 def parse_time(text: str, origin: int) -> int:

@@ -291,14 +291,14 @@ class RescuedChunkReader(ChunkReader):
             np.concatenate([super().times(ids, start, stop), self._chosen(ids, start, stop)[:, 0]])
         )
 
-    def _sources(self, wanted: Collection[int], start: int, stop: int) -> list[Iterator[Item]]:
+    def _sources(self, wanted: Collection[int], start: int, stop: int, few: bool) -> list[Iterator[Item]]:
         rows = self._chosen(wanted, start, stop)
         outside = (
             (time, connection, data)
             for time, connection, offset, size in rows[np.argsort(rows[:, 0], kind="stable")].tolist()
             if len(data := self._bytes.read(offset, size)) == size
         )
-        return [*super()._sources(wanted, start, stop), outside]
+        return [*super()._sources(wanted, start, stop, few), outside]
 
     def _chosen(self, ids: Collection[int], start: int, stop: int) -> I64:
         """Return the messages outside chunks of the connections ``ids`` with start <= time < stop."""
