@@ -237,7 +237,8 @@ def _sum_up(
             return 130
         limits_kept = _gate(complete, failed, limits, options.junit)
         frames = sum(info.frames for _, info in complete)
-        say(f"{len(complete)} bags complete, {len(failed)} failed, {frames} frames. Summary: {page}")
+        done = f"{len(complete)} bag{'s' * (len(complete) != 1)} complete, {len(failed)} failed"
+        say(f"{done}, {frames} frames. Summary: {page}")
         if viewer:
             say(f"catalog at {url}, viewer at {viewer}; serving until Ctrl-C", always=True)
             wait_for_interrupt()
