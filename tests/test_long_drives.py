@@ -14,6 +14,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import bevviz
+from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
 from bevviz.pipeline import result_store
@@ -199,6 +200,25 @@ def test_a_drive_that_was_run_before_shows_its_list_at_once(
     again.film.close()
     assert whole_list(RecordedDrive(drives[0], drives[1].frames, table=table), passes) == first
     assert passes == {"again"}
+
+
+def test_a_drive_that_was_evaluated_shows_its_list_at_once(
+    drives: tuple[Drive, Drive], bag: Path, store: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The list is that of the workbench's own run. A part of the drive keeps none."""
+    monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
+    monkeypatch.setattr(recorded_drive, "LEAST", FRAMES + 1)
+    provider = drives[0].session.stages.provider
+    table = run_table([bag], drives[0].config, provider, (None, None))
+    assert table is not None
+    command = ["evaluate", str(bag), "--model", "demo"]
+    assert main([*command, "--every", "2"]) == 0 and table.load() is None
+    assert main(command) == 0
+    evaluated = RecordedDrive(drives[0], drives[1].frames, table=table)
+    evaluated._load_list()
+    assert len(evaluated.frame_times()) == FRAMES
+    evaluated.film.close()
+    assert groups(evaluated.findings) == whole_list(RecordedDrive(drives[0], drives[1].frames), set()) != []
 
 
 def test_a_list_belongs_to_one_drive_and_configuration(bag: Path, store: None, tmp_path: Path) -> None:

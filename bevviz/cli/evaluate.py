@@ -146,13 +146,17 @@ def _run(
     from bevviz.anomalies import FailureSummary
     from bevviz.pipeline.ahead import working_ahead
     from bevviz.pipeline.session import Session
+    from bevviz.workbench.run_table import list_keeper
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
     ahead = working_ahead(session, frames, [config], options.jobs)
+    # The workbench takes stated labels for the frames' own. This run has them apart.
+    keeper = None if options.truth or options.kitti_labels else list_keeper(frames, session)
+    kept = [] if keeper is None else [keeper]
     if not outputs:
         print_hints(frames.scene, config)
         with ahead as processor:
-            end = run_with_progress(frames, processor, [judge, failures])
+            end = run_with_progress(frames, processor, [judge, failures, *kept])
         warn([*frames.warnings, *failures.warnings])
         return table_status(end)
     from bevviz.recording.recorder import Recorder
@@ -163,6 +167,7 @@ def _run(
             Recorder(recording, config, session.stages.provider),
             judge,
             failures,
+            *kept,
         ]
         return [*log, recorder(recording, judge)] if recorder is not None else log
 

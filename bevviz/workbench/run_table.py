@@ -10,12 +10,18 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from bevviz.anomalies import Onsets
 from bevviz.bags.remote import address_of
+from bevviz.bags.source import BagSource
 from bevviz.config import Config, values
+from bevviz.model.protocols import Observer
+from bevviz.model.results import FrameResult
 from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key, with_weights
+from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import model_path, versions
 from bevviz.support.files import file_hash
-from bevviz.workbench.findings import FindingFrame
+from bevviz.why import FrameExplainer
+from bevviz.workbench.findings import FindingFrame, FindingList, find_findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +73,43 @@ class RunTable:
     def save(self, run: StoredRun) -> None:
         """Keep the list of a complete run."""
         self._store.put(self._key, zlib.compress(json.dumps(asdict(run)).encode(), 1))
+
+
+class ListKeeper(Observer[FrameResult]):
+    """Observer that keeps the list of a run over a whole drive, as the workbench would make it.
+
+    Args:
+        table: place of the list.
+        session: session of the run.
+        scans: number of scans of the drive. The list of a run over fewer is not kept.
+    """
+
+    def __init__(self, table: RunTable, session: Session, scans: int) -> None:
+        self._table, self._session, self._scans = table, session, scans
+        self._list, self._onsets = FindingList(), Onsets()
+        self._frames: list[tuple[int, int]] = []
+
+    def observe(self, result: FrameResult) -> None:
+        """List the findings of a frame."""
+        frame, session = result.frame, self._session
+        self._list.add(find_findings(FrameExplainer(result, session.loader, session.stages.class_names)))
+        self._list.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
+        self._frames.append((frame.stamp, frame.index))
+
+    def end(self) -> None:
+        """Keep the list."""
+        if len(self._frames) == self._scans:
+            groups = [StoredGroup(*group) for group in self._list.content()]
+            self._table.save(StoredRun(groups, sorted(self._frames)))
+
+
+def list_keeper(source: BagSource, session: Session) -> ListKeeper | None:
+    """Return an observer that keeps the list of a run. None: the run leaves scans out, or no list is kept."""
+    if len(source.numbers) != len(source.scans):
+        return None
+    files = [file.path for file in source.recording.files]
+    table = run_table(files, session.config, session.stages.provider, (None, None)) if files else None
+    return None if table is None else ListKeeper(table, session, len(source.scans))
 
 
 def run_table(
