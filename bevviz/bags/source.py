@@ -33,6 +33,7 @@ from bevviz.sync.synchronizer import Synchronizer
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
 NEAR = SECOND // 2  # the same for clouds and images before a single cloud, at least
+WHOLE_IMAGES = ("Image", "CompressedImage")  # kinds that are decoded without the images before
 MAX_LATCHED = 2000  # latched transform messages read before a start in the middle of a drive
 EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
@@ -280,8 +281,7 @@ class BagSource(Closable):
         sync, number, stop = state.sync, -1, high + MARGIN
         near = low - (self._near if chosen == range(1) else MARGIN)
         # A single frame needs no old clouds and images, which are most of a drive.
-        light = handlers.keys() - {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
-        before = self.recording.messages(light, low - MARGIN, near, few=True)
+        before = self.recording.messages(handlers.keys() - self._heavy, low - MARGIN, near, few=True)
         for message in chain(before, self.recording.scans(handlers.keys(), near, high + MARGIN)):
             if message.received > stop:
                 break
@@ -301,10 +301,18 @@ class BagSource(Closable):
         yield from self._numbered(sync.flush(), state)
 
     @cached_property
+    def _heavy(self) -> set[str]:
+        """Topics with clouds and with whole images."""
+        images = {topic.name for topic in self.recording.topics if topic.kind in WHOLE_IMAGES}
+        return {
+            *self.roles.lidars,
+            *(camera.topic for camera in self.roles.cameras if camera.topic in images),
+        }
+
+    @cached_property
     def _near(self) -> int:
         """Nanoseconds before a cloud in which the cloud before it and an image of each camera are."""
-        heavy = {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
-        rates = [topic.rate or 0.0 for topic in self.recording.topics if topic.name in heavy]
+        rates = [topic.rate or 0.0 for topic in self.recording.topics if topic.name in self._heavy]
         slowest = min(rates, default=0.0)
         nearest = max(NEAR, 2 * round(self.config.sync.tolerance * SECOND))
         return min(MARGIN, max(nearest, round(3 * SECOND / slowest))) if slowest else MARGIN
