@@ -24,6 +24,11 @@ def main() -> int:
         "--seeds", type=int, nargs="+", default=[1, 2, 3], help="one walk each (default: 1 2 3)"
     )
     parser.add_argument("--frames", type=int, default=12, help="of the demo drive (default: 12)")
+    parser.add_argument(
+        "--screenshots",
+        type=Path,
+        help="folder for a picture of each page that is wrong, and of the last step",
+    )
     options = parser.parse_args()
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
@@ -32,10 +37,15 @@ def main() -> int:
         oracle = Oracle(bag)
         for seed in options.seeds:
             with serving("open", str(bag)) as (address, _), chromium() as browser:
-                walk = Walk(browser, address, oracle, seed)
-                walk.go(options.steps)
+                walk = Walk(browser, address, oracle, seed, options.screenshots)
+                try:
+                    walk.go(options.steps)
+                except Exception as error:  # The next seed is walked nevertheless.
+                    print(f"seed {seed} has ended early: {error!r}")
+                for pane in walk.panes if not walk.wrong else []:
+                    walk.save_picture(pane, options.steps)
             (bag.parent / "demo.mcap.notes.json").unlink(missing_ok=True)
-            print(f"seed {seed}: {options.steps} steps, {len(walk.wrong)} wrong sentences")
+            print(f"seed {seed}: {walk.taken} steps, {len(walk.wrong)} wrong sentences")
             failed += len(walk.wrong)
     return 1 if failed else 0
 

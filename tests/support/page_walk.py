@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import random
 import re
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -28,7 +30,7 @@ from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.resolve import select_subjects
 from bevviz.why.subject import Subject, points_in_box, projected_box
 from bevviz.workbench.trials import trial_effects
-from tests.support.workbench_pages import watched_page
+from tests.support.workbench_pages import kill_browsers, watched_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -39,6 +41,7 @@ Asked = tuple[Answer, int]  # an answer and the number of its frame
 PATIENCE = 90.0  # seconds until the page has to be at rest
 REST = 1.0  # seconds in which nothing changes on a page that is at rest
 SAME_BOX = 0.2  # IoU of the image boxes of one detection in two frames in a row
+ONE_STEP = 420.0  # seconds of a step and its checks, after which the browser counts as hanging
 MISS = 8.0  # seconds that the viewer has to report a click, which may have hit nothing
 WRONG = "-3"  # a value that is refused
 VALUES = [f"clustering.eps={one}" for one in ("0.3", "0.7", "0.9")]
@@ -218,10 +221,21 @@ class Pane:
 
 
 class Walk:
-    """A walk over two pages of a server. ``wrong`` has the sentences about another object, frame or value."""
+    """A walk over two pages of a server. ``wrong`` has the sentences about another object, frame or value.
 
-    def __init__(self, browser: Browser, address: str, oracle: Oracle, seed: int) -> None:
+    Args:
+        browser: the browser that shows both pages.
+        address: address of the server.
+        oracle: the same drive, asked in Python.
+        seed: seed of the walk.
+        pictures: folder for a screenshot of each page that is wrong. None: none is saved.
+    """
+
+    def __init__(
+        self, browser: Browser, address: str, oracle: Oracle, seed: int, pictures: Path | None = None
+    ) -> None:
         self.browser, self.address, self.oracle = browser, address, oracle
+        self.seed, self.pictures, self.taken = seed, pictures, 0
         self.rng, self.wrong, self.done = random.Random(seed), list[str](), "open"
         self.run: Values = ()  # values of the newest run over the drive
         self.notes: list[str] = []  # rows of the notes
@@ -236,19 +250,50 @@ class Walk:
         for number in range(steps):
             if time.monotonic() > end:
                 return number
-            if number in (0, steps // 3):
-                page = watched_page(self.browser, 1100, 700)
-                page.goto(self.address)
-                self.panes.append(Pane(page))
-                self.wait(page.locator("#bar").is_hidden)  # Every frame has been run.
-                self.rest(self.panes[-1])
-            pane, (name,) = self.rng.choice(self.panes), self.rng.choices(STEPS, WEIGHTS)
-            self.done, start = f"{number}, page {self.panes.index(pane)}: {name}", time.monotonic()
-            self.done += f" {getattr(self, f'_{name}')(pane)}"
-            for one in self.panes:
-                self.check(one)
-            print(f"{self.done} ({time.monotonic() - start:.1f} s)", flush=True)
+            with killed_after(ONE_STEP):
+                self._go_on(number, opens=number in (0, steps // 3))
         return steps
+
+    def _go_on(self, number: int, opens: bool) -> None:
+        """Take a step on one of the pages, and check all pages. Save a picture of a page that is wrong."""
+        start, known, pane = time.monotonic(), len(self.wrong), None
+        self.done = f"seed {self.seed}, step {number}"
+        try:
+            if opens:
+                self._open()
+            pane, (name,) = self.rng.choice(self.panes), self.rng.choices(STEPS, WEIGHTS)
+            self.done += f", page {self.panes.index(pane)}: {name}"
+            self.done += f" {getattr(self, f'_{name}')(pane)}"
+            for checked in sorted(self.panes, key=lambda one: one is not pane):
+                self.check(checked)
+                if len(self.wrong) > known:
+                    known = len(self.wrong)
+                    self.save_picture(checked, number)
+        except Exception as error:
+            self.expect(False, f"{type(error).__name__}: {error}")
+            if pane is not None:
+                self.save_picture(pane, number)
+            raise
+        self.taken += 1
+        print(f"{self.done} ({time.monotonic() - start:.1f} s)", flush=True)
+
+    def _open(self) -> None:
+        page = watched_page(self.browser, 1100, 700)
+        page.set_default_timeout(PATIENCE * 1000)
+        page.goto(self.address)
+        self.panes.append(Pane(page))
+        self.wait(page.locator("#bar").is_hidden)  # Every frame has been run.
+        self.rest(self.panes[-1])
+
+    def save_picture(self, pane: Pane, number: int) -> None:
+        """Save a screenshot of a page, named after the seed, the step and the page."""
+        from playwright.sync_api import Error
+
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            file = self.pictures / f"seed_{self.seed}_step_{number}_page_{self.panes.index(pane)}.png"
+            with suppress(Error):  # A browser without a graphics card may be too slow.
+                pane.page.screenshot(path=file)
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -538,6 +583,18 @@ class Walk:
         if not condition:
             self.wrong.append(f"{self.done}: {text}")
             print(f"WRONG {self.wrong[-1]}", flush=True)
+
+
+@contextmanager
+def killed_after(seconds: float) -> Iterator[None]:
+    """Kill the browsers when the block takes longer. Playwright waits for a hanging page without a limit."""
+    timer = threading.Timer(seconds, kill_browsers)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def names(pane: Pane) -> list[str]:
