@@ -198,6 +198,7 @@ function changed() {
   remember();
   $("changed").hidden = !state.set.length && !state.undo.length;
   $("drive").disabled = !state.set.length;
+  tellSide();
   $("changes").replaceChildren(...state.set.map((one) => element("li", "", one)));
   $("save").href = `/config.yaml?${new URLSearchParams(state.set.map((one) => ["set", one]))}`;
   parameters.show();
@@ -285,14 +286,20 @@ function tried(message) {
 
 // Switch between the frame as opened and as tried.
 function flip() {
-  if (!state.set.length) return;
+  if (!state.set.length || kind === "live") return; // A robot has no tried side.
   state.flipped = !state.flipped;
-  $("flip").setAttribute("aria-pressed", state.flipped);
-  $("side").textContent = state.flipped ? "shown: before" : "shown: after";
+  tellSide();
   remember();
   showSide();
   freshness();
   askAgain();
+}
+
+// Tell which side is shown. Other values show their own side again.
+function tellSide() {
+  const isBefore = state.set.length > 0 && state.flipped;
+  $("flip").setAttribute("aria-pressed", isBefore);
+  $("side").textContent = isBefore ? "shown: before" : isTried() ? "shown: after" : "";
 }
 
 // Show the side of a listed finding: with the settings of the newest trial, or as opened.
