@@ -29,7 +29,7 @@ from bevviz.stages.robot_results import in_points_frame
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.resolve import select_subjects
 from bevviz.why.subject import Subject, points_in_box, projected_box
-from bevviz.workbench.trials import trial_effects
+from bevviz.workbench.trials import RUNS, trial_effects
 from tests.support.workbench_pages import kill_browsers, watched_page
 
 if TYPE_CHECKING:
@@ -47,11 +47,18 @@ WRONG = "-3"  # a value that is refused
 VALUES = [f"clustering.eps={one}" for one in ("0.3", "0.7", "0.9")]
 VALUES += [f"clustering.min_cluster_points={one}" for one in ("5", "40", WRONG)]
 VALUES += ["ground.distance_threshold=0.4", "detector.conf_threshold=0.1", "detector.conf_threshold=0.6"]
+SLIDES = (0.12, 0.3)  # parts of a slider's range
+SLIDE = """(slider, part) => {
+  slider.value = Number(slider.min) + part * (slider.max - slider.min);
+  for (const type of ["input", "change"]) slider.dispatchEvent(new Event(type));
+  return slider.value;
+}"""
 TRIED = ("fixed", "broken", "new false")  # kinds of rows that are about the newest run with other values
 STEPS = ["step", "row", "line", "click", "beside", "value", "hint", "undo", "flip", "reload", "note", "drive"]
-WEIGHTS = [20, 24, 12, 10, 5, 12, 6, 6, 5, 4, 5, 1]
+WEIGHTS = [20, 24, 12, 10, 5, 12, 6, 6, 5, 4, 5, 2]
 PAGE = """() => {
-  const IDS = ["shown", "verdict", "where", "of", "hints", "effect", "noted"];
+  const IDS = ["shown", "verdict", "where", "of", "hints", "effect", "noted", "side",
+    "trial-set", "trial-listed"];
   const $ = (id) => document.getElementById(id);
   const texts = (query) => [...document.querySelectorAll(query)].map((one) => one.innerText);
   const shown = (id) => ($(id).offsetParent ? $(id).innerText.trim() : "");
@@ -60,6 +67,9 @@ PAGE = """() => {
     ...Object.fromEntries(IDS.map((id) => [id, shown(id)])),
     state: $("answer").className.split(" ").find((one) => ["reported", "missed"].includes(one)) ?? "",
     chain: texts("#chain li"), helps: texts("#hints button"), changes: texts("#changes li"),
+    beside: texts("#beside button"),
+    fields: [...document.querySelectorAll(".control.changed")].map((row) => (
+      `${row.children[0].textContent}=${row.children[1].value}`)),
     rows: [...document.querySelectorAll("#found li:not(.group) > button:first-child")].map((row) => ({
       time: row.querySelector(".time").innerText, kind: row.children[2].innerText,
       text: row.querySelector(".what").firstChild.textContent,
@@ -237,7 +247,7 @@ class Walk:
         self.browser, self.address, self.oracle = browser, address, oracle
         self.seed, self.pictures, self.taken = seed, pictures, 0
         self.rng, self.wrong, self.done = random.Random(seed), list[str](), "open"
-        self.run: Values = ()  # values of the newest run over the drive
+        self.runs: list[Values] = []  # values of the runs over the drive, the newest last
         self.notes: list[str] = []  # rows of the notes
         self.panes: list[Pane] = []
 
@@ -294,6 +304,11 @@ class Walk:
             file = self.pictures / f"seed_{self.seed}_step_{number}_page_{self.panes.index(pane)}.png"
             with suppress(Error):  # A browser without a graphics card may be too slow.
                 pane.page.screenshot(path=file)
+
+    @property
+    def run(self) -> Values:
+        """Values of the newest run over the drive. Empty: there is none."""
+        return self.runs[-1] if self.runs else ()
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -378,6 +393,8 @@ class Walk:
     def _value(self, pane: Pane) -> str:
         key, _, value = (setting := self.rng.choice(VALUES)).partition("=")
         pane.page.fill("#search", key)
+        if self.rng.random() < 0.3:
+            return self._slide(pane, key, self.rng.choice(SLIDES))
         control = pane.page.locator(f"[id='control-{key}']")
         if control.input_value() == value:
             pane.page.evaluate("document.activeElement.blur()")
@@ -385,9 +402,17 @@ class Walk:
         control.fill(value)
         control.press("Enter")
         pane.page.evaluate("document.activeElement.blur()")
+        pane.before = False
         if value != WRONG:
             self._try(pane, (*(one for one in pane.values if not one.startswith(f"{key}=")), setting))
         return setting
+
+    def _slide(self, pane: Pane, key: str, part: float) -> str:
+        """Move the slider of a parameter to a part of its range."""
+        slider = pane.page.locator(f"input[aria-label='{key}, slider']")
+        setting = f"{key}={slider.evaluate(SLIDE, part)}"
+        self._try(pane, (*(one for one in pane.values if not one.startswith(f"{key}=")), setting))
+        return f"slider of {setting}"
 
     def _try(self, pane: Pane, values: Values) -> None:
         pane.undo.append(pane.values)
@@ -458,7 +483,7 @@ class Walk:
     def _drive(self, pane: Pane) -> Values:
         if pane.values:
             pane.page.keyboard.press("r")
-            self.run = pane.values
+            self.runs = [*self.runs, pane.values][-RUNS:]
             pane.page.wait_for_timeout(1000)
         return pane.values
 
@@ -472,12 +497,21 @@ class Walk:
         seconds = (float(content["time"]) - oracle.frames[0].stamp) / 1e9  # in doubles, as the page counts
         wanted = {"shown": f"Frame {pane.frame} at {seconds:.2f} s", "frame": pane.frame, "of": ""}
         wanted |= {"changes": [*pane.values], "notes": sorted(self.notes)}
-        wanted |= {"line": line}
+        wanted |= {"line": line, "side": "", "fields": sorted(pane.values)}
+        if pane.values:
+            wanted["side"] = "shown: before" if pane.before else "shown: after"
+        if self.runs:
+            ran, newest = (", ".join(one) for one in (pane.values, self.run))
+            wanted["trial-set"] = ran if pane.values in self.runs else newest
+            other = f"The table of findings has the differences of {newest}."
+            wanted["trial-listed"] = "" if wanted["trial-set"] == newest else other
         notes = sorted(f"{one['time']} {one['text']}" for one in content["rows"] if one["kind"] == "note")
         said = {**content, "frame": oracle.frame_at(content["time"]), "notes": notes}
+        said["fields"] = sorted(content["fields"])
         for key, value in wanted.items():
             self.expect(said[key] == value, f"{key} is {said[key]}, not {value}")
         self.check_answer(pane, content)
+        self.check_beside(pane, content["beside"])
         self.check_effect(pane, content["effect"])
         for number, row in enumerate(content["rows"]):
             if row["kind"] not in ("note", "anomaly") and (number < 12 or row["current"]):
@@ -526,6 +560,16 @@ class Walk:
                 wanted = [", ".join(hint.settings) for hint in helped.hints]
                 good = helps == wanted if wanted else content["hints"] == helped.remark
                 self.expect(good, f"{about}: '{content['hints']}', not {wanted} '{helped.remark}'")
+
+    def check_beside(self, pane: Pane, texts: list[str]) -> None:
+        """Hold the buttons of the other subjects at the place against the shown frame."""
+        for text in texts:
+            name, _, reason = text.rpartition(": ")
+            named = self.oracle.named(pane.frame, pane.side, name)
+            reasons = {one.verdict.kind.value for one, _ in named}
+            self.expect(
+                reason in reasons, f"also there is '{text}' in {pane.frame} with {pane.side}: {reasons}"
+            )
 
     def check_effect(self, pane: Pane, text: str) -> None:
         if not pane.values or "must be" in text:
