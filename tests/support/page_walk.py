@@ -41,7 +41,8 @@ Asked = tuple[Answer, int]  # an answer and the number of its frame
 PATIENCE = 90.0  # seconds until the page has to be at rest
 REST = 1.0  # seconds in which nothing changes on a page that is at rest
 SAME_BOX = 0.2  # IoU of the image boxes of one detection in two frames in a row
-ONE_STEP = 420.0  # seconds of a step and its checks, after which the browser counts as hanging
+OPENING = 300.0  # seconds until every frame has been run, on a machine that compiles the stages first
+ONE_STEP = 600.0  # seconds of a step and its checks, after which the browser counts as hanging
 MISS = 8.0  # seconds that the viewer has to report a click, which may have hit nothing
 WRONG = "-3"  # a value that is refused
 VALUES = [f"clustering.eps={one}" for one in ("0.3", "0.7", "0.9")]
@@ -55,6 +56,7 @@ SLIDE = """(slider, part) => {
 }"""
 TRIED = ("fixed", "broken", "new false")  # kinds of rows that are about the newest run with other values
 STEPS = ["step", "row", "line", "click", "beside", "value", "hint", "undo", "flip", "reload", "note", "drive"]
+RESTED = ("row", "line", "click")  # steps that end on a page at rest
 WEIGHTS = [20, 24, 12, 10, 5, 12, 6, 6, 5, 4, 5, 2]
 PAGE = """() => {
   const IDS = ["shown", "verdict", "where", "of", "hints", "effect", "noted", "side",
@@ -68,8 +70,8 @@ PAGE = """() => {
     state: $("answer").className.split(" ").find((one) => ["reported", "missed"].includes(one)) ?? "",
     chain: texts("#chain li"), helps: texts("#hints button"), changes: texts("#changes li"),
     beside: texts("#beside button"),
-    fields: [...document.querySelectorAll(".control.changed")].map((row) => (
-      `${row.children[0].textContent}=${row.children[1].value}`)),
+    fields: [...document.querySelectorAll(".control.changed")].map(({ children: [label, input] }) => (
+      `${label.textContent}=${input.type === "checkbox" ? input.checked : input.value}`)),
     rows: [...document.querySelectorAll("#found li:not(.group) > button:first-child")].map((row) => ({
       time: row.querySelector(".time").innerText, kind: row.children[2].innerText,
       text: row.querySelector(".what").firstChild.textContent,
@@ -216,6 +218,8 @@ class Pane:
     subject: list[Asked] = field(default_factory=list)  # what was asked about can be any of these
     known: int = 0  # frame in which it was seen last
     called: set[str] = field(default_factory=set)  # names of its class since it was asked about
+    content: dict[str, Any] = field(default_factory=dict)  # the newest content that was read
+    changed: float = 0.0  # time at which it was read first
 
     @property
     def side(self) -> Values:
@@ -250,6 +254,7 @@ class Walk:
         self.runs: list[Values] = []  # values of the runs over the drive, the newest last
         self.notes: list[str] = []  # rows of the notes
         self.panes: list[Pane] = []
+        self.acted = 0.0  # time of the newest action on any page
 
     def go(self, steps: int, within: float = np.inf) -> int:
         """Take so many steps, or as many as so many seconds allow. The second page comes after a third.
@@ -274,6 +279,8 @@ class Walk:
             pane, (name,) = self.rng.choice(self.panes), self.rng.choices(STEPS, WEIGHTS)
             self.done += f", page {self.panes.index(pane)}: {name}"
             self.done += f" {getattr(self, f'_{name}')(pane)}"
+            if name not in RESTED:
+                self.acted = time.monotonic()
             for checked in sorted(self.panes, key=lambda one: one is not pane):
                 self.check(checked)
                 if len(self.wrong) > known:
@@ -292,7 +299,8 @@ class Walk:
         page.set_default_timeout(PATIENCE * 1000)
         page.goto(self.address)
         self.panes.append(Pane(page))
-        self.wait(page.locator("#bar").is_hidden)  # Every frame has been run.
+        run = self.wait(page.locator("#bar").is_hidden, OPENING)
+        assert run, "the frames have not been run"
         self.rest(self.panes[-1])
 
     def save_picture(self, pane: Pane, number: int) -> None:
@@ -373,6 +381,7 @@ class Walk:
         self.wait(lambda: pane.page.evaluate(f"{picked}.length"), MISS)
         clicks = [item for item in pane.page.evaluate(picked) if item["type"] == "entity"]
         if not clicks:
+            self.acted = time.monotonic()
             return "on nothing"
         name = self.rest(pane)["where"].partition(" · ")[0]
         named = self.oracle.named(pane.frame, pane.side, name)
@@ -493,7 +502,7 @@ class Walk:
         """Hold every sentence of a page against the oracle."""
         oracle, line = self.oracle, "tried" if pane.side else "stamp"
         self.wait(lambda: pane.page.evaluate(PAGE)["line"] == line)  # A slow viewer changes it late.
-        content = self.rest(pane)
+        content = self.rest(pane, again=True)
         seconds = (float(content["time"]) - oracle.frames[0].stamp) / 1e9  # in doubles, as the page counts
         wanted = {"shown": f"Frame {pane.frame} at {seconds:.2f} s", "frame": pane.frame, "of": ""}
         wanted |= {"changes": [*pane.values], "notes": sorted(self.notes)}
@@ -599,22 +608,28 @@ class Walk:
 
     # --- waiting -------------------------------------------------------------------------------
 
-    def rest(self, pane: Pane) -> dict[str, Any]:
-        """Wait until nothing changes any more, and the viewer is where the page says."""
-        content, since = dict[str, Any](), 0.0
+    def rest(self, pane: Pane, *, again: bool = False) -> dict[str, Any]:
+        """Wait until nothing changes any more, and the viewer is where the page says.
+
+        Args:
+            pane: the page.
+            again: nothing was done since the last wait, whose time counts, too.
+        """
+        if not again:
+            self.acted = time.monotonic()
 
         def rested() -> bool:
-            nonlocal content, since
-            if (now := pane.page.evaluate(PAGE)) != content:
-                content, since = now, time.monotonic()
+            if (content := pane.page.evaluate(PAGE)) != pane.content:
+                pane.content, pane.changed = content, time.monotonic()
             there = content["time"] > 0 and content["shown"].startswith(
                 f"Frame {self.oracle.frame_at(content['time'])} "
             )
-            return time.monotonic() - since > REST and there and not content["busy"]
+            quiet = time.monotonic() - max(pane.changed, self.acted)
+            return quiet > REST and there and not content["busy"]
 
         brief = ("shown", "verdict", "hints", "effect", "busy", "time")
-        self.expect(bool(self.wait(rested)), f"never at rest: {[content[key] for key in brief]}")
-        return content
+        self.expect(bool(self.wait(rested)), f"never at rest: {[pane.content[key] for key in brief]}")
+        return pane.content
 
     def wait(self, done: Callable[[], Any], patience: float = PATIENCE) -> Any:
         """Wait until ``done`` returns a true value, and return it; None: it never did."""
