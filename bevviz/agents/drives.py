@@ -116,9 +116,7 @@ def agent_config(config: Config, settings: Sequence[str]) -> Config:
     return changed
 
 
-def batch_drives(
-    results: Sequence[tuple[Path, RunInfo]],
-) -> dict[str, Callable[[], AskedDrive]]:
+def batch_drives(results: Sequence[tuple[Path, RunInfo]]) -> dict[str, Callable[[], AskedDrive]]:
     """Return what opens each drive of a batch, as its recording was configured."""
 
     def opener(recording: Path) -> Callable[[], AskedDrive]:

@@ -414,10 +414,7 @@ class BagSource(Closable):
             elif labelled is not None:
                 detections.append(labelled)
         return replace(
-            frame,
-            robot_boxes=tuple(boxes),
-            robot_detections=tuple(detections),
-            problems=tuple(problems),
+            frame, robot_boxes=tuple(boxes), robot_detections=tuple(detections), problems=tuple(problems)
         )
 
     def _find_driver(self) -> str:

@@ -4,14 +4,4 @@ from bevviz.calib.result import AXES, Axis, AxisFinding, AxisResult, Calibration
 from bevviz.calib.score import Shot, Shots, gather
 from bevviz.calib.solve import calibrate
 
-__all__ = [
-    "AXES",
-    "Axis",
-    "AxisFinding",
-    "AxisResult",
-    "Calibration",
-    "Shot",
-    "Shots",
-    "calibrate",
-    "gather",
-]
+__all__ = ["AXES", "Axis", "AxisFinding", "AxisResult", "Calibration", "Shot", "Shots", "calibrate", "gather"]

@@ -140,11 +140,7 @@ def add_limits(parser: argparse.ArgumentParser) -> None:
     )
     for side, what in (("min", "at least"), ("max", "at most")):
         gate.add_argument(
-            f"--{side}",
-            action="append",
-            default=[],
-            metavar="METRIC=NUMBER",
-            help=f"{what} that",
+            f"--{side}", action="append", default=[], metavar="METRIC=NUMBER", help=f"{what} that"
         )
     gate.add_argument("--junit", type=Path, metavar="FILE.xml", help="whether each limit is kept, for a CI")
 
@@ -170,11 +166,7 @@ def add_subject(parser: argparse.ArgumentParser, default: str) -> argparse._Argu
         "--box", type=_numbers(2, 4), default=(), metavar="U,V[,U1,V1]", help="at that pixel, or in that box"
     )
     target.add_argument(
-        "--point",
-        type=_numbers(3),
-        default=(),
-        metavar="X,Y,Z",
-        help="there, in metres of the points' frame",
+        "--point", type=_numbers(3), default=(), metavar="X,Y,Z", help="there, in metres of the points' frame"
     )
     target.add_argument(
         "--cell",

@@ -119,9 +119,7 @@ def _check(options: argparse.Namespace) -> int:
     if len(options.paths) != 1:
         raise UserError("--check takes one report: bevviz report --check bug.rrd")
     verdict = check(
-        options.paths[0],
-        model=None if options.model is None else Path(options.model),
-        settings=options.set,
+        options.paths[0], model=None if options.model is None else Path(options.model), settings=options.set
     )
     for line in verdict.lines():
         print(line)

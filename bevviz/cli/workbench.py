@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
 from bevviz.cli.interrupts import interruptible, wait_for_interrupt
-from bevviz.cli.options import (
-    Commands,
-    add_at,
-    add_bag,
-    add_config,
-    add_truth,
-    load_config,
-    port,
-)
+from bevviz.cli.options import Commands, add_at, add_bag, add_config, add_truth, load_config, port
 from bevviz.cli.outputs import announce, has_display, print_hints, say, warn
 from bevviz.errors import UserError
 

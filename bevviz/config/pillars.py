@@ -121,8 +121,7 @@ class PillarParams(BaseModel):
         (), description="centres: class names of each head, where the network has several"
     )
     min_rotation: Mapping[str, float] = Field(
-        {},
-        description="centres: least norm of (sin, cos) by class, else 0; Autoware's yaw_norm_thresholds",
+        {}, description="centres: least norm of (sin, cos) by class, else 0; Autoware's yaw_norm_thresholds"
     )
 
     scores: Literal["logits", "probabilities"] = Field(

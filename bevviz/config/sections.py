@@ -65,8 +65,7 @@ class SourceConfig(Section):
     camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
     camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
     lidar_calibration: Mapping[str, str] = Field(
-        {},
-        description="topic with a LiDAR's packets -> its angles: a Hesai's CSV, an Ouster's metadata",
+        {}, description="topic with a LiDAR's packets -> its angles: a Hesai's CSV, an Ouster's metadata"
     )
     boxes: Mapping[str, str] = Field(
         {},
@@ -185,8 +184,7 @@ class DetectorConfig(StageSection):
     )
     classes: tuple[str, ...] = Field((), description="only these class names; empty: all")
     provider: str = Field(
-        "auto",
-        description="onnxruntime's: auto (a GPU's, where it works), CPU, CUDA, TensorRT",
+        "auto", description="onnxruntime's: auto (a GPU's, where it works), CPU, CUDA, TensorRT"
     )
     threads: int = Field(0, ge=0, description="onnxruntime threads; 0: all cores")
 
@@ -443,9 +441,7 @@ class LiveConfig(Section):
         description="--robot: save when the robot's objects and ours differ for so long; empty: never",
     )
     robot_tolerance: Metres = Field(
-        0.5,
-        ge=0,
-        description="--robot: largest distance of the two centres of one object, seen from above",
+        0.5, ge=0, description="--robot: largest distance of the two centres of one object, seen from above"
     )
     trigger_after: Seconds = Field(
         2.0, ge=0, le=600, description="time after its trigger that an automatic save includes"

@@ -32,14 +32,7 @@ POSES, LABELS = "city_SE3_egovehicle.feather", "annotations.feather"
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSITION = ("tx_m", "ty_m", "tz_m")
 # Columns of a scan and their names here.
-FIELDS = {
-    "x": "x",
-    "y": "y",
-    "z": "z",
-    "intensity": "intensity",
-    "laser_number": "ring",
-    "offset_ns": "time",
-}
+FIELDS = {"x": "x", "y": "y", "z": "z", "intensity": "intensity", "laser_number": "ring", "offset_ns": "time"}
 FORMATS = {"intensity": "u1", "ring": "u1"}
 Table = dict[str, NDArray[Any]]
 

@@ -33,12 +33,7 @@ from bevviz.errors import UserError
 from bevviz.messages.encode import encode_points
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
-from bevviz.support.files import (
-    CONFIG_LIMIT,
-    TABLE_LIMIT,
-    read_lines,
-    read_text,
-)
+from bevviz.support.files import CONFIG_LIMIT, TABLE_LIMIT, read_lines, read_text
 
 MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
 NOTE_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")

@@ -253,14 +253,7 @@ def _unzigzag(value: np.uint64) -> np.int64:
 
 @kernel
 def _decode_fields(
-    data: U8,
-    count: int,
-    encodings: I64,
-    sizes: I64,
-    offsets: I64,
-    resolutions: F64,
-    out: U8,
-    step: int,
+    data: U8, count: int, encodings: I64, sizes: I64, offsets: I64, resolutions: F64, out: U8, step: int
 ) -> int:
     """Decode the fields that are stored point by point. Return the byte behind them."""
     at, fields = 0, len(encodings)

@@ -246,8 +246,5 @@ DEFINITIONS = {
     "pandar_msgs/msg/PandarScan": "std_msgs/Header header\nPandarPacket[] packets\n",
 }
 DECODER = Decoder(
-    types=("pandar_msgs/msg/PandarScan",),
-    kind="PointCloud2",
-    from_bytes=read_scan,
-    definitions=DEFINITIONS,
+    types=("pandar_msgs/msg/PandarScan",), kind="PointCloud2", from_bytes=read_scan, definitions=DEFINITIONS
 )

@@ -300,9 +300,4 @@ def decode(sensor: Sensor, packets: Sequence[ReceivedPacket]) -> Any:
 
 _TYPES = tuple(f"{package}/msg/PacketMsg" for package in ("ouster_sensor_msgs", "ouster_msgs", "ouster_ros"))
 DEFINITIONS = dict.fromkeys(_TYPES, "uint8[] buf\n")
-DECODER = Decoder(
-    types=_TYPES,
-    kind="PointCloud2",
-    definitions=DEFINITIONS,
-    metadata_topic=metadata_topic,
-)
+DECODER = Decoder(types=_TYPES, kind="PointCloud2", definitions=DEFINITIONS, metadata_topic=metadata_topic)

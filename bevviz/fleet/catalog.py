@@ -11,14 +11,7 @@ from bevviz.errors import UserError, first_line
 from bevviz.fleet.summary import Link
 from bevviz.fleet.table import RunInfo
 from bevviz.recording import blueprints, entities, rerun_cli
-from bevviz.recording.ports import (
-    LOOPBACK,
-    allowed_origins,
-    check_port,
-    free_port,
-    host_for,
-    own_address,
-)
+from bevviz.recording.ports import LOOPBACK, allowed_origins, check_port, free_port, host_for, own_address
 
 TIMEOUT = 600  # seconds
 

@@ -96,10 +96,7 @@ SCALES: Mapping[str, Scale] = {
         ),
         ("longer than {a} m", "shorter than {b} m", "{a} to {b} m long"),
     ),
-    "height_m": Scale(
-        _steps(0.3, 4, 0.1),
-        ("higher than {a} m", "lower than {b} m", "{a} to {b} m high"),
-    ),
+    "height_m": Scale(_steps(0.3, 4, 0.1), ("higher than {a} m", "lower than {b} m", "{a} to {b} m high")),
     "points": Scale(
         _decades(0, 5), ("with {a} points or more", "with fewer than {b} points", "with {a} to {b} points")
     ),
@@ -158,17 +155,13 @@ SCALES: Mapping[str, Scale] = {
         ),
     ),
     "speed_mps": Scale(
-        _steps(0.5, 40, 0.5),
-        ("at more than {a} m/s", "at less than {b} m/s", "at {a} to {b} m/s"),
+        _steps(0.5, 40, 0.5), ("at more than {a} m/s", "at less than {b} m/s", "at {a} to {b} m/s")
     ),
     "time_s": Scale(
         np.array([0.5, 1, 1.5, 2, 3, 4, 5, 7, 10, 15, 20, 30, 45, 60, 90, *range(120, 3600, 60)], np.float32),
         ("after {a} s of the drive", "in the first {b} s of the drive", "{a} to {b} s into the drive"),
     ),
-    "hour": Scale(
-        _steps(1, 24, 1),
-        ("after {a}:00 UTC", "before {b}:00 UTC", "from {a}:00 to {b}:00 UTC"),
-    ),
+    "hour": Scale(_steps(1, 24, 1), ("after {a}:00 UTC", "before {b}:00 UTC", "from {a}:00 to {b}:00 UTC")),
 }
 NAMES: Mapping[str, str] = {  # attributes without an order, with their words
     "class": "{}",

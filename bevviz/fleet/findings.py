@@ -47,9 +47,7 @@ NUMBERS = (
     *("range_m", "bearing_deg", "length_m", "height_m", "points", "gap_m", "u", "v", "score"),
     *("brightness", "scan_points", "scan_range_m", "speed_mps", "time_s", "hour"),
 )
-FINDING = pa.struct(
-    [*((name, pa.string()) for name in TEXTS), *((name, pa.float32()) for name in NUMBERS)],
-)
+FINDING = pa.struct([*((name, pa.string()) for name in TEXTS), *((name, pa.float32()) for name in NUMBERS)])
 _FRAME = ("bag", "recording", "frame", "stamp")
 
 

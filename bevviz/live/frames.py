@@ -13,17 +13,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.live.encoder import Encoder, sample_rows
-from bevviz.model.frame import (
-    F64,
-    Camera,
-    Cloud,
-    Frame,
-    Image,
-    Intrinsics,
-    LateBoxes,
-    Scene,
-    UserMark,
-)
+from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.model.geometry import inverse
 from bevviz.model.protocols import Items
 from bevviz.model.results import Detections, DetectionState, FrameResult, Masks

@@ -36,10 +36,7 @@ class LiveInfo(TopicContents):
 
 
 def describe(
-    config: Config,
-    arguments: Sequence[str] = (),
-    seconds: float = LISTEN,
-    patience: float = PATIENCE,
+    config: Config, arguments: Sequence[str] = (), seconds: float = LISTEN, patience: float = PATIENCE
 ) -> LiveInfo:
     """Listen to the graph for ``seconds``, counted from when the topics have their roles. Ctrl-C ends it.
 

@@ -51,10 +51,7 @@ class Node(Closable):
     """
 
     def __init__(
-        self,
-        arguments: Sequence[str] = (),
-        on_end: Callable[[], None] = lambda: None,
-        name: str = "bevviz",
+        self, arguments: Sequence[str] = (), on_end: Callable[[], None] = lambda: None, name: str = "bevviz"
     ) -> None:
         rclpy = load_rclpy()
         from rclpy.executors import SingleThreadedExecutor

@@ -11,12 +11,7 @@ import numpy as np
 
 from bevviz.messages.decoders import either, frame_name, stamp_ns
 from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d, decode_objects
-from bevviz.model.frame import (
-    Bool,
-    ImageLabels,
-    LabelledBoxes2D,
-    LabelledBoxes3D,
-)
+from bevviz.model.frame import Bool, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
 
 
 def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D:

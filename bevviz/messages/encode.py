@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from bevviz.messages.definitions import typestore
 from bevviz.model import geometry
-from bevviz.model.frame import (
-    F32,
-    F64,
-    I64,
-    Boxes3D,
-    Cloud,
-    Image,
-    ImageLabels,
-    Intrinsics,
-)
+from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
 
 Hypotheses = Sequence[tuple[str, float]]  # class and score; the first one is that of the box itself
 

@@ -123,11 +123,7 @@ RESULTS = {  # results of the robot's pipeline that are shown unless ours use th
     "Image": re.compile(r"(^|/)visualization/bev_image$"),
 }
 _DESCRIPTION = re.compile(r"(^|/)robot_description$")
-_AROUND = {
-    "mark": "notes of people",
-    "status": "the robot's diagnostics",
-    "shape": "around perception",
-}
+_AROUND = {"mark": "notes of people", "status": "the robot's diagnostics", "shape": "around perception"}
 
 STAGE_KINDS = {  # type of the robot's result, by the stage that it replaces
     "ground.method": "PointCloud2",

@@ -8,16 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.model.reasons import (
-    Reason,
-    ReasonKind,
-    kind_of,
-    limit,
-    limit_of,
-    make_reason,
-    owner_of,
-    scored,
-)
+from bevviz.model.reasons import Reason, ReasonKind, kind_of, limit, limit_of, make_reason, owner_of, scored
 from bevviz.model.results import (
     CameraResult,
     Clusters,

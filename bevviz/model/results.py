@@ -14,17 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.model.frame import (
-    F32,
-    F64,
-    I32,
-    I64,
-    U8,
-    Bool,
-    Boxes3D,
-    Camera,
-    Frame,
-)
+from bevviz.model.frame import F32, F64, I32, I64, U8, Bool, Boxes3D, Camera, Frame
 from bevviz.model.tables import Columns, Tabular
 
 if TYPE_CHECKING:

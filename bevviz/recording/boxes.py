@@ -16,11 +16,7 @@ from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Track
 from bevviz.recording import entities
 from bevviz.recording.entities import TRACK_COLORS, ClassId
 from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
-from bevviz.recording.labels import (
-    choose_named_in_3d,
-    log_box_label_style,
-    log_box_labels,
-)
+from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
 from bevviz.recording.opinions import outline_colors
 from bevviz.recording.primitives import (
     OUTLINE,
@@ -278,10 +274,7 @@ def log_truth_style(to: Writer) -> None:
     to.static(
         entities.TRUTH,
         rr.Boxes3D.from_fields(
-            colors=[_TRUTH_COLOR],
-            radii=rr.Radius.ui_points(0.5),
-            show_labels=False,
-            fill_mode=OUTLINE,
+            colors=[_TRUTH_COLOR], radii=rr.Radius.ui_points(0.5), show_labels=False, fill_mode=OUTLINE
         ),
     )
 

@@ -24,12 +24,7 @@ from bevviz.model.results import (
     Masks,
 )
 from bevviz.recording import entities, retention
-from bevviz.recording.labels import (
-    IN_IMAGE,
-    choose_named,
-    log_image_box_label_style,
-    log_image_box_labels,
-)
+from bevviz.recording.labels import IN_IMAGE, choose_named, log_image_box_label_style, log_image_box_labels
 from bevviz.recording.primitives import (
     CORNER,
     blob,

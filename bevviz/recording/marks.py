@@ -19,13 +19,7 @@ from bevviz.model.frame import F32, Boxes3D, Camera
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.images import bev_pixels
-from bevviz.recording.labels import (
-    IN_IMAGE,
-    LETTER_WIDTH,
-    choose_named,
-    choose_named_in_3d,
-    log_name_style,
-)
+from bevviz.recording.labels import IN_IMAGE, LETTER_WIDTH, choose_named, choose_named_in_3d, log_name_style
 from bevviz.recording.primitives import CORNER, image_outlines, transform
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import Color, StateColor
@@ -45,16 +39,7 @@ _BOX: Lines = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (
 _CROSS: Lines = ((4, 6), (5, 7))
 _FLAT_CROSS: Lines = ((0, 2), (1, 3))
 _SIDES: Lines = _BOX[:4]
-_WEDGE: Lines = (
-    (0, 4),
-    (1, 5),
-    (2, 6),
-    (3, 7),
-    (4, 5),
-    (5, 6),
-    (6, 7),
-    (7, 4),
-)  # of a frustum
+_WEDGE: Lines = ((0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 6), (6, 7), (7, 4))  # of a frustum
 
 
 @dataclass(frozen=True, slots=True)

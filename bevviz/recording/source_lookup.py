@@ -13,16 +13,7 @@ from typing import Any, Self
 
 import rerun as rr
 
-from bevviz.config import (
-    Config,
-    Layer,
-    Preset,
-    flat_yaml,
-    load,
-    object_files,
-    untrusted_layers,
-    values,
-)
+from bevviz.config import Config, Layer, Preset, flat_yaml, load, object_files, untrusted_layers, values
 from bevviz.config.pillars import is_network_file
 from bevviz.errors import UserError, first_line
 from bevviz.model.frame import Scene

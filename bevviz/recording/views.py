@@ -79,10 +79,7 @@ def space(
             target_frame=entities.space(root + entities.sensor(scene.lidar))
         ),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=position,
-            look_target=target,
-            eye_up=(0.0, 0.0, 1.0),
+            kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)
         ),
         overrides=overrides,
     )

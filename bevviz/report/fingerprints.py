@@ -142,10 +142,7 @@ def _stages(result: FrameResult) -> Iterator[tuple[str, Arrays]]:
         if camera.image is not None:
             yield (
                 f"image {camera.name}",
-                {
-                    "pixels": camera.image.bgr,
-                    "stamp": np.array([camera.image.stamp]),
-                },
+                {"pixels": camera.image.bgr, "stamp": np.array([camera.image.stamp])},
             )
         calibration = {"camera_from_points": camera.camera_from_points}
         if camera.intrinsics is not None:

@@ -225,16 +225,7 @@ def make(
         written.warnings = [_without_folders(warning, [*request.paths, bag]) for warning in written.warnings]
         made_with = provenance(request.config, session.stages.provider)
         facts = _facts(
-            request,
-            public,
-            window,
-            content,
-            written,
-            made_with,
-            summary,
-            whole_bag.scene.name,
-            notes,
-            asked,
+            request, public, window, content, written, made_with, summary, whole_bag.scene.name, notes, asked
         )
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))

@@ -88,10 +88,7 @@ def choose_candidate(
     grid = np.full((columns, rows), -2, np.int32)
     at = np.empty((n, 2), np.int64)
     for i in range(n):
-        at[i, 0], at[i, 1] = (
-            math.floor((xy[i, 0] - low_x) / cell),
-            math.floor((xy[i, 1] - low_y) / cell),
-        )
+        at[i, 0], at[i, 1] = (math.floor((xy[i, 0] - low_x) / cell), math.floor((xy[i, 1] - low_y) / cell))
         if inside[i]:
             grid[at[i, 0], at[i, 1]] = -1
     stack = np.empty((n, 2), np.int64)

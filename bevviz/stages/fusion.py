@@ -9,16 +9,7 @@ import numpy as np
 from bevviz.config import ClusteringConfig, FusionConfig
 from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Intrinsics
 from bevviz.model.geometry import apply, iou
-from bevviz.model.results import (
-    CameraResult,
-    Claims,
-    Clusters,
-    Decision,
-    Detections,
-    Fusion,
-    Objects,
-    Pairs,
-)
+from bevviz.model.results import CameraResult, Claims, Clusters, Decision, Detections, Fusion, Objects, Pairs
 from bevviz.stages.mask_lookup import is_covered
 from bevviz.support.kernel import kernel
 

@@ -298,14 +298,7 @@ def _lowest(points: F32, order: I32, start: I32) -> I32:
 
 @kernel
 def _follow(
-    rise: F32,
-    ring: F32,
-    order: I32,
-    start: I32,
-    radius: F64,
-    sectors: int,
-    max_step: float,
-    steepest: float,
+    rise: F32, ring: F32, order: I32, start: I32, radius: F64, sectors: int, max_step: float, steepest: float
 ) -> F64:
     """Return the (R, S) heights of the ground above the first plane, computed ring by ring outwards."""
     surface = np.zeros((len(radius), sectors))

@@ -9,23 +9,8 @@ import numpy as np
 from bevviz.errors import StageError
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
-from bevviz.model.frame import (
-    F32,
-    Bool,
-    Boxes3D,
-    Camera,
-    Frame,
-    LabelledBoxes2D,
-    LabelledBoxes3D,
-)
-from bevviz.model.results import (
-    Clusters,
-    ClusterState,
-    Detections,
-    DetectionState,
-    Ground,
-    Objects,
-)
+from bevviz.model.frame import F32, Bool, Boxes3D, Camera, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.results import Clusters, ClusterState, Detections, DetectionState, Ground, Objects
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.user_stages import heights_above_ground, make_objects
 

@@ -105,12 +105,7 @@ class Tracker:
         self._next = 0
 
     def update(
-        self,
-        frame: Frame,
-        clusters: Clusters,
-        in_view: Bool,
-        objects: Objects | None,
-        config: TrackingConfig,
+        self, frame: Frame, clusters: Clusters, in_view: Bool, objects: Objects | None, config: TrackingConfig
     ) -> Tracks:
         """Return the tracks after this frame.
 
@@ -342,12 +337,7 @@ class Tracker:
         self._stamps = [s for s, kept in zip(self._stamps, recent, strict=True) if kept]
 
     def _vote(
-        self,
-        cluster: NDArray[Any],
-        in_view: Bool,
-        objects: Objects | None,
-        dt: float,
-        config: TrackingConfig,
+        self, cluster: NDArray[Any], in_view: Bool, objects: Objects | None, dt: float, config: TrackingConfig
     ) -> I32:
         """Add the scores of this frame's objects. Return the (T,) object of each track, -1 for none."""
         state = self._state

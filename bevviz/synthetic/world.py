@@ -325,12 +325,7 @@ def _parked(rng: np.random.Generator, street: Street, side: int) -> Iterator[Act
 
 
 def _cars(
-    rng: np.random.Generator,
-    lateral: float,
-    speed: float,
-    first: tuple[float, ...],
-    start: float,
-    end: float,
+    rng: np.random.Generator, lateral: float, speed: float, first: tuple[float, ...], start: float, end: float
 ) -> Iterator[Actor]:
     """Yield the cars of a lane."""
     for s in chain(first, _spaced(rng, start, end, 20, 60)):

@@ -210,10 +210,7 @@ def _reported_object(
         assert fusion is not None
         same = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == detection)
         also = [other for other in np.flatnonzero(same).tolist() if other != cluster]
-    known = subject.kind in (
-        "truth",
-        "detection",
-    )  # The detections of a place merely touch it.
+    known = subject.kind in ("truth", "detection")  # The detections of a place merely touch it.
     is_own = any(
         (candidate.camera, candidate.row) == (camera, detection) and (known or candidate.overlap >= LINK)
         for candidate in candidates

@@ -240,11 +240,7 @@ def _ground_changes(config: Config) -> Iterator[Change]:
             yield {"ground.distance_threshold": threshold}
     if ground.method == "plane":
         yield {"ground.method": "polar", "ground.distance_threshold": 0.2}
-        yield {
-            "ground.method": "polar",
-            "ground.distance_threshold": 0.2,
-            "clustering.min_points": points,
-        }
+        yield {"ground.method": "polar", "ground.distance_threshold": 0.2, "clustering.min_points": points}
 
 
 def _smaller_min_points(neighbours: int, limit: int) -> list[int]:

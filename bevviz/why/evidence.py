@@ -6,14 +6,7 @@ from dataclasses import dataclass
 
 from bevviz.model.frame import F32, I64, U8
 from bevviz.model.reasons import Scored
-from bevviz.model.results import (
-    CameraResult,
-    ClusterState,
-    Decision,
-    DetectionState,
-    FrameResult,
-    Fusion,
-)
+from bevviz.model.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
 from bevviz.why.subject import Subject
 
 MOST = 0.5  # least share of the main cause, and of a cluster that belongs mostly to one object

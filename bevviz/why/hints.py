@@ -302,9 +302,7 @@ def _settings(change: Change) -> tuple[str, ...]:
     return tuple(f"{key}={_setting_text(value)}" for key, value in change.items())
 
 
-def _combined_changes(
-    reached: Mapping[_ReachedStage, _Step],
-) -> Iterator[Change]:
+def _combined_changes(reached: Mapping[_ReachedStage, _Step]) -> Iterator[Change]:
     """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
     done: set[_ReachedStage] = set()
     while left := reached.keys() - done:

@@ -19,14 +19,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame, LabelledBoxes3D
 from bevviz.model.json_forms import RobotObjectForm
 from bevviz.sync.transform_tree import TransformBuffer, TransformError
-from bevviz.why.robot_chain import (
-    NEAR,
-    SECOND,
-    ObjectMessage,
-    RobotChain,
-    StepOutcome,
-    verdict,
-)
+from bevviz.why.robot_chain import NEAR, SECOND, ObjectMessage, RobotChain, StepOutcome, verdict
 
 AROUND = 10 * SECOND  # nanoseconds before and after the frame that the chain is inferred from
 LEAST = 4  # messages of a topic that the chain needs

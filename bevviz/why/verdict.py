@@ -7,14 +7,7 @@ from dataclasses import dataclass
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
 from bevviz.model.reasons import Reason, ReasonKind
-from bevviz.model.results import (
-    ClusterState,
-    Decision,
-    DetectionState,
-    FrameResult,
-    Fusion,
-    Opinion,
-)
+from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
 from bevviz.why.belonging import find_fused
 from bevviz.why.confidence import Outcome, rank_outcomes
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion

@@ -78,12 +78,7 @@ class NetworkSession:
     """
 
     def __init__(
-        self,
-        path: Path,
-        providers: Sequence[str],
-        options: ort.SessionOptions,
-        where: str,
-        loading: str = "",
+        self, path: Path, providers: Sequence[str], options: ort.SessionOptions, where: str, loading: str = ""
     ) -> None:
         self.where = where
         self._seconds = SECONDS if set(providers) <= set(INTERPRETING) else COMPILING_SECONDS
