@@ -69,37 +69,30 @@ class Reader(Protocol):
     @property
     def connections(self) -> Sequence[Connection]:
         """Connections of the file."""
-        ...
 
     @property
     def compression(self) -> str:
         """Names of the compressions of the file; empty without compression."""
-        ...
 
     @property
     def span(self) -> tuple[int, int]:
         """Log time of the first message, and log time of the last message plus one nanosecond."""
-        ...
 
     @property
     def warnings(self) -> Sequence[str]:
         """Missing data met so far, one sentence each."""
-        ...
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Iterator[Message]:
         """Yield messages of the connections ``ids`` with start <= log time < stop, in order of log time."""
-        ...
 
     def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
         """Return the sorted log times of the connections ``ids`` with start <= time < stop.
 
         The data of the messages is not read.
         """
-        ...
 
     def close(self) -> None:
         """Close the file."""
-        ...
 
 
 class FileBytes:

@@ -37,7 +37,6 @@ class FrameComparison(Protocol):
     @property
     def found(self) -> FrameDifferences | None:
         """Differences of the frame. None: a side has no result."""
-        ...
 
 
 class ComparisonSummary(Observer[FrameComparison]):

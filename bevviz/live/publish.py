@@ -51,11 +51,9 @@ class ResultSink(Protocol):
 
     def wants(self, topic: str) -> bool:
         """Return whether anybody receives a topic."""
-        ...
 
     def send(self, topic: str, data: bytes, stamp: int) -> None:
         """Send a message in CDR with its stamp in nanoseconds."""
-        ...
 
 
 class RosTopics:

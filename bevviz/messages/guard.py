@@ -29,12 +29,10 @@ class TypedMessage(Protocol):
     @property
     def topic(self) -> str:
         """Topic of the message."""
-        ...
 
     @property
     def type(self) -> str:
         """Type of the message."""
-        ...
 
 
 def guard(

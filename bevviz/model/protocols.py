@@ -20,17 +20,14 @@ class Items(Protocol[T_co]):
     @property
     def scene(self) -> Scene:
         """Names that entities and blueprints are made from."""
-        ...
 
     @property
     def total(self) -> int | None:
         """Number of expected items, or None if unknown."""
-        ...
 
     @property
     def warnings(self) -> Sequence[str]:
         """Losses and suspicious data so far, one sentence each."""
-        ...
 
     def __iter__(self) -> Iterator[T_co]: ...
 
@@ -41,24 +38,19 @@ class FrameSource(Items[Frame], Protocol):
     @property
     def total(self) -> int:
         """Number of frames."""
-        ...
 
     @property
     def scans(self) -> I64:
         """(N,) log time of every scan in nanoseconds, in order of the scan's number."""
-        ...
 
     def number_at(self, time: str | float) -> int:
         """Return the number of the frame at a time."""
-        ...
 
     def frame(self, number: int) -> Frame | None:
         """Return a frame, or None if it cannot be made."""
-        ...
 
     def close(self) -> None:
         """Release the files."""
-        ...
 
 
 class Processor(Protocol[T_contra, R]):
@@ -70,11 +62,9 @@ class Processor(Protocol[T_contra, R]):
 
     def perceive(self, item: T_contra, network: Executor | None = None, /) -> R:
         """Return the result of the stages that need no result of the item before."""
-        ...
 
     def finish(self, result: R, /) -> R:
         """Complete a result of ``perceive``."""
-        ...
 
 
 class Observer(Generic[R_contra]):

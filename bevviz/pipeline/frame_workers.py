@@ -36,20 +36,16 @@ class FrameParts(Protocol):
     @property
     def numbers(self) -> range:
         """Numbers of the selected frames."""
-        ...
 
     def part(self, first: int, stop: int) -> Iterator[Frame]:
         """Yield a part of the selected frames, counted from 0."""
-        ...
 
     @property
     def opener(self) -> Callable[[], FrameParts]:
         """Function that opens the same frames again. The standard pickle has to know it."""
-        ...
 
     def close(self) -> None:
         """Release the files."""
-        ...
 
 
 def with_threads(config: Config, threads: int) -> Config:

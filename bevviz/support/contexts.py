@@ -15,7 +15,6 @@ class Closable(ABC):
     @abstractmethod
     def close(self) -> None:
         """Release the resources."""
-        ...
 
     def __enter__(self) -> Self:
         return self

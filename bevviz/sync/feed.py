@@ -35,11 +35,9 @@ class Message(TypedMessage, Protocol):
     @property
     def received(self) -> int:
         """Time of receipt, nanoseconds."""
-        ...
 
     def header(self) -> tuple[int, str]:
         """Return stamp (nanoseconds) and frame_id. Raise MessageError if there is no header."""
-        ...
 
 
 M = TypeVar("M", bound=Message)

@@ -63,14 +63,12 @@ class Reader(Protocol):
     @property
     def news(self) -> News:
         """Tells when there are new pieces."""
-        ...
 
     def take(self) -> Sequence[bytes | str]:
         """Return the pieces to send now. Empty: wait for news of the recording or of the page.
 
         A text is the number of the frame that the next piece holds.
         """
-        ...
 
 
 def write_at(file: int, content: bytes, start: int) -> None:
@@ -235,19 +233,15 @@ class FrameMaker(Protocol):
     @property
     def on_demand(self) -> bool:
         """Whether frames are made on demand. It is known once there is a row."""
-        ...
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame at a stamp. None: there is none, or not yet."""
-        ...
 
     def number_at(self, stamp: int) -> int:
         """Return the number of the frame at a stamp."""
-        ...
 
     def version(self, number: int) -> int:
         """Return a number that changes if the frame would be drawn otherwise than before."""
-        ...
 
     def piece(self, number: int, *, wanted: bool) -> bytes | None:
         """Return the piece of a frame. None: there is no such frame, or it cannot be read.
@@ -256,7 +250,6 @@ class FrameMaker(Protocol):
             number: number of the frame.
             wanted: whether a page waits for it. Else it is a neighbour of such a frame.
         """
-        ...
 
 
 class FilmReader(BufferReader):

@@ -30,7 +30,6 @@ class Descriptions(Protocol):
 
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
-        ...
 
 
 class Record(Protocol):
@@ -43,7 +42,6 @@ class Record(Protocol):
     @property
     def kind(self) -> str:
         """``chunk``, ``message``, ``connection``, ``index``, ``statistics`` or another kind."""
-        ...
 
 
 R = TypeVar("R", bound=Record)
