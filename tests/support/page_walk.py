@@ -322,6 +322,9 @@ class Walk:
 
     def _step(self, pane: Pane) -> str:
         pane.page.keyboard.press(key := self.rng.choice(".,"))
+        if "has not been run yet" in pane.page.inner_text("#shown"):  # A slow page learns of the frame late.
+            pane.page.wait_for_timeout(3000)
+            pane.page.keyboard.press(key)
         pane.frame = min(max(pane.frame + (1 if key == "." else -1), 0), len(self.oracle.frames) - 1)
         return key
 
