@@ -27,6 +27,7 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
 
 Codec = Literal["h264", "h265", "av1", "vp8", "vp9"]  # video codecs that Rerun shows without decoding
 

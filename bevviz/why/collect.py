@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -127,17 +127,10 @@ def _returns_in_front(subject: Subject, traces: FrameIndex) -> tuple[I64, int]:
     turned = CORE * _wrap_angles(np.arctan2(corners[:, 1], corners[:, 0]) - middle)
     elevation = np.arctan2(corners[:, 2], away)
     half = CORE * (elevation.max() - elevation.min()) / 2
-    rows = np.concatenate(list(_rows_between(seen.azimuth, middle + turned.min(), middle + turned.max())))
+    rows = seen.between(middle + turned.min(), middle + turned.max())
     aimed = rows[np.abs(seen.elevation[rows] - (elevation.max() + elevation.min()) / 2) < half]
     before = aimed[seen.away[aimed] < away.min() - NEARER]
     return np.sort(seen.row[before]), len(aimed)
-
-
-def _rows_between(azimuth: F32, low: float, high: float) -> Iterator[I64]:
-    """Yield the rows of sorted azimuths within an interval, which may wrap around."""
-    for turn in (-2 * np.pi, 0.0, 2 * np.pi):
-        first, last = np.searchsorted(azimuth, [low + turn, high + turn])
-        yield np.arange(first, last)
 
 
 def _wrap_angles(angle: F32) -> F32:

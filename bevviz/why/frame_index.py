@@ -13,7 +13,7 @@ from bevviz.evaluate import Matches, Truth, judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.class_names import accepted_names
-from bevviz.model.frame import F32, I32, I64, U8, Bool, Boxes3D
+from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.visibility import share_in_image
@@ -23,6 +23,7 @@ from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_b
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
 DEPTH = 1.5  # metres of depth that the visible part of an object takes
+SECTORS = 1 << 16
 PART = 0.2  # least share of an object's obstacle voxels in a cluster that belongs to it
 
 
@@ -40,12 +41,29 @@ class Fate(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Directions:
-    """Directions of raw points from the origin, sorted by azimuth."""
+    """Directions of raw points from the origin, sorted by sector."""
 
     row: I64  # (N,) row of the point
-    azimuth: F32  # (N,) radians, ascending
+    sector: U16  # (N,) ascending; azimuth in steps of 2 pi / ``SECTORS``
+    azimuth: F32  # (N,) radians
     elevation: F32  # (N,) radians
     away: F32  # (N,) horizontal metres
+
+    def between(self, low: float, high: float) -> I64:
+        """Return the indices of the points in an interval of azimuths in radians, which may wrap around."""
+        parts = []
+        for turn in (-2 * np.pi, 0.0, 2 * np.pi):
+            ends = np.array([low + turn, high + turn], np.float32)
+            sectors = _sector(ends)
+            first = np.searchsorted(self.sector, sectors[0])
+            azimuth = self.azimuth[first : np.searchsorted(self.sector, sectors[1], "right")]
+            parts.append(first + np.flatnonzero((azimuth >= ends[0]) & (azimuth < ends[1])))
+        return np.concatenate(parts)
+
+
+def _sector(azimuth: F32) -> U16:
+    """Return the sector of each azimuth."""
+    return (np.clip(azimuth / (2 * np.pi) + 0.5, 0, 1) * (SECTORS - 1)).astype(np.uint16)
 
 
 class FrameIndex:
@@ -63,6 +81,7 @@ class FrameIndex:
         self.classes = tuple(dict.fromkeys([*classes, *seen]))
         self._places: dict[tuple[object, ...], I64] = {}
         self._uv: dict[str, F32] = {}
+        self._in_image: dict[str, I64] = {}  # rows of the raw points in each camera's image
         self._fits: dict[str, Fits] = {}  # by camera
         self._truth_boxes: dict[str, tuple[F32, F32]] = {}  # by camera
         self._labels: dict[int, I32] = {}
@@ -71,7 +90,8 @@ class FrameIndex:
     def for_result(self, result: FrameResult) -> FrameIndex:
         """Return the index of another result of the same frame. Arrays of the frame alone are shared."""
         other = FrameIndex(result, self.classes)
-        other._places, other._uv, other._truth_boxes = self._places, self._uv, self._truth_boxes
+        other._places, other._uv, other._in_image = self._places, self._uv, self._in_image
+        other._truth_boxes = self._truth_boxes
         other.truth, other.shown, other.labels_in_evaluate = self.truth, self.shown, self.labels_in_evaluate
         other.directions = self.directions
         return other
@@ -92,9 +112,9 @@ class FrameIndex:
         """Directions of the raw points."""
         x, y, z = self.result.frame.points.T
         azimuth = np.arctan2(y, x)
-        row = np.argsort(azimuth)
-        away = np.hypot(x, y)
-        return Directions(row, azimuth[row], np.arctan2(z, away)[row], away[row])
+        away, sector = np.hypot(x, y), _sector(azimuth)
+        row = np.argsort(sector, kind="stable")  # NumPy sorts small integers in a tenth of the time.
+        return Directions(row, sector[row], azimuth[row], np.arctan2(z, away)[row], away[row])
 
     @cached_property
     def obstacle(self) -> I64:
@@ -113,6 +133,15 @@ class FrameIndex:
         of_voxel = np.full(len(ground.mask), -1, np.int32)
         of_voxel[~ground.mask] = clusters.labels
         return of_voxel[voxels.inverse]
+
+    def obstacles_of(self, subject: Subject) -> Bool:
+        """Return (M - ground,) whether each obstacle voxel holds a raw point of the subject."""
+        voxels, ground = self.result.voxels, self.result.ground
+        if voxels is None or ground is None:
+            return np.zeros(0, np.bool_)
+        is_own = np.zeros(len(ground.mask), np.bool_)
+        is_own[voxels.inverse[self.place(subject)]] = True
+        return is_own[~ground.mask]
 
     @property
     def first_labels(self) -> I32:
@@ -187,10 +216,17 @@ class FrameIndex:
 
     def _in_frustum(self, camera: CameraResult, xyxy: F32) -> I64:
         """Return the rows of the raw points that project into an image box."""
-        u, v = self.uv(camera).T
-        x0, y0, x1, y1 = xyxy
-        with np.errstate(invalid="ignore"):
-            return np.flatnonzero((u >= x0) & (u <= x1) & (v >= y0) & (v <= y1))
+        uv, intrinsics = self.uv(camera), camera.camera.intrinsics
+        if intrinsics is None:
+            return np.zeros(0, np.int64)
+        image = np.array([0, 0, intrinsics.width, intrinsics.height], np.float32)
+        if (xyxy[:2] < image[:2]).any() or (xyxy[2:] > image[2:]).any():
+            return _rows_in(uv, xyxy)
+        name = camera.camera.name
+        if name not in self._in_image:
+            self._in_image[name] = _rows_in(uv, image)
+        rows = self._in_image[name]
+        return rows[_rows_in(uv[rows], xyxy)]
 
     def _foreground(self, camera: CameraResult, xyxy: F32, rows: I64) -> I64:
         """Keep the points of a detection's frustum at the depth that is most frequent in its middle.
@@ -275,17 +311,16 @@ class FrameIndex:
 
     def mates(self, cluster: int, row: int) -> Iterator[int]:
         """Yield the rows of other objects of the ground truth with points in the cluster."""
-        clusters = self.result.clusters
-        if clusters is None:
+        clusters, truth = self.result.clusters, self.labels_in_evaluate
+        if clusters is None or truth is None:
             return
         center, half = clusters.aabb.center[cluster], clusters.aabb.size[cluster] / 2
-        for other in self.truth:
-            if other.row == row or other.box is None:
-                continue
-            reach = half[:2] + np.hypot(*other.box.size[0, :2]) / 2 + MARGIN
-            near = np.abs(other.box.center[0, :2] - center[:2]) <= reach
-            if near.all() and self.voxels_in_cluster(cluster, other.row):
-                yield other.row
+        diagonal = np.hypot(truth.boxes.size[:, 0], truth.boxes.size[:, 1])
+        reach = half[:2] + diagonal[:, None] / 2 + MARGIN
+        near = (np.abs(truth.boxes.center[:, :2] - center[:2]) <= reach).all(axis=1)
+        for other in np.flatnonzero(near).tolist():
+            if other != row and self.voxels_in_cluster(cluster, other):
+                yield other
 
     def fits(self, camera: CameraResult) -> Fits:
         """Return how well each detection of a camera fits each object of the ground truth."""
@@ -318,17 +353,12 @@ class FrameIndex:
                 if around is None:
                     continue
                 whole[row] = around
-                inside = self._in_image(self.uv(camera)[self.place(self.truth[row])], around)
+                uv = self.uv(camera)[self.place(self.truth[row])]
+                inside = uv[_rows_in(uv, around)]
                 if len(inside) >= FEW:
                     seen[row] = *inside.min(0), *inside.max(0)
             self._truth_boxes[name] = whole, seen
         return self._truth_boxes[name]
-
-    @staticmethod
-    def _in_image(uv: F32, box: F32) -> F32:
-        """Return the pixels inside an image box."""
-        with np.errstate(invalid="ignore"):
-            return uv[((uv >= box[:2]) & (uv <= box[2:])).all(axis=1)]
 
     @cached_property
     def competing(self) -> tuple[Subject, ...]:
@@ -341,6 +371,14 @@ class FrameIndex:
                     detection_subject(self.result, camera, row) for row in np.flatnonzero(kept).tolist()
                 ]
         return tuple(subjects)
+
+
+def _rows_in(uv: F32, box: F32) -> I64:
+    """Return the rows of the pixels inside an image box."""
+    u, v = uv.T
+    x0, y0, x1, y1 = box
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero((u >= x0) & (u <= x1) & (v >= y0) & (v <= y1))
 
 
 def _near(points: F32, boxes: Boxes3D) -> Sequence[I64]:

@@ -41,19 +41,23 @@ def find_mates(
     if subject.kind != "detection":
         return []
     members = np.flatnonzero(clusters.labels == main)
-    mine = np.isin(members, obstacle_rows)
+    mine = _marked(obstacle_rows, len(obstacles))[members]
     mates = []
     for other in traces.competing:
         if other.key == subject.key or not _same_view(subject, other):
             continue
-        voxels = traces.result.voxels
-        assert voxels is not None
-        rows_of = traces.obstacle[np.unique(voxels.inverse[traces.place(other)])]
-        theirs = np.isin(members, rows_of)
+        theirs = traces.obstacles_of(other)[members]
         alone, apart = mine & ~theirs, theirs & ~mine
         if alone.sum() >= FEW and apart.sum() >= max(FEW, PART * min(int(alone.sum()), 50)):
             mates.append((other.row, other.name, int(theirs.sum())))
     return mates
+
+
+def _marked(rows: I64, total: int) -> Bool:
+    """Return (total,) whether each row is one of these."""
+    is_marked = np.zeros(total, np.bool_)
+    is_marked[rows] = True
+    return is_marked
 
 
 def _same_view(a: Subject, b: Subject) -> bool:
@@ -76,18 +80,16 @@ def separation(
     if main < 0 or clusters is None or obstacles is None or subject.kind not in ("truth", "detection"):
         return float("nan"), 0.0, None
     members = np.flatnonzero(clusters.labels == main)
-    mine = np.isin(members, obstacle_rows)
+    mine = _marked(obstacle_rows, len(obstacles))[members]
     if not mates and (subject.kind == "detection" or mine.mean() >= MOST):
         return float("nan"), 0.0, None
     points = obstacles[members]
     nearest, gap = ~mine, float("inf")
-    voxels = result.voxels
-    assert voxels is not None
     for row, _, _ in mates:
         other = (
             traces.truth[row] if subject.kind == "truth" else _detection_of_row(traces, subject.camera, row)
         )
-        theirs = np.isin(members, traces.obstacle[np.unique(voxels.inverse[traces.place(other)])])
+        theirs = traces.obstacles_of(other)[members]
         theirs &= ~mine if subject.box is not None else np.True_
         alone = mine if subject.box is not None else mine & ~theirs
         if alone.any() and theirs.any():
