@@ -10,11 +10,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import pytest
 
 from bevviz.errors import UserError
+from bevviz.model.frame import Camera, Frame, Image
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
-from tests.support.workbench_pages import chromium, demo_bag, listed, opened, serving, state, until, verdict
+from bevviz.workbench.thumbnails import MOST, WIDTH, Thumbnails
+from tests.support.workbench_pages import (
+    FRAMES,
+    chromium,
+    demo_bag,
+    listed,
+    opened,
+    serving,
+    state,
+    until,
+    verdict,
+)
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -218,6 +232,38 @@ def test_the_timeline_goes_to_a_finding(page: Page) -> None:
     until(lambda: (page.inner_text("#shown").split()[1] == "0") != first)
     until(lambda: verdict(page))
     assert page.locator("#found [aria-current=true]").count() == 1
+
+
+def test_the_timeline_shows_the_camera_at_the_pointer(page: Page) -> None:
+    box = page.locator("#events").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] - 20, box["y"] + 8)
+    page.mouse.move(box["x"] + box["width"] - 18, box["y"] + 8)
+    until(page.locator("#thumbnail").is_visible)
+    assert page.evaluate("document.querySelector('#thumbnail img').naturalWidth") == WIDTH
+    assert page.inner_text("#thumbnail") == f"{(FRAMES - 1) / 10:.2f} s"
+    page.mouse.move(100, 100)
+    until(page.locator("#thumbnail").is_hidden)
+
+
+def test_thumbnails_are_bounded() -> None:
+    """A long drive has one for each of its parts, the first frame of the part that came."""
+    thumbnails = Thumbnails(10 * MOST)
+    for number in range(0, 10 * MOST, 3):
+        thumbnails.add(pictured_frame(number))
+    shown = [thumbnails.near(number) for number in range(10 * MOST)]
+    assert len({id(picture) for picture in shown}) == MOST
+    picture = cv2.imdecode(np.frombuffer(shown[25] or b"", np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None and picture.shape == (WIDTH // 2, WIDTH, 3)
+    assert abs(picture.mean() - 21) < 2  # frames 20 to 29 are a part
+    assert Thumbnails(10).near(3) is None
+
+
+def pictured_frame(number: int) -> Frame:
+    """Return a frame whose image is as grey as its number."""
+    bgr = np.full((2 * WIDTH, 4 * WIDTH, 3), number % 256, np.uint8)
+    camera = Camera("front", Image(0, "front", bgr), None, None, None)
+    return Frame(number, number, 0, "", np.zeros((0, 3), np.float32), "base", cameras=(camera,))
 
 
 def test_a_shared_link_opens_on_another_machine(

@@ -63,7 +63,8 @@ class Directions:
 
 def _sector(azimuth: F32) -> U16:
     """Return the sector of each azimuth."""
-    return (np.clip(azimuth / (2 * np.pi) + 0.5, 0, 1) * (SECTORS - 1)).astype(np.uint16)
+    share = np.clip(azimuth / (2 * np.pi) + 0.5, 0, 1)
+    return np.asarray(share * (SECTORS - 1), np.uint16)
 
 
 class FrameIndex:

@@ -41,6 +41,7 @@ from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
 from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.workbench.session import DriveTools, WorkbenchSession
 from bevviz.workbench.source import Settings, Source
+from bevviz.workbench.thumbnails import Thumbnails
 from bevviz.workbench.trials import TrialRunner
 
 KEPT = 6  # results of recently viewed frames that are kept
@@ -116,6 +117,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self._first, self._table = first, table
         self._is_listed = False  # whether the list is that of an earlier run
         self.film = Film(drive.scene, drive.config, self.again.total)
+        self._thumbnails = Thumbnails(len(self.again.scans))
         self.lanes: dict[str, RecordingBuffer] = {"film": self.film.rows}
         self._desks = 0  # number of desks until now
         self.over = False
@@ -314,10 +316,15 @@ class RecordedDrive(Source, Observer[FrameResult]):
             self.news.tell()
 
     def _know(self, frame: Frame) -> None:
-        """Keep the stamp of a frame."""
+        """Keep the stamp and the thumbnail of a frame."""
+        self._thumbnails.add(frame)
         if frame.index not in self._stamp_by_number:
             self._stamp_by_number[frame.index] = frame.stamp
             bisect.insort(self._stamps, (frame.stamp, frame.index))
+
+    def thumbnail(self, number: int) -> bytes | None:
+        """Return a small image of the camera near a frame as JPEG. None: there is none yet."""
+        return self._thumbnails.near(number)
 
     @contextmanager
     def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:

@@ -66,6 +66,7 @@ class Site:
             Route(f"/viewer/{self._version}/{{name}}", self.viewer),
             Route("/config.yaml", self.config),
             Route("/report/{number:int}/{name}", self.report),
+            Route("/thumbnail/{number:int}", self.thumbnail),
             WebSocketRoute("/film", self.recording),
             WebSocketRoute("/talk", self.talk),
         ]
@@ -131,6 +132,14 @@ class Site:
         if path.suffix == ".html":  # The HTML of a report states its own policy.
             return _File(path, media_type="text/html")
         return _File(path, filename=path.name, media_type="application/octet-stream")
+
+    async def thumbnail(self, request: Request) -> Response:
+        """Return a small image of the camera near a frame."""
+        workbench = await self._startup.session()
+        picture = None if workbench is None else workbench.source.thumbnail(request.path_params["number"])
+        if picture is None:
+            return PlainTextResponse("there is no image of this frame yet\n", 404)
+        return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     # --- recordings ----------------------------------------------------------------------------
 

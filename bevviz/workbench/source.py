@@ -127,6 +127,10 @@ class Source(Closable):
         """Whether a page gets a frame of the recording only when it looks at it."""
         return False
 
+    def thumbnail(self, number: int) -> bytes | None:
+        """Return a small image of the camera near a frame as JPEG. None: there is none."""
+        return None
+
     @abstractmethod
     def progress(self) -> dict[str, Any]:
         """Return the progress of the run for the page."""

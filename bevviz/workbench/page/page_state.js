@@ -24,6 +24,7 @@ export function dropFrames(held) {
 }
 export const frameTimes = () => frames.map(([stamp]) => stamp); // sorted
 frameTimes.stamp = (row) => frames[row][2];
+frameTimes.number = (row) => frames[row][1];
 const TOLERANCE = 1000; // ns, of the times of a viewer
 const rowAt = (time) => frames.findLastIndex(([stamp]) => stamp <= Number(time) + TOLERANCE);
 // Frames come in any order: the one that is shown first, then all. So the next one in the list need not be the next frame.

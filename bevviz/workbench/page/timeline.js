@@ -1,7 +1,7 @@
 // Timeline under the viewer: one lane for each sort of finding, the shown time, and a click that goes there.
 
 import { $, frameTimes, seconds, state } from "./page_state.js";
-import { seek } from "./viewer.js";
+import { kind, seek } from "./viewer.js";
 
 const LANES = [
   ["missed", "--bad", ["missed", "lost", "unmatched", "broken"]],
@@ -28,7 +28,14 @@ export function start(choosing) {
   $("events").onpointermove = (event) => {
     const mark = markAt(event);
     $("events").title = mark ? `${mark.entry.what} ${mark.entry.name} at ${seconds(mark.entry.sights[mark.row][1])}` : "";
+    showThumbnail(event, rowAt(event));
   };
+  $("events").onpointerleave = () => { $("thumbnail").hidden = true; };
+  $("thumbnail").firstChild.onload = () => {
+    $("thumbnail").lastChild.textContent = $("thumbnail").dataset.at;
+    $("thumbnail").hidden = !$("events").matches(":hover");
+  };
+  $("thumbnail").firstChild.onerror = () => { $("thumbnail").hidden = true; };
   new ResizeObserver(draw).observe($("events"));
 }
 
@@ -105,10 +112,26 @@ function markAt(event) {
 
 function clicked(event) {
   const mark = markAt(event);
-  if (mark) { choose(mark.entry, mark.row); return; }
+  if (mark) choose(mark.entry, mark.row);
+  else seek(frameTimes.stamp(rowAt(event)));
+}
+
+// Row of the frame at the pointer.
+function rowAt(event) {
   const times = frameTimes();
   const part = (event.offsetX - NAMES) / ($("events").clientWidth - NAMES);
   const wanted = times[0] + part * (times.at(-1) - times[0]);
-  const best = times.reduce((row, at, other) => (Math.abs(at - wanted) < Math.abs(times[row] - wanted) ? other : row), 0);
-  seek(frameTimes.stamp(best));
+  return times.reduce((row, at, other) => (Math.abs(at - wanted) < Math.abs(times[row] - wanted) ? other : row), 0);
+}
+
+// Show the camera near a frame above the pointer, if the server has an image of it. A robot has none.
+function showThumbnail(event, row) {
+  if (kind === "live" || event.offsetX < NAMES) { $("thumbnail").hidden = true; return; }
+  const [figure, canvas] = [$("thumbnail"), $("events")];
+  const path = `/thumbnail/${frameTimes.number(row)}`;
+  figure.style.left = `${Math.max(112, Math.min(event.clientX, canvas.clientWidth - 112))}px`;
+  figure.style.bottom = `${document.documentElement.clientHeight - canvas.getBoundingClientRect().top + 4}px`;
+  figure.dataset.at = seconds(frameTimes.stamp(row));
+  if (figure.firstChild.getAttribute("src") !== path) figure.firstChild.src = path;
+  else figure.hidden = !figure.firstChild.naturalWidth;
 }
