@@ -31,6 +31,7 @@ from bevviz.fleet.findings import SCHEMA, FindingCollector
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
 from bevviz.pipeline.session import Session
+from bevviz.why import FrameExplainer
 from bevviz.why.false_objects import false_causes
 from tests.support import small_drives
 
@@ -100,7 +101,7 @@ class SmallDrive:
             result = session.add_anomalies(session.perceive(frame_))
             evaluation.observe(result)
             place = {"bag": self.bag, "recording": self.name, "frame": index, "stamp": frame_.stamp}
-            rows += [{**place, **finding} for finding in collector.of_frame(result)]
+            rows += [{**place, **finding} for finding in collector.of_frame(FrameExplainer(result))]
         return rows
 
 

@@ -17,16 +17,17 @@ import bevviz
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
+from bevviz.findings.finding_list import CELL, FindingFrame, FindingList
+from bevviz.findings.frame_findings import Finding
+from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.pipeline import result_store
 from bevviz.pipeline.run import run
 from bevviz.recording import entities
 from bevviz.why import Selection
 from bevviz.workbench import film, recorded_drive
 from bevviz.workbench.buffers import FrameCache, PageState
-from bevviz.workbench.findings import CELL, Finding, FindingFrame, FindingList
 from bevviz.workbench.overview import STEP, overview_order
 from bevviz.workbench.recorded_drive import RecordedDrive
-from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
 from tests.support.waiting import until
 from tests.support.workbench_pages import FRAMES, demo_bag
 
@@ -202,8 +203,14 @@ def test_a_drive_that_was_run_before_shows_its_list_at_once(
     assert passes == {"again"}
 
 
-def test_a_drive_that_was_evaluated_shows_its_list_at_once(
-    drives: tuple[Drive, Drive], bag: Path, store: None, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("command", ["evaluate", "batch"])
+def test_a_drive_that_another_command_ran_shows_its_list_at_once(
+    drives: tuple[Drive, Drive],
+    bag: Path,
+    store: None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    command: str,
 ) -> None:
     """The list is that of the workbench's own run. A part of the drive keeps none."""
     monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
@@ -211,9 +218,10 @@ def test_a_drive_that_was_evaluated_shows_its_list_at_once(
     provider = drives[0].session.stages.provider
     table = run_table([bag], drives[0].config, provider, (None, None))
     assert table is not None
-    command = ["evaluate", str(bag), "--model", "demo"]
-    assert main([*command, "--every", "2"]) == 0 and table.load() is None
-    assert main(command) == 0
+    words = [command, str(bag), "--model", "demo"]
+    words += ["--out", str(tmp_path), "--keep", "inspect"] if command == "batch" else []
+    assert main([*words, "--every", "2"]) == 0 and table.load() is None
+    assert main(words) == 0
     evaluated = RecordedDrive(drives[0], drives[1].frames, table=table)
     evaluated._load_list()
     assert len(evaluated.frame_times()) == FRAMES

@@ -18,6 +18,7 @@ from bevviz.fleet.findings import FindingCollector
 from bevviz.pipeline.session import Session
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import TRUTH_TOPIC
+from bevviz.why import FrameExplainer
 from tests.support import documented_json, small_drives
 
 
@@ -79,7 +80,7 @@ def test_a_track_without_its_detection_is_a_finding_of_a_batch() -> None:
         assert image is not None and labels is not None
         loader.add(image.stamp, small_drives.candidates(snapshot, dropped={victim} if victim else set()))
         result = session.run(snapshot.frame)
-        findings, truth = collector.of_frame(result), truth_of(snapshot.frame, labels)
+        findings, truth = collector.of_frame(FrameExplainer(result)), truth_of(snapshot.frame, labels)
         place = dict(zip(map(str, snapshot.truth_object.tolist()), truth.boxes.distance, strict=True))
         for finding in findings if victim else []:
             is_track = finding["outcome"] == "unexplained" and finding.get("object", "").startswith("track")

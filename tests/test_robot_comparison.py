@@ -21,6 +21,7 @@ from bevviz.bags.source import BagSource
 from bevviz.config import OpinionsConfig, changed_config, load
 from bevviz.config.trust import USER
 from bevviz.datasets.kitti import label_files, read_labels
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.counts import OPINIONS
@@ -42,7 +43,6 @@ from bevviz.sweep.run import SweepOutcome
 from bevviz.synthetic import SyntheticSource
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
-from bevviz.workbench.findings import find_findings
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.trials import trial_effects
 from tests.support.recordings import Recording

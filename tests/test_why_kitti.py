@@ -11,6 +11,7 @@ import pytest
 import bevviz
 from bevviz.config import load
 from bevviz.evaluate import match, truth_of
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model.frame import Camera, Frame
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import Detections, FrameResult
@@ -19,7 +20,6 @@ from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.stages.clustering import dbscan
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.frame_index import Fate
-from bevviz.workbench.findings import find_findings
 
 NAMES = {"Car": "car", "Van": "car", "Truck": "truck", "Tram": "train"}  # any other label is a person
 

@@ -24,6 +24,7 @@ from bevviz.cli import main
 from bevviz.config import changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
@@ -36,7 +37,6 @@ from bevviz.why.click import select_click
 from bevviz.why.subject import projected_box, single_box
 from bevviz.workbench.access import persistent_token
 from bevviz.workbench.buffers import RecordingBuffer
-from bevviz.workbench.findings import find_findings
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.session import WorkbenchSession

@@ -16,13 +16,14 @@ from bevviz.config.keys import values
 from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
+from bevviz.findings.finding_list import FindingList
+from bevviz.findings.frame_findings import find_findings
 from bevviz.fleet.table import RunInfo
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import find_source
-from bevviz.workbench.findings import FindingList, find_findings
 from bevviz.workbench.recorded_drive import recorded_session
 from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.startup import LabelledSource

@@ -144,9 +144,9 @@ def _run(
         recorder: makes the observer that logs its results.
     """
     from bevviz.anomalies import FailureSummary
+    from bevviz.findings.run_table import list_keeper
     from bevviz.pipeline.ahead import working_ahead
     from bevviz.pipeline.session import Session
-    from bevviz.workbench.run_table import list_keeper
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
     ahead = working_ahead(session, frames, [config], options.jobs)

@@ -17,7 +17,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bevviz.evaluate.evaluation import Evaluation
-from bevviz.evaluate.ground_truth import Truth
 from bevviz.evaluate.matching import Matches
 from bevviz.evaluate.recall_estimate import unreported_tracks
 from bevviz.model import geometry
@@ -27,12 +26,8 @@ from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.recording.images import unexplained_detections
 from bevviz.support.files import atomic_write
-from bevviz.why.collect import collect_evidence
-from bevviz.why.frame_index import FrameIndex, detection_subject
-from bevviz.why.resolve import track_subject
-from bevviz.why.sentences import make_verdict
-from bevviz.why.subject import LINK, Subject, projected_box, single_box
-from bevviz.why.verdict import find_reason
+from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.subject import LINK, projected_box, single_box
 
 FINDINGS = "findings"  # name of the table of all bags, and of the column in a table of frames
 
@@ -64,15 +59,15 @@ class FindingCollector:
         self._place: tuple[int, F64] | None = None  # stamp and position of the frame before
         self._speed = math.nan
 
-    def of_frame(self, result: FrameResult) -> list[Finding]:
-        """Return the findings of the next frame."""
+    def of_frame(self, explainer: FrameExplainer) -> list[Finding]:
+        """Return the findings of the next frame. The explainer has the ground truth of the evaluation."""
+        result = explainer.traces.result
         shared = self._frame_attributes(result)
         findings: list[Finding] = []
         if self._evaluation is not None and self._evaluation.last is not None:
-            _, truth, matches = self._evaluation.last
-            findings += judged_findings(result, truth, matches, self._evaluation.causes)
+            findings += judged_findings(explainer, self._evaluation.last[2], self._evaluation.causes)
         elif self._evaluation is None:
-            findings += _unjudged(result)
+            findings += _unjudged(explainer)
         findings += [
             {
                 "outcome": "anomaly",
@@ -107,27 +102,26 @@ class FindingCollector:
 
 
 def judged_findings(
-    result: FrameResult, truth: Truth, matches: Matches, causes: Mapping[int, Reason]
+    explainer: FrameExplainer, matches: Matches, causes: Mapping[int, Reason]
 ) -> Iterator[Finding]:
     """Yield the found, missed and false objects of a frame with ground truth.
 
     Args:
-        result: of the frame.
-        truth: ground truth of the frame.
-        matches: objects matched with it.
+        explainer: of the frame.
+        matches: objects matched with its ground truth.
         causes: causes of the false objects, by row.
     """
+    result, truth = explainer.traces.result, explainer.traces.labels_in_evaluate
+    assert truth is not None
     wanted = np.flatnonzero(truth.must)
     rows = {
         int(row): finding for row, finding in zip(wanted, _boxes(result, truth.boxes, wanted), strict=True)
     }
-    traces = FrameIndex(result, truth=truth)
-    subjects = {subject.row: subject for subject in traces.truth}
     for row, finding in rows.items():
         finding |= {"outcome": "found", "class": truth.labels[row].lower()}
         finding["object"] = truth.ids[row] if truth.ids else ""
         if matches.missed[row]:
-            finding |= {"outcome": "missed", **_explained(subjects[row], traces)}
+            finding |= {"outcome": "missed", **_explained(explainer.about(Selection(truth=row)))}
         yield finding
     objects, false = result.objects, np.flatnonzero(matches.false)
     if objects is None:
@@ -141,61 +135,59 @@ def judged_findings(
         yield finding
 
 
-def _unjudged(result: FrameResult) -> Iterator[Finding]:
+def _unjudged(explainer: FrameExplainer) -> Iterator[Finding]:
     """Yield the objects of a frame, and the kept detections that no object explains."""
+    result = explainer.traces.result
     objects = result.objects
     if objects is not None:
         rows = np.arange(len(objects))
         for row, finding in zip(rows.tolist(), _boxes(result, objects.boxes, rows), strict=True):
             finding |= {"outcome": "found", "class": objects.names[row].lower()}
             yield finding | {"score": float(objects.score[row])}
-    traces = FrameIndex(result)
     for camera in result.cameras:
         detections, image = camera.detections, camera.camera.image
         if detections is None or camera.fusion is None:
             continue
         for row in unexplained_detections(camera).tolist():
-            subject = detection_subject(result, camera, row)
+            name = camera.camera.name
             lost: Finding = {"outcome": "unexplained", "class": detections.names[row].lower()}
-            lost |= {"camera": camera.camera.name, "score": float(detections.score[row])}
-            lost |= _explained(subject, traces)
+            lost |= {"camera": name, "score": float(detections.score[row])}
+            lost |= _explained(explainer.about(Selection(detection=row, camera=name)))
             if image is not None:
                 x0, y0, x1, y1 = detections.xyxy[row].tolist()
                 height, width = image.bgr.shape[:2]
                 lost |= {"u": (x0 + x1) / 2 / width, "v": (y0 + y1) / 2 / height}
             yield lost
-    yield from _unreported(result, traces)
+    yield from _unreported(explainer)
 
 
-def _unreported(result: FrameResult, traces: FrameIndex) -> Iterator[Finding]:
+def _unreported(explainer: FrameExplainer) -> Iterator[Finding]:
     """Yield the named tracks in the cloud that no object reports, unless a detection tells of them."""
+    result = explainer.traces.result
     tracks, objects, rows = result.tracks, result.objects, unreported_tracks(result)
     if tracks is None or objects is None or not len(rows):
         return
     told = [(c.camera, c.detections.xyxy[unexplained_detections(c)]) for c in result.cameras if c.detections]
-    subjects = [track_subject(traces, number) for number in tracks.id[rows].tolist()]
-    boxes = [subject.box for subject in subjects if subject.box is not None]
+    answers = [explainer.about(Selection(track=number)) for number in tracks.id[rows].tolist()]
+    boxes = [answer.subject.box for answer in answers if answer.subject.box is not None]
     known = Boxes3D.joined([objects.boxes, *boxes])
     places = _boxes(result, known, np.arange(len(objects), len(known)))
-    for subject, box, finding in zip(subjects, boxes, places, strict=True):
+    for answer, box, finding in zip(answers, boxes, places, strict=True):
         shown = [(projected_box(box, camera), xyxy) for camera, xyxy in told]
         if any(xy is not None and (geometry.iou(xy[None], xyxy) >= LINK).any() for xy, xyxy in shown):
             continue
-        finding |= {"outcome": "unexplained", "class": subject.label.lower(), **_explained(subject, traces)}
+        finding |= {"outcome": "unexplained", "class": answer.subject.label.lower(), **_explained(answer)}
         if finding["reason"] != ReasonKind.REPORTED.value:  # by another track of the same object
-            yield finding | {"object": f"track {subject.row}"}
+            yield finding | {"object": f"track {answer.subject.row}"}
 
 
-def _explained(subject: Subject, traces: FrameIndex) -> Finding:
+def _explained(answer: Answer) -> Finding:
     """Return the reason why a subject was lost, in the words of ``why``, without hints."""
-    evidence = collect_evidence(subject, traces)
-    reason, reported, _ = find_reason(subject, evidence, traces)
-    verdict = make_verdict(subject, reason, reported)
-    explained: Finding = {"reason": reason.kind.value, "text": verdict.text}
-    if subject.kind == "detection":
-        explained |= {"points": float(evidence.raw), "range_m": evidence.distance}
-        if evidence.center is not None:
-            explained["bearing_deg"] = math.degrees(math.atan2(evidence.center[1], evidence.center[0]))
+    explained: Finding = {"reason": answer.verdict.kind.value, "text": answer.verdict.text}
+    if answer.subject.kind == "detection":
+        explained |= {"points": float(answer.evidence.raw), "range_m": answer.distance}
+        if answer.center is not None:
+            explained["bearing_deg"] = math.degrees(math.atan2(answer.center[1], answer.center[0]))
     return explained
 
 

@@ -22,7 +22,8 @@ from bevviz.model.frame import F64, Bool, Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants
 from bevviz.sweep.search import Settings, search
-from bevviz.why.false_objects import false_causes
+from bevviz.why import FrameExplainer
+from bevviz.why.false_objects import false_reasons
 
 FRAMES = 60  # frames to choose on, and as many to confirm
 TRIALS = 72
@@ -131,8 +132,8 @@ class Sample:
             if result.objects is None:
                 continue
             matches = judge(result.objects, sampled.truth)
-            causes = false_causes(result, sampled.truth)
-            findings = judged_findings(result, sampled.truth, matches, causes)
+            explainer = FrameExplainer(result, truth=sampled.truth)
+            findings = judged_findings(explainer, matches, false_reasons(explainer.traces))
             reasons.update(f["reason"] for f in findings if f["outcome"] != "found")
         return reasons
 

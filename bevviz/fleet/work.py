@@ -17,6 +17,7 @@ from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.evaluate.marks import MarkRecorder
 from bevviz.evaluate.recall_estimate import RecallEstimator
+from bevviz.findings.run_table import ListKeeper, list_keeper
 from bevviz.fleet.findings import FINDINGS, FindingCollector, judged_names
 from bevviz.fleet.jobs import PARTIAL, Job, JobResult
 from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
@@ -31,6 +32,7 @@ from bevviz.recording.sinks import open_recording
 from bevviz.report.pictures import camera_picture, crop_ahead, jpeg, shrink
 from bevviz.support.files import file_hash, unfinished_files
 from bevviz.support.text import path_text
+from bevviz.why import FrameExplainer
 from bevviz.why.false_objects import false_causes
 
 PICTURED = 12  # worst frames of a bag that have pictures in the table
@@ -114,7 +116,9 @@ def _fill(
             else:
                 observers += [MarkRecorder(sinks.recording), estimator]
             assert sinks.file is not None
-            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation)
+            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session)
+            if not job.truth:  # The workbench takes stated labels for the frames' own.
+                collector.keeper = list_keeper(source, session, job.config)
             watchers = [*observers, collector, DiskWatch(sinks)]
             with working_ahead(session, source, [config], helpers if has_networks(config) else 1) as ahead:
                 if run_frames(source, ahead, watchers).interrupted:
@@ -138,7 +142,11 @@ def _fill(
 
 
 class _RowCollector(Observer[FrameResult]):
-    """Observer that makes a row for each frame. It ends the run if the recording was removed."""
+    """Observer that makes a row for each frame. It ends the run if the recording was removed.
+
+    Attributes:
+        keeper: keeps the list of findings for the workbench. None: it is not kept.
+    """
 
     def __init__(
         self,
@@ -147,7 +155,10 @@ class _RowCollector(Observer[FrameResult]):
         recording: Path,
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
+        session: Session,
     ) -> None:
+        self.keeper: ListKeeper | None = None
+        self._session = session
         self._job, self._rows, self._recording = job, rows, recording
         self._on_frame, self._evaluation = on_frame, evaluation
         self._findings = FindingCollector(evaluation)
@@ -165,13 +176,20 @@ class _RowCollector(Observer[FrameResult]):
             heapq.heappush(self._worst, (*rank, _pictures(result)))
         if len(self._worst) > PICTURED:
             heapq.heappop(self._worst)
-        values[FINDINGS] = self._findings.of_frame(result)
+        judged = None if self._evaluation is None else self._evaluation.last
+        truth = None if judged is None else judged[1]
+        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names, truth)
+        values[FINDINGS] = self._findings.of_frame(explainer)
+        if self.keeper is not None:
+            self.keeper.add(explainer)
         self._rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError
 
     def end(self) -> None:
+        if self.keeper is not None:
+            self.keeper.end()
         for _, negative_row, jpegs in self._worst:
             self._rows[-negative_row] |= jpegs
         if self._evaluation is not None:

@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from bevviz.evaluate import MIN_HITS, RANGE
+from bevviz.evaluate import MIN_HITS, RANGE, Truth
 from bevviz.model.frame import U8
 from bevviz.model.json_forms import AnswerForm, HintForm, StepForm
 from bevviz.model.reasons import ReasonKind
@@ -210,12 +210,17 @@ class FrameExplainer:
         result: result of the frame, with its explanations.
         loader: stage loader with the networks already loaded, for ``hints``.
         classes: names of the classes that the detector knows.
+        truth: ground truth of the frame; None: its own.
     """
 
     def __init__(
-        self, result: FrameResult, loader: StageLoader | None = None, classes: Sequence[str] = ()
+        self,
+        result: FrameResult,
+        loader: StageLoader | None = None,
+        classes: Sequence[str] = (),
+        truth: Truth | None = None,
     ) -> None:
-        self.traces = FrameIndex(result, classes)
+        self.traces = FrameIndex(result, classes, truth)
         self._hint_finder = HintFinder(self.traces, loader)
         self._answers: dict[tuple[object, ...], Answer] = {}
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import rerun as rr
 
 from bevviz.config import Config
+from bevviz.findings.frame_findings import Finding, find_findings
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints, entities
@@ -18,7 +19,6 @@ from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import FrameCache, RecordingBuffer
-from bevviz.workbench.findings import Finding, find_findings
 from bevviz.workbench.findings_layer import FindingRows, log_layer
 from bevviz.workbench.source import Settings
 

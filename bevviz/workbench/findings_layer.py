@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 
 from bevviz.config import BevConfig
+from bevviz.findings.frame_findings import Finding
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
@@ -20,7 +21,6 @@ from bevviz.recording.writer import Writer
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.support.colors import Color, StateColor
 from bevviz.why.subject import projected_box, single_box
-from bevviz.workbench.findings import Finding
 
 FindingRows: TypeAlias = Mapping[str, Sequence[Finding]]  # findings of an entity, one per logged row
 

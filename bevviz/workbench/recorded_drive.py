@@ -19,6 +19,8 @@ from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.findings.frame_findings import Finding, find_findings
+from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
@@ -34,11 +36,9 @@ from bevviz.why.robot_messages import RobotQuestions, object_topics
 from bevviz.workbench.buffers import BufferReader, FilmReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.film import Film
-from bevviz.workbench.findings import Finding, find_findings
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
-from bevviz.workbench.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.workbench.session import DriveTools, WorkbenchSession
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.thumbnails import Thumbnails

@@ -19,6 +19,7 @@ import rerun as rr
 from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
+from bevviz.findings.frame_findings import find_findings
 from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live, ObservingSession
 from bevviz.live.status import give_way
@@ -34,7 +35,6 @@ from bevviz.why.log import mark_answers
 from bevviz.why.robot_messages import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.desk import Attempt, Desk
-from bevviz.workbench.findings import find_findings
 from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.reports import ReportedBag, ReportMaker

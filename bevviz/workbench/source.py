@@ -14,6 +14,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth
 from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.findings.finding_list import FindingList
 from bevviz.model.frame import F32, F64, Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.session import Session
@@ -22,7 +23,6 @@ from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.robot_messages import FollowedObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.desk import Attempt, Desk
-from bevviz.workbench.findings import FindingList
 
 Settings = tuple[str, ...]
 Message = Mapping[str, Any]  # message from the page

@@ -13,6 +13,8 @@ import numpy as np
 from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate import ObjectScore, Truth
+from bevviz.findings.finding_list import DIFFERENCES
+from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
 from bevviz.model.counts import OPINIONS, count_opinions
 from bevviz.model.protocols import Observer
@@ -24,7 +26,6 @@ from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
-from bevviz.workbench.findings import DIFFERENCES, Finding, finding_of
 
 if TYPE_CHECKING:
     from bevviz.workbench.recorded_drive import RecordedDrive

@@ -14,6 +14,8 @@ from bevviz.anomalies import Onsets
 from bevviz.bags.remote import address_of
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, values
+from bevviz.findings.finding_list import FindingFrame, FindingList
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key, with_weights
@@ -21,7 +23,6 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import model_path, versions
 from bevviz.support.files import file_hash
 from bevviz.why import FrameExplainer
-from bevviz.workbench.findings import FindingFrame, FindingList, find_findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,8 @@ class StoredRun:
     groups: list[StoredGroup]
     frames: list[tuple[int, int]]
 
+
+UNRELATED = {"live", "logging", "store"}  # sections that change no finding
 
 _RUN = TypeAdapter(StoredRun)
 
@@ -91,8 +94,13 @@ class ListKeeper(Observer[FrameResult]):
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
-        frame, session = result.frame, self._session
-        self._list.add(find_findings(FrameExplainer(result, session.loader, session.stages.class_names)))
+        self.add(FrameExplainer(result, self._session.loader, self._session.stages.class_names))
+
+    def add(self, explainer: FrameExplainer) -> None:
+        """List the findings of a frame that is explained already."""
+        result = explainer.traces.result
+        frame = result.frame
+        self._list.add(find_findings(explainer))
         self._list.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self._frames.append((frame.stamp, frame.index))
 
@@ -103,12 +111,19 @@ class ListKeeper(Observer[FrameResult]):
             self._table.save(StoredRun(groups, sorted(self._frames)))
 
 
-def list_keeper(source: BagSource, session: Session) -> ListKeeper | None:
-    """Return an observer that keeps the list of a run. None: the run leaves scans out, or no list is kept."""
+def list_keeper(source: BagSource, session: Session, config: Config | None = None) -> ListKeeper | None:
+    """Return an observer that keeps the list of a run. None: the run leaves scans out, or no list is kept.
+
+    Args:
+        source: frames of the run.
+        session: session of the run.
+        config: configuration as the user gave it. None: that of the session.
+    """
     if len(source.numbers) != len(source.scans):
         return None
     files = [file.path for file in source.recording.files]
-    table = run_table(files, session.config, session.stages.provider, (None, None)) if files else None
+    config = config or session.config
+    table = run_table(files, config, session.stages.provider, (None, None)) if files else None
     return None if table is None else ListKeeper(table, session, len(source.scans))
 
 
@@ -135,7 +150,12 @@ def run_table(
     files = [path for path in files if path.is_file()]
     for path in [path for path in (model, *files) if path is not None and path.suffix == ".onnx"]:
         files += with_weights(path)
-    facts = [config.model_dump_json(), provider, str(sorted(versions().items())), code_hash("")]
+    facts = [
+        config.model_dump_json(exclude=UNRELATED),
+        provider,
+        str(sorted(versions().items())),
+        code_hash(""),
+    ]
     facts += [file_hash(path) for path in files]
     for stated in [*paths, *labels]:
         facts.append(str(stated))

@@ -1,0 +1,1 @@
+"""Findings of a drive: missed, false and unexplained objects, and the kept list. Imports `why` and below."""
