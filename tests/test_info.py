@@ -14,7 +14,8 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.pipeline.bag_info import WIDTH, describe_bag, render_bag_info
+from bevviz.pipeline.bag_info import WIDTH, BagInfo, describe_bag, render_bag_contents, render_bag_info
+from bevviz.pipeline.sensor_check import SensorCheck
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import DEMO_MODEL
 from tests.support import bags
@@ -182,6 +183,23 @@ def test_the_whole_drive_is_checked_on_request(tmp_path: Path, capsys: pytest.Ca
     assert main(["info", path, "--sensors"]) == 0
     assert "warnings\n  camera camera: frozen image since 11.0 s\n" in capsys.readouterr().out
     assert main(["info", "--live", "--sensors"]) != 0
+
+
+def test_the_contents_come_before_the_sensors_are_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long drive is described at once."""
+    checked: list[int] = []
+    monkeypatch.setattr(SensorCheck, "add", lambda check, frame: checked.append(frame.index))
+    told: list[BagInfo] = []
+
+    def tell(info: BagInfo) -> None:
+        assert not checked
+        told.append(info)
+
+    info = describe_bag([frozen_after(2.0, tmp_path / "drive")], Config(), on_contents=tell)
+    assert len(checked) > 5 and checked == list(range(len(checked)))
+    assert render_bag_info(info).startswith(render_bag_contents(told[0]))
 
 
 def test_unrelated_single_frames_are_not_compared(shared: Path) -> None:

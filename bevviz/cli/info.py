@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
-from bevviz.cli.outputs import add_json, print_result
+from bevviz.cli.outputs import add_json, json_on_stdout, print_result
 from bevviz.errors import UserError
 
 
@@ -43,7 +43,13 @@ def add(commands: Commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from bevviz.pipeline.bag_info import contents_tree, describe_bag, render_bag_info
+    from bevviz.pipeline.bag_info import (
+        BagInfo,
+        contents_tree,
+        describe_bag,
+        render_bag_contents,
+        render_missing,
+    )
 
     if options.live and options.sensors:
         raise UserError("bevviz info: --sensors is for a drive; a running robot's are watched by bevviz live")
@@ -58,6 +64,12 @@ def _info(options: argparse.Namespace) -> int:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
     if not options.paths:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
-    bag_info = describe_bag(options.paths, load_config(options), all_frames=options.sensors)
-    print_result(options, "info", contents_tree(bag_info), lambda: render_bag_info(bag_info))
+
+    def show(info: BagInfo) -> None:
+        if not json_on_stdout(options):
+            print(render_bag_contents(info), flush=True)
+
+    config = load_config(options)
+    bag_info = describe_bag(options.paths, config, all_frames=options.sensors, on_contents=show)
+    print_result(options, "info", contents_tree(bag_info), lambda: render_missing(bag_info))
     return 0

@@ -19,6 +19,7 @@ from bevviz.pipeline.bag_info import (
     find_missing,
     network_providers,
     render_contents,
+    render_missing,
 )
 from bevviz.support import progress
 
@@ -124,4 +125,4 @@ def render(info: LiveInfo) -> str:
         "graph": f"ROS_DOMAIN_ID {info.domain}, {info.middleware}",
         "time": f"{info.seconds:.1f} s listened, {sum(t.count or 0 for t in info.topics)} messages",
     }
-    return render_contents(about, info)
+    return f"{render_contents(about, info)}\n{render_missing(info)}"

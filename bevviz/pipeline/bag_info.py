@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -92,13 +93,21 @@ class BagInfo(TopicContents):
         return (self.end - self.start) / SECOND
 
 
-def describe_bag(paths: Sequence[Path], config: Config, *, all_frames: bool = False) -> BagInfo:
+def describe_bag(
+    paths: Sequence[Path],
+    config: Config,
+    *,
+    all_frames: bool = False,
+    on_contents: Callable[[BagInfo], None] = lambda info: None,
+) -> BagInfo:
     """Read the index of a bag, and check its sensors.
 
     Args:
         paths: files or folders.
         config: configuration of the runs to come.
         all_frames: check the sensors in the whole drive, not in its first frames alone.
+        on_contents: called with the contents before the sensors are checked. ``missing`` and ``warnings``
+            are not complete then.
 
     Raises:
         UserError: there is no readable bag, or a stated topic is not in it.
@@ -111,16 +120,24 @@ def describe_bag(paths: Sequence[Path], config: Config, *, all_frames: bool = Fa
                 roles = find_roles(recording.topics, config.source, stage_topics(config))
             except UserError:  # A stage may need the topic of a result file, which is the first error.
                 raise error from None
-            return _describe(recording, roles, config, missing=[str(error)])
+            info = _describe(recording, roles, config, missing=[str(error)])
+            on_contents(info)
+            return info
     with source:
         roles = source.roles
-        frame, check = None, SensorCheck(config)
-        for count, read in enumerate(first_frames(source, TRIAL_SCAN, all_frames), 1):
-            frame = read if count <= TRIAL_SCAN else frame
-            if not source.recording.single_frames:
+        frames, check = first_frames(source, TRIAL_SCAN, all_frames), SensorCheck(config)
+        first = list(islice(frames, TRIAL_SCAN))
+        frame = first[-1] if first else None
+        info = _describe(source.recording, roles, config, find_missing(roles, frame, config), frame, source)
+        on_contents(info)
+        if not source.recording.single_frames:
+            for read in chain(first, frames):
                 check.add(read)
-        missing = [*source.large_losses(), *find_missing(roles, frame, config)]
-        return _describe(source.recording, roles, config, missing, frame, source, check.warnings)
+        return replace(
+            info,
+            missing=(*source.large_losses(), *info.missing),
+            warnings=(*source.recording.warnings, *source.doubts, *check.warnings),
+        )
 
 
 def _describe(
@@ -130,7 +147,6 @@ def _describe(
     missing: Sequence[str],
     frame: Frame | None = None,
     source: BagSource | None = None,
-    faults: Sequence[str] = (),
 ) -> BagInfo:
     """Collect the summary of an open bag."""
     networks, missing_networks = network_providers(config)
@@ -152,7 +168,7 @@ def _describe(
         object_network=networks["objects"],
         configured=tuple(stated_lines(config)),
         missing=tuple(missing),
-        warnings=(*recording.warnings, *(source.doubts if source else ()), *faults),
+        warnings=(*recording.warnings, *(source.doubts if source else ())),
     )
 
 
@@ -305,6 +321,11 @@ def _camera_tree(camera: Camera) -> CameraForm:
 
 def render_bag_info(info: BagInfo) -> str:
     """Return the summary of a bag as text for a terminal of 100 columns."""
+    return f"{render_bag_contents(info)}\n{render_missing(info)}"
+
+
+def render_bag_contents(info: BagInfo) -> str:
+    """Return the summary of a bag but what is missing and the warnings."""
     kinds = sorted(set(info.formats))
     files = f"{len(info.formats)} files of " if len(info.formats) > 1 else ""
     header = {
@@ -316,7 +337,7 @@ def render_bag_info(info: BagInfo) -> str:
 
 
 def render_contents(header: Mapping[str, str], info: TopicContents) -> str:
-    """Return the contents as text, below some lines about the whole.
+    """Return the contents as text, below some lines about the whole, with an empty line at the end.
 
     Args:
         header: name and text of each of these lines.
@@ -333,10 +354,14 @@ def render_contents(header: Mapping[str, str], info: TopicContents) -> str:
         *_section("network runs on", [info.network] if info.network else []),
         *_section("3D detector runs on", [info.object_network] if info.object_network else []),
         *_section("configured by", info.configured),
-        *_section("missing for a full run", info.missing or ["nothing"]),
-        *_section("warnings", info.warnings),
     ]
-    return "\n".join(lines).rstrip()
+    return "\n".join(lines)
+
+
+def render_missing(info: TopicContents) -> str:
+    """Return what is missing and the warnings as text."""
+    lines = _section("missing for a full run", info.missing or ["nothing"])
+    return "\n".join([*lines, *_section("warnings", info.warnings)]).rstrip()
 
 
 def _row(name: str, text: str) -> str:
