@@ -39,7 +39,7 @@ class Page:
         parts = urlsplit(address)
         self._number = 0
         self.sights: list[tuple[int, str]] = []
-        film, self._desk, self._talk = (
+        recording, self._desk, self._talk = (
             stack.enter_context(
                 connect(
                     f"ws://{parts.netloc}/{path}&{parts.query}",
@@ -47,9 +47,9 @@ class Page:
                     max_size=None,
                 )
             )
-            for path in ("film?lane=film", "film?lane=desk", "talk?")
+            for path in ("recording?lane=recording", "recording?lane=desk", "talk?")
         )
-        film.recv(timeout=WAIT)
+        recording.recv(timeout=WAIT)
         self.first = time.monotonic()
         self._talk.send(json.dumps({"id": 0, "type": "shown"}))
         while not self._next("progress")["over"]:

@@ -304,8 +304,8 @@ def _workbench(drive: Sequence[str], folder: Path) -> Hashes:
 def _live(folder: Path) -> Hashes:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.frames import Replay
     from bevviz.live.runtime import Live, Outputs
+    from bevviz.live.source_wrappers import Replay
     from bevviz.live.status import Notes
     from bevviz.synthetic import SyntheticSource
 

@@ -18,8 +18,8 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.frames import Replay
 from bevviz.live.runtime import Live, Outputs, Status
+from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.synthetic import SyntheticSource
 

@@ -28,6 +28,7 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.fleet.bag_job import run
 from bevviz.fleet.jobs import (
     PARTIAL,
     Job,
@@ -40,7 +41,6 @@ from bevviz.fleet.jobs import (
     unfinished_jobs,
 )
 from bevviz.fleet.table import SEVERITIES, read_info, row, severity
-from bevviz.fleet.work import run
 from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
 from tests.support import bags

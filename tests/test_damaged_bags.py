@@ -17,7 +17,8 @@ import zstandard
 
 from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
-from bevviz.bags.reader import LEAST, DamageError, FileBytes, unpack
+from bevviz.bags.compression import LEAST, unpack
+from bevviz.bags.reader import DamageError, FileBytes
 from bevviz.bags.rescue.sqlite import checksum_of
 from bevviz.bags.source import BagSource
 from bevviz.cli import main

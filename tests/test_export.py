@@ -13,7 +13,7 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.datasets.kitti import read_labels
+from bevviz.datasets.kitti_files import read_labels
 from bevviz.errors import UserError
 from bevviz.export.folder import rectify
 from bevviz.export.kitti import KittiExport, label_lines

@@ -10,8 +10,8 @@ import pytest
 from bevviz.bags.bag import Recording
 from bevviz.datasets import open_dataset
 from bevviz.datasets.cloud_files import read_cloud
-from bevviz.datasets.kitti import read_labels
 from bevviz.datasets.kitti_drives import CLOUDS
+from bevviz.datasets.kitti_files import read_labels
 from bevviz.errors import UserError
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.detections import decode_detections_3d

@@ -19,14 +19,14 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.fleet import work
+from bevviz.fleet import bag_job
 from bevviz.fleet.jobs import make_jobs
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline import frame_workers, result_store
-from bevviz.pipeline.ahead import working_ahead
-from bevviz.pipeline.cluster import ClusterFrames
+from bevviz.pipeline.dask_frames import ClusterFrames
 from bevviz.pipeline.frame_workers import FrameParts, FrameWorkers
+from bevviz.pipeline.network_prefetch import working_ahead
 from bevviz.pipeline.result_store import open_store
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -162,7 +162,7 @@ def test_a_batch_gives_the_same_with_helpers(bag: Path, tmp_path: Path) -> None:
     tables = []
     for helpers in (1, 2):
         (job,) = make_jobs([bag], tmp_path / str(helpers), CONFIG, FrameSelection(), "debug")
-        result = work.run(job, 1, helpers=helpers)
+        result = bag_job.run(job, 1, helpers=helpers)
         assert (result.frames, result.error) == (FRAMES, "")
         columns = pq.read_table(job.table).to_pydict()
         tables.append({name: values for name, values in columns.items() if not name.startswith("time_ms")})

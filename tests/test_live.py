@@ -30,10 +30,10 @@ from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import RecordingSaver, unused_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
-from bevviz.live.frames import Replay, ThinnedSource, thin
 from bevviz.live.indexing import INDEX, Indexer, add_index, remove_leftovers
 from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.runtime import Live, Outputs
+from bevviz.live.source_wrappers import Replay, ThinnedSource, thin
 from bevviz.live.status import Notes
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (

@@ -12,8 +12,8 @@ import bevviz
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
-from bevviz.live.frames import Replay
 from bevviz.live.runtime import Live, Outputs
+from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -96,35 +96,35 @@ def test_a_page_is_sent_what_it_can_draw_and_its_lag_is_known(
 ) -> None:
     now = 100.0
     monkeypatch.setattr(bench.live.encoder, "clock", lambda: now)
-    film = bench.film
-    assert film.lag is None, "nobody looks"
+    recording = bench.recording
+    assert recording.lag is None, "nobody looks"
     heard = PageState()
-    with film.shown(heard) as page:
-        assert film.lag == 0.0
+    with recording.shown(heard) as page:
+        assert recording.lag == 0.0
         for _ in range(AHEAD):
             assert page.ready
             page.send()
             now += 0.5
-        assert not page.ready and film.lag == 0.5 * AHEAD
+        assert not page.ready and recording.lag == 0.5 * AHEAD
         assert bench.live.numbers["lag of the page viewer, ms"] == 500.0 * AHEAD
         heard.hidden = True
-        assert film.lag == 0.0, "a page that nobody sees draws nothing"
+        assert recording.lag == 0.0, "a page that nobody sees draws nothing"
         heard.hidden, heard.count = False, AHEAD - 1
-        assert page.ready and film.lag == 0.5
+        assert page.ready and recording.lag == 0.5
         heard.count = AHEAD
-        assert film.lag == 0.0
-    assert film.lag is None
+        assert recording.lag == 0.0
+    assert recording.lag is None
 
 
 def test_what_a_page_was_too_slow_for_is_counted(bench: RunningRobot, results: list[FrameResult]) -> None:
-    film, encoder = bench.film, bench.live.encoder
+    recording, encoder = bench.recording, bench.live.encoder
     packet = encoder.encode(results[0], bench.live.scene, {}, ())
-    film._take(packet, True)
-    _, number = film.since(None)
+    recording._take(packet, True)
+    _, number = recording.since(None)
     for _ in range(WHOLE + 2):
-        film._take(packet, False)
-    pieces, _ = film.since(number)
-    assert len(pieces) == 2 and film.dropped == WHOLE + 1, "the newest whole one, and what it relies on"
+        recording._take(packet, False)
+    pieces, _ = recording.since(number)
+    assert len(pieces) == 2 and recording.dropped == WHOLE + 1, "the newest whole one, and what it relies on"
 
 
 def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None:
@@ -134,6 +134,6 @@ def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None
     with RunningRobot(live) as bench:
         whole = live.encoder.encode(results[0], live.scene, {}, ())
         for packet in (whole, Packet(b"", False, whole.context, 0.0), whole):
-            bench.film._take(packet, False)
-        assert bench.film.since(None)[1] == 2
+            bench.recording._take(packet, False)
+        assert bench.recording.since(None)[1] == 2
         live.encoder.close()

@@ -24,7 +24,7 @@ from bevviz.pipeline import result_store
 from bevviz.pipeline.run import run
 from bevviz.recording import entities
 from bevviz.why import Selection
-from bevviz.workbench import film, recorded_drive
+from bevviz.workbench import drive_recording, recorded_drive
 from bevviz.workbench.buffers import FrameCache, PageState
 from bevviz.workbench.overview import STEP, overview_order
 from bevviz.workbench.recorded_drive import RecordedDrive
@@ -69,7 +69,7 @@ def whole_list(drive: RecordedDrive, passes: set[str]) -> list[list[int]]:
     drive.start()
     until(lambda: drive.over)
     assert drive.progress()["done"] == FRAMES and not drive.progress()["error"]
-    drive.film.close()
+    drive.recording.close()
     return groups(drive.findings)
 
 
@@ -124,18 +124,18 @@ def test_the_oldest_frames_of_a_cache_make_room() -> None:
 def long_drive(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> Iterator[RecordedDrive]:
     """Yield a drive whose recording is too large for a browser, before its run."""
     monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
-    monkeypatch.setattr(film, "WHOLE", 0)
+    monkeypatch.setattr(drive_recording, "WHOLE", 0)
     drive = RecordedDrive(drives[0], drives[1].frames)
     drive.show(drive.look(0), ())
     yield drive
-    drive.film.close()
+    drive.recording.close()
 
 
 def test_a_page_gets_the_frames_that_it_looks_at(long_drive: RecordedDrive) -> None:
     """First the requested one, then its neighbours. Tracks come with the run."""
     state = PageState()
     stamps = [long_drive.drive.raw(number).stamp for number in range(FRAMES)]
-    with long_drive.reader("film", 0, state) as reader:
+    with long_drive.reader("recording", 0, state) as reader:
         assert len(reader.take()) == 1 and reader.take() == ()  # the layout with the first frame
         state.requested += [stamps[1], stamps[4]]
         numbers = []
@@ -149,7 +149,7 @@ def test_a_page_gets_the_frames_that_it_looks_at(long_drive: RecordedDrive) -> N
         state.requested.append(stamps[4])
         number, piece = reader.take()
         assert number == "4"
-        assert long_drive.film.frame(4, 1) == piece
+        assert long_drive.recording.frame(4, 1) == piece
     assert [number for _, number in long_drive.frame_times()] == list(range(FRAMES))
 
 
@@ -163,7 +163,7 @@ def test_frames_on_demand_are_complete_in_any_order(long_drive: RecordedDrive, t
     assert {entities.TRAILS, entities.image("zed"), entities.points("rslidar")} <= shown[2] & shown[
         3
     ] & shown[5]
-    numbers = [long_drive.film.rows[row] for row in range(1, len(long_drive.film.rows))]
+    numbers = [long_drive.recording.rows[row] for row in range(1, len(long_drive.recording.rows))]
     totals = entities_at(tmp_path, dict(enumerate(numbers)))
     assert {entities.count("clusters"), entities.stage_time("total")} <= set.union(*totals.values())
     assert not any(path.startswith(entities.WORLD) for paths in totals.values() for path in paths)
@@ -198,13 +198,13 @@ def test_a_drive_that_was_run_before_shows_its_list_at_once(
     again._load_list()
     assert groups(again.findings) == first != []
     assert len(again.frame_times()) == FRAMES
-    again.film.close()
+    again.recording.close()
     assert whole_list(RecordedDrive(drives[0], drives[1].frames, table=table), passes) == first
     assert passes == {"again"}
 
 
 @pytest.mark.parametrize("command", ["evaluate", "batch"])
-def test_a_drive_that_another_command_ran_shows_its_list_at_once(
+def test_a_drive_run_by_another_command_shows_its_list(
     drives: tuple[Drive, Drive],
     bag: Path,
     store: None,
@@ -225,7 +225,7 @@ def test_a_drive_that_another_command_ran_shows_its_list_at_once(
     evaluated = RecordedDrive(drives[0], drives[1].frames, table=table)
     evaluated._load_list()
     assert len(evaluated.frame_times()) == FRAMES
-    evaluated.film.close()
+    evaluated.recording.close()
     assert groups(evaluated.findings) == whole_list(RecordedDrive(drives[0], drives[1].frames), set()) != []
 
 

@@ -240,11 +240,11 @@ def test_a_full_temporary_disk_names_its_folder(
     with small_disk(tmp_path / "small", "64k") as small:
         monkeypatch.setattr("tempfile.tempdir", str(small))
         full = f"{small}: the disk is full: make room there, or name another folder for temporary files"
-        with RecordingBuffer() as film:
-            film.add(b"first")
+        with RecordingBuffer() as recording:
+            recording.add(b"first")
             with pytest.raises(UserError, match=f"^{re.escape(full)} with TMPDIR$"):
-                film.add(bytes(100_000))
-            assert film[0] == b"first" and len(film) == 1
+                recording.add(bytes(100_000))
+            assert recording[0] == b"first" and len(recording) == 1
         within = f"{small}/bevviz-scratch-"
         said = error_of(capsys, "info", packed)
         assert within in said or full in said

@@ -31,11 +31,11 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import Dependency, Provenance
-from bevviz.report.cause import cause_of, explain_subject
 from bevviz.report.check import CheckResult
 from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack, unpack
 from bevviz.report.page import spans
 from bevviz.report.pictures import marked_pictures, ticks
+from bevviz.report.report_subject import cause_of, explain_subject
 from bevviz.stages.detector import Detector
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.subject import projected_box

@@ -11,7 +11,7 @@ import pytest
 
 import bevviz
 from bevviz.anomalies import AnomalyDetector
-from bevviz.anomalies.placement import LEAST_PAST, find_error, score_rotations
+from bevviz.anomalies.calibration_drift import LEAST_PAST, find_error, score_rotations
 from bevviz.anomalies.sensor_faults import ImageWatch
 from bevviz.config import AnomaliesConfig
 from bevviz.model.frame import Image

@@ -530,14 +530,14 @@ def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None
 
 
 def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
-    """Of a film that nobody acknowledges a few pieces come, and the one that is asked for."""
+    """Of a recording that nobody acknowledges a few pieces come, and the one that is asked for."""
     from websockets.sync.client import connect
     from websockets.typing import Origin
 
     with Talk(address) as talk:
         last = max(int(s[1]) for entry in talk.of("missed", "false") for s in entry["sights"])
     parts = urlsplit(address)
-    url, origin = f"ws://{parts.netloc}/film?{parts.query}", Origin(f"http://{parts.netloc}")
+    url, origin = f"ws://{parts.netloc}/recording?{parts.query}", Origin(f"http://{parts.netloc}")
 
     def pieces(start: int, words: Callable[[], str], first: str = "") -> list[bytes]:
         found = []
@@ -630,7 +630,7 @@ def test_a_server_that_stops_cancels_waiting_requests_quietly(capfd: pytest.Capt
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("path", ["/talk", "/film"])
+@pytest.mark.parametrize("path", ["/talk", "/recording"])
 def test_channels_are_guarded(address: str, path: str) -> None:
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
@@ -850,7 +850,11 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
         recoloured = session.try_values(0, ("ground.distance_threshold=0.5",), attempt=desk.attempt())
         session.try_values(0, ("detector.conf_threshold=0.9",), attempt=desk.attempt())
         result = drive.at(frame=0)
-        pieces = [film[row] for film in (bench.film.rows, desk.buffer) for row in range(len(film))]
+        pieces = [
+            recording[row]
+            for recording in (bench.recording.rows, desk.buffer)
+            for row in range(len(recording))
+        ]
         assert len(other.buffer) == 0, "another page shows nothing of it"
         bench.close()
     assert result.objects is not None
@@ -967,7 +971,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
         bench.show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):
             bench.observe(result)
-        first, *others = [bench.film.rows[row] for row in range(len(bench.film.rows))]
+        first, *others = [bench.recording.rows[row] for row in range(len(bench.recording.rows))]
         application = blueprints.application_id("workbench", drive.scene, drive.config)
         bench.close()
     (whole := tmp_path / "first.rrd").write_bytes(first)
@@ -982,16 +986,16 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
 
 def test_pieces_of_a_recording_are_read_back_unchanged() -> None:
     told = []
-    with RecordingBuffer() as film:
-        end = film.news.listen(lambda: told.append(len(film)))
+    with RecordingBuffer() as recording:
+        end = recording.news.listen(lambda: told.append(len(recording)))
         for piece in (b"one", b"", None, b"two" * 1000):
-            film.add(piece)
+            recording.add(piece)
         end()
-        film.add(b"three")
-        assert [film[row] for row in range(len(film))] == [b"one", b"two" * 1000, b"three"]
+        recording.add(b"three")
+        assert [recording[row] for row in range(len(recording))] == [b"one", b"two" * 1000, b"three"]
         assert told == [1, 2]
         with pytest.raises(IndexError):
-            film[3]
+            recording[3]
 
 
 def test_controls_are_made_of_the_fields() -> None:

@@ -64,8 +64,8 @@ def drawn(source: RecordedDrive, folder: Path) -> Iterator[Drawn]:
     stamp = source.look(FRAME).frame.stamp
     poses: dict[str, NDArray[np.float64]] = {}
     rows: dict[str, dict[str, Any]] = {}
-    for number in range(len(source.film.rows)):
-        (path := folder / f"{number}.rrd").write_bytes(source.film.rows[number])
+    for number in range(len(source.recording.rows)):
+        (path := folder / f"{number}.rrd").write_bytes(source.recording.rows[number])
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
             columns = {name: batch.column(name) for name in batch.schema.names}

@@ -118,7 +118,7 @@ class Shown:
     """What a page's viewer would show. A thread takes each piece at once: a slow page skips pieces."""
 
     def __init__(self, address: str, folder: Path) -> None:
-        self.channel, self._file = Channel(address, "/film"), folder / "piece.rrd"
+        self.channel, self._file = Channel(address, "/recording"), folder / "piece.rrd"
         self.stamp, self.texts, self.marked = 0, list[str](), False
         self._pieces = deque[bytes]()
         threading.Thread(target=self._receive, daemon=True).start()
@@ -348,18 +348,18 @@ def test_the_objects_method_is_changed_there_and_back(
 
 def test_pages_begin_at_a_whole_frame_and_miss_none(bench: RunningRobot, results: list[FrameResult]) -> None:
     encoder: Encoder = bench.live.encoder
-    film: LiveBuffer = bench.film
-    assert film.since(None) == ([], -1)
+    recording: LiveBuffer = bench.recording
+    assert recording.since(None) == ([], -1)
     packets = deque(encoder.encode(result, bench.live.scene, {}, ()) for result in results[:3])
-    film._take(packets[0], True)
-    begin, number = film.since(None)
+    recording._take(packets[0], True)
+    begin, number = recording.since(None)
     assert len(begin) == 3, "layout, what the frame relies on, the frame"
     assert all(piece[:4] == begin[0][:4] for piece in begin)
-    film._take(packets[1], False)
-    film.add(b"marks")
-    assert film.since(number) == ([encoder.header + packets[1].data, b"marks"], number + 2)
+    recording._take(packets[1], False)
+    recording.add(b"marks")
+    assert recording.since(number) == ([encoder.header + packets[1].data, b"marks"], number + 2)
     for _ in range(WHOLE + 1):
-        film._take(packets[0], False)
-    again, following = film.since(0)
+        recording._take(packets[0], False)
+    again, following = recording.since(0)
     assert len(again) == 2, "what was missed is not made up for: a whole frame, and what it relies on"
-    assert film.since(following) == ([], following)
+    assert recording.since(following) == ([], following)

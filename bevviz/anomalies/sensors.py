@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bevviz.anomalies.placement import PlacementWatch
+from bevviz.anomalies.calibration_drift import PlacementWatch
+from bevviz.anomalies.mounting_changes import MountingWatch, ScanShape
 from bevviz.anomalies.sensor_faults import ImageWatch, ScanWatch, SensorFault
-from bevviz.anomalies.turns import MountingWatch, ScanShape
 from bevviz.model.frame import Cloud, Frame
 from bevviz.model.results import Anomaly, FrameResult
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import Connection
 
-from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message, unpack
+from bevviz.bags.compression import unpack
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
 

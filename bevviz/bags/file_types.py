@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from backports import zstd
 from rosbags.interfaces import Connection
 
 from bevviz.bags import mcap, pcap, ros1, sqlite
 from bevviz.bags.chunks import ChunkReader
+from bevviz.bags.compression import ZSTD, unpack_file
 from bevviz.bags.reader import (
     LAST_TIME,
-    PIECE,
-    ZSTD,
     DamageError,
-    FileBytes,
     Message,
     Reader,
     UnindexedError,
@@ -31,14 +27,11 @@ from bevviz.datasets.cloud_files import CLOUDS
 from bevviz.datasets.dataset import IMAGES, UNREAD
 from bevviz.errors import UserError
 from bevviz.model.frame import I64
-from bevviz.support import progress
 from bevviz.support.files import LFS_HINT, LFS_POINTER
 from bevviz.support.loggers import logger
 from bevviz.support.scratch_folder import ScratchFolder
 
 _log = logger(__name__)
-
-ZSTD_FRAME = re.compile(re.escape(ZSTD))
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,37 +288,6 @@ def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -
             f"{megabytes(target.stat().st_size)} could be unpacked"
         )
     return target
-
-
-def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
-    """Unpack a zstd file. After damage, go on at the next frame.
-
-    Returns:
-        Number of damaged places, and whether the last frame is complete.
-    """
-    source, damaged, stream = FileBytes(path), 0, zstd.ZstdDecompressor()
-    bar = progress.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
-    try:
-        with target.open("wb") as out, bar:
-            offset = 0
-            while offset < source.size:
-                # The decompressor drops its output for the piece with the damage, so pieces are small.
-                piece = source.read(offset, PIECE)
-                try:
-                    out.write(stream.decompress(piece))
-                    offset += len(piece) - len(stream.unused_data)
-                    next_frame = offset if stream.eof else None
-                except zstd.ZstdError:
-                    damaged += 1
-                    next_frame = next(source.search(ZSTD_FRAME, offset + 1), source.size)
-                bar.update(offset - bar.n)
-                if next_frame is not None and next_frame < source.size:
-                    offset, stream = next_frame, zstd.ZstdDecompressor()
-                elif next_frame is not None:
-                    break
-    finally:
-        source.close()
-    return damaged, stream.eof
 
 
 def find_saved_bag(path: Path) -> Path:

@@ -16,7 +16,8 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
-from bevviz.bags.reader import LONGEST, ZSTD, normalized
+from bevviz.bags.compression import LONGEST, ZSTD
+from bevviz.bags.reader import normalized
 from bevviz.errors import first_line
 from bevviz.messages import definitions, foxglove
 from bevviz.messages.decoders import MessageError, read_header

@@ -29,7 +29,7 @@ from bevviz.stages.edges import (
     shrink,
     undistort,
 )
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 CELLS = (8, 4)  # parts of the image along u and v; the edges of one part have the same errors
 PIXELS = 500_000  # larger images are scaled down to this size

@@ -29,7 +29,7 @@ from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.evaluate.metrics import Limit
-    from bevviz.fleet.cluster import Cluster
+    from bevviz.fleet.dask_jobs import Cluster
     from bevviz.fleet.jobs import Job, JobResults
     from bevviz.fleet.processes import Processes
     from bevviz.fleet.table import RunInfo
@@ -193,7 +193,7 @@ def _execute(
     with ExitStack() as stack:
         engine: Cluster | Processes
         if options.dask:
-            from bevviz.fleet.cluster import Cluster
+            from bevviz.fleet.dask_jobs import Cluster
 
             engine = stack.enter_context(Cluster(options.dask))
         else:

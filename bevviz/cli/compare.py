@@ -123,7 +123,7 @@ def _run(
     from bevviz.compare.sides import ComparisonRecorder, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
-    from bevviz.pipeline.ahead import working_ahead
+    from bevviz.pipeline.network_prefetch import working_ahead
 
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
 

@@ -145,7 +145,7 @@ def _run(
     """
     from bevviz.anomalies import FailureSummary
     from bevviz.findings.run_table import list_keeper
-    from bevviz.pipeline.ahead import working_ahead
+    from bevviz.pipeline.network_prefetch import working_ahead
     from bevviz.pipeline.session import Session
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.foxglove_server import FoxgloveServer
-    from bevviz.live.frames import Replay
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
     from bevviz.live.source import LiveSource
+    from bevviz.live.source_wrappers import Replay
     from bevviz.live.status import Notes
     from bevviz.model.frame import Frame
     from bevviz.model.protocols import Items
@@ -233,9 +233,9 @@ def _watch_robot(
     server: FoxgloveServer | None,
 ) -> int:
     """Wait for the robot, then run. Publish results and take requests as the options say."""
-    from bevviz.live.frames import warm_up
     from bevviz.live.publish import Publisher, ResultSink, RosTopics
     from bevviz.live.requests import Control, RosRequests, answer_sigusr1
+    from bevviz.live.source_wrappers import warm_up
     from bevviz.live.status import Diagnostics
 
     def refuse(path: Path | None = None) -> Path:
@@ -301,7 +301,7 @@ def _watch_robot(
 
 def _replay(frames: int) -> Replay:
 
-    from bevviz.live.frames import Replay
+    from bevviz.live.source_wrappers import Replay
     from bevviz.synthetic import SyntheticSource
 
     source = SyntheticSource(frames=frames)

@@ -58,7 +58,7 @@ def process(
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.evaluate.marks import MarkRecorder
-    from bevviz.pipeline.ahead import working_ahead
+    from bevviz.pipeline.network_prefetch import working_ahead
     from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()

@@ -16,7 +16,7 @@ import numpy as np
 
 from bevviz.config.files import parse_yaml
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in, subfolders
-from bevviz.datasets.kitti import (
+from bevviz.datasets.kitti_files import (
     MIN_FOCAL,
     Calibration,
     named_rows,

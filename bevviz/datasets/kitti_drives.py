@@ -32,7 +32,7 @@ from bevviz.datasets.dataset import (
     read_table,
     subfolders,
 )
-from bevviz.datasets.kitti import (
+from bevviz.datasets.kitti_files import (
     Calibration,
     boxes_of,
     named_rows,

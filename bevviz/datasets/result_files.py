@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
-from bevviz.datasets.kitti import Calibration, labelled_boxes
+from bevviz.datasets.kitti_files import Calibration, labelled_boxes
 from bevviz.datasets.nuscenes import pose_of
 from bevviz.errors import UserError, first_line
 from bevviz.messages.topics import Topic

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from bevviz.errors import first_line
 from bevviz.model.frame import F64, I64, U8
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 MAGIC = b"CLOUDINI_V"
 CHUNK = 32 * 1024  # points of a chunk

@@ -20,7 +20,7 @@ from bevviz.evaluate.matching import AcceptedNames, accepts
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import FrameResult
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 RECALL_POINTS = 40
 COUNTS, IGNORED, OTHER = 0, 1, -1  # role of a label or detection for a class and difficulty

@@ -18,10 +18,10 @@ from bevviz.evaluate.ground_truth import Truth, truth_source
 from bevviz.evaluate.matching import AcceptedNames, judge
 from bevviz.fleet.causes import Cause, Findings
 from bevviz.fleet.findings import judged_findings
+from bevviz.fleet.parameter_search import Settings, search
 from bevviz.model.frame import F64, Bool, Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants
-from bevviz.sweep.search import Settings, search
 from bevviz.why import FrameExplainer
 from bevviz.why.false_objects import false_reasons
 

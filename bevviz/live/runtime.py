@@ -18,13 +18,13 @@ from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import BagSaver, RecordingSaver, free_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
-from bevviz.live.frames import ThinnedSource, warm_up
 from bevviz.live.indexing import Indexer
 from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
 from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.robot_comparison import RobotComparison
+from bevviz.live.source_wrappers import ThinnedSource, warm_up
 from bevviz.live.status import Health, Notes, set_nice
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer

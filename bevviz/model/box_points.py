@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 CELLS = 64  # cells along each side of the grid in which rectangles are looked up; the last holds the edge
 ROUNDING = 1e-3  # metres

@@ -35,7 +35,7 @@ from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages import robot_results, user_stages
 from bevviz.stages.bev import bev
 from bevviz.stages.clustering import cluster
-from bevviz.stages.frustum import claim_clusters
+from bevviz.stages.frustum_fusion import claim_clusters
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import no_ground, segment_ground
 from bevviz.stages.opinions import opinions
@@ -43,7 +43,7 @@ from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
-from bevviz.support.kernel import common_clock, thread_clock
+from bevviz.support.numba_kernel import common_clock, thread_clock
 
 LEAST_SCORE = 0.01  # of candidates that are decoded, so that configurations and runs can share them
 

@@ -11,7 +11,7 @@ from bevviz.config import Config
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.support import progress
-from bevviz.support.kernel import thread_clock
+from bevviz.support.numba_kernel import thread_clock
 
 FIRST_FRAMES = 100  # frames that are checked without an option
 FIRST_SECONDS = 2.0  # seconds after which that check ends

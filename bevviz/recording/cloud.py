@@ -24,7 +24,7 @@ from bevviz.recording.retention import RawCloud
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support.colors import UNNAMED, palette, turbo
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 
 def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:

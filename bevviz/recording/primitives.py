@@ -19,7 +19,7 @@ from bevviz.recording.entities import ClassId
 from bevviz.recording.writer import Writer
 from bevviz.stages.visibility import image_points
 from bevviz.support.colors import CONTEXT, FAINT, GROUND, UNNAMED, turbo
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 OUTLINE = rr.components.FillMode.MajorWireframe

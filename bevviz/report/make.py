@@ -22,7 +22,7 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Camera, Frame, Scene
 from bevviz.model.protocols import Observer
 from bevviz.model.results import Detections, FrameResult
-from bevviz.pipeline.ahead import working_ahead
+from bevviz.pipeline.network_prefetch import working_ahead
 from bevviz.pipeline.notes import Note
 from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
@@ -46,7 +46,6 @@ from bevviz.report.bag_window import (
     open_window,
     unchanged,
 )
-from bevviz.report.cause import LISTED, TriedValues, answer_text, cause_of, explain_subject
 from bevviz.report.facts import (
     Facts,
     ReportInfo,
@@ -59,6 +58,7 @@ from bevviz.report.facts import (
 from bevviz.report.fingerprints import digest, pack
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
+from bevviz.report.report_subject import LISTED, TriedValues, answer_text, cause_of, explain_subject
 from bevviz.report.result_topics import result_messages, without_result_files
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector

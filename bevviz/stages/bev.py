@@ -16,7 +16,7 @@ from bevviz.model.frame import F32, I32, U8, Bool, Boxes3D
 from bevviz.model.geometry import corners
 from bevviz.model.results import Bev, Clusters, Objects
 from bevviz.support.colors import class_color, turbo
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of the occupancy channel, as in nav_msgs/OccupancyGrid
 

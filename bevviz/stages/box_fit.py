@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from bevviz.model.frame import F64, I64
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 HEADINGS = 36  # headings tried in a half turn; then every degree near the best
 STRAY_SHARE = 0.02  # share of the points that may lie outside on each side

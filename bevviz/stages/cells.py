@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevviz.model.frame import F32, F64, I32, I64
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 DIGIT_BITS = 11  # bits per pass of the radix sort; the counters of one pass fit into the first cache
 

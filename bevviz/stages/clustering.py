@@ -12,7 +12,7 @@ from bevviz.config import ClusteringConfig
 from bevviz.model.frame import F32, F64, I32, I64, Boxes3D
 from bevviz.model.results import Clusters, ClusterState
 from bevviz.stages.cells import cell_keys, sort_by, sort_by_key
-from bevviz.support.kernel import kernel, unordered_kernel
+from bevviz.support.numba_kernel import kernel, unordered_kernel
 
 MIN_SIZE = 0.01  # metres: no side of a box is shorter, so that each box has a volume and can be drawn and hit
 

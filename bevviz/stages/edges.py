@@ -22,7 +22,7 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, RING_FIELDS, U8, Bool, Cloud, Intrinsics
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 NEAREST, FARTHEST = 2.0, 60.0  # metres: the robot itself is nearer; farther edges are wider than a pixel
 ROW = np.radians(0.4)  # radians, height of a row of beams in a cloud without rings

@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.stages.box_fit import fit
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 MARGIN = 0.05  # share of a box's width that is searched on either side of it
 TIGHT_SHARE = 0.15  # share of a box's sides by which the box may be too tight

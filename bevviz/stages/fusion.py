@@ -11,7 +11,7 @@ from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Intrinsics
 from bevviz.model.geometry import apply, iou
 from bevviz.model.results import CameraResult, Claims, Clusters, Decision, Detections, Fusion, Objects, Pairs
 from bevviz.stages.mask_lookup import is_covered
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 # Weights of the three similarities of a cluster and a detection, each from 0 to 1 (see ``fuse``).
 IOU_WEIGHT, SHARE_WEIGHT, NEARNESS_WEIGHT = 0.6, 0.25, 0.15

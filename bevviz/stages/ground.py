@@ -10,7 +10,7 @@ from bevviz.config import GroundConfig
 from bevviz.model.frame import F32, F64, I32, Bool
 from bevviz.model.results import Ground
 from bevviz.stages.cells import sort_by
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 # A ring is sqrt(r^2 + RING_SCALE^2) / RING_COUNT wide: half a metre near the sensor, 4% of the range
 # far away, where the beams are sparse.

@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.model.frame import F32, I32, U8, Bool
 from bevviz.model.results import Masks
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 
 def is_covered(masks: Masks, d: int, uv: F32, margin: float = 0.0) -> Bool:

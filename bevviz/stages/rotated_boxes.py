@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevviz.model.frame import F64, I64, Bool
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 
 @kernel

@@ -10,7 +10,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
 from bevviz.stages.fusion import assign
 from bevviz.stages.rotated_boxes import shared_area
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate
 SAME_PLACE = 0.2  # least intersection over union of a long track with its box, however far the centres are

@@ -6,7 +6,7 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D, Camera
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 CELL_ANGLE = np.float32(np.radians(0.8))  # radians: edge of a cell of the range image
 OCCLUSION_MARGIN = np.float32(0.7)  # metres: a return hides a box if it is at least this much nearer

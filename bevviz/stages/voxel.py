@@ -11,7 +11,7 @@ from bevviz.config import VoxelConfig
 from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import Voxels
 from bevviz.stages.cells import cell_keys, group
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 S = TypeVar("S", bound=np.generic)
 

@@ -10,12 +10,12 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import ClusterState, FrameResult
 from bevviz.stages.visibility import share_in_image
-from bevviz.support.kernel import kernel
-from bevviz.why.belonging import find_candidates, find_reported_object, sort_candidates
+from bevviz.support.numba_kernel import kernel
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence
 from bevviz.why.frame_index import FEW, PART, Fate, FrameIndex
 from bevviz.why.merged_clusters import LOOKED_AT, find_mates, least_distance, separation
 from bevviz.why.subject import IN_VIEW, Subject
+from bevviz.why.subject_matches import find_candidates, find_reported_object, sort_candidates
 
 NEARER = 0.5  # metres by which a return must be nearer to hide the subject
 CORE = 0.8  # share of the directions of a box; an object does not fill the corners of its box

@@ -12,10 +12,10 @@ from bevviz.model import geometry
 from bevviz.model.class_names import DATA_SETS
 from bevviz.model.reasons import Reason, ReasonKind, scored
 from bevviz.model.results import Decision, FrameResult, Objects
-from bevviz.why.belonging import opinion_on
 from bevviz.why.evidence import MOST, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex, detection_subject
 from bevviz.why.subject import points_in_box, single_box
+from bevviz.why.subject_matches import opinion_on
 
 LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
 BARELY = 2.0  # factor on a limit of the fusion within which it accepts an object only just

@@ -17,7 +17,7 @@ from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.visibility import share_in_image
-from bevviz.why.fits import Fits, find_fits
+from bevviz.why.detection_fits import Fits, find_fits
 from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_boxes, single_box
 
 FEW = 3  # fewer points than this count as none

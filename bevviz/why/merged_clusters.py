@@ -10,7 +10,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, I64, Bool
 from bevviz.model.reasons import Scored, scored
 from bevviz.stages.clustering import dbscan
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 from bevviz.why.evidence import MOST
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.subject import LINK, Subject

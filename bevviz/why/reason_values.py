@@ -10,10 +10,10 @@ import numpy as np
 from bevviz.model.decisions import detection_reason, mask_evidence, pair_reason
 from bevviz.model.reasons import Limit, Reason, ReasonKind, Scored, StageOwner, limit, limit_of, scored
 from bevviz.model.results import CameraResult, Decision, FrameResult
-from bevviz.why.belonging import find_fused, opinion_on
 from bevviz.why.evidence import Evidence, camera_and_fusion
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import Subject
+from bevviz.why.subject_matches import find_fused, opinion_on
 
 _OWN_LIMIT = {  # section of a stage whose parameter decides only if the stage is ours
     ReasonKind.GROUND: "ground",

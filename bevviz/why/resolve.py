@@ -14,11 +14,11 @@ from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
 from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
-from bevviz.why.belonging import OVERLAP
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import CORE, FEW, Fate, FrameIndex, detection_subject
 from bevviz.why.selection import Selection
 from bevviz.why.subject import IN_VIEW, LINK, NOISE, Subject, projected_box, single_box
+from bevviz.why.subject_matches import OVERLAP
 
 PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
 SPACING = 1.0  # pixels; subjects whose points are this much farther from the pixel may still show there

@@ -11,11 +11,11 @@ import numpy as np
 from bevviz.model.decisions import detection_reason, not_kept_text
 from bevviz.model.reasons import ReasonKind, kind_of, limit, limit_of, scored
 from bevviz.model.results import Decision, DetectionState, Opinion
-from bevviz.why.belonging import find_fused, opinion_on
 from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.reason_values import detector_ran, name_of, not_run
 from bevviz.why.subject import Subject, projected_box
+from bevviz.why.subject_matches import find_fused, opinion_on
 
 _SHOWN = 5  # clusters or candidates listed in a step, at most
 

@@ -8,13 +8,13 @@ from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
-from bevviz.why.belonging import find_fused
 from bevviz.why.confidence import Outcome, rank_outcomes
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
 from bevviz.why.subject import Subject
+from bevviz.why.subject_matches import find_fused
 
 WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 

@@ -252,7 +252,7 @@ class FrameMaker(Protocol):
         """
 
 
-class FilmReader(BufferReader):
+class DriveReader(BufferReader):
     """Reader of a drive. Of one with frames on demand: the rows, then the frames that this page looks at.
 
     Args:

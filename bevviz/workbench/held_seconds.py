@@ -13,8 +13,8 @@ from bevviz.bags.source import BagSource
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.files import write_bag
-from bevviz.live.frames import thin
 from bevviz.live.raw_recorder import RawMessage
+from bevviz.live.source_wrappers import thin
 from bevviz.model.frame import Camera, Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.support.contexts import Closable

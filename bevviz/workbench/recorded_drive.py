@@ -33,9 +33,9 @@ from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_messages import RobotQuestions, object_topics
-from bevviz.workbench.buffers import BufferReader, FilmReader, PageState, Reader, RecordingBuffer
+from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.desk import Attempt, Desk
-from bevviz.workbench.film import Film
+from bevviz.workbench.drive_recording import DriveRecording
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
@@ -98,8 +98,8 @@ class RecordedDrive(Source, Observer[FrameResult]):
         table: place of the list of a whole run. None: it is not kept.
 
     Attributes:
-        film: recording of the drive.
-        lanes: buffers by name: ``film``, the desk of each page, and the runs with other values.
+        recording: recording of the drive.
+        lanes: buffers by name: ``recording``, the desk of each page, and the runs with other values.
         over: whether the run over the drive has ended.
         robot_bag: the bag a third time, for the robot's own chain. None: nobody has asked.
     """
@@ -116,9 +116,9 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self.drive, self.again, self.scans = drive, again, len(drive)
         self._first, self._table = first, table
         self._is_listed = False  # whether the list is that of an earlier run
-        self.film = Film(drive.scene, drive.config, self.again.total)
+        self.recording = DriveRecording(drive.scene, drive.config, self.again.total)
         self._thumbnails = Thumbnails(len(self.again.scans))
-        self.lanes: dict[str, RecordingBuffer] = {"film": self.film.rows}
+        self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
         self._desks = 0  # number of desks until now
         self.over = False
         self._overview: OverviewFrames | None = None  # while it is made
@@ -154,7 +154,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
             self._thread.join(PATIENCE)
         for buffer in self.lanes.values():
             buffer.close()
-        self.film.close()
+        self.recording.close()
         self.drive.close()
         self.again.close()
         with self.following:
@@ -164,7 +164,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
     @property
     def on_demand(self) -> bool:
         """Whether a page gets a frame of the recording only when it looks at it."""
-        return self.film.on_demand
+        return self.recording.on_demand
 
     def objects(self, number: int) -> Objects | None:
         """Return the objects that the run found in a frame."""
@@ -245,8 +245,8 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """Record the next frame of the run. Then wait while a question is being answered."""
         frame = result.frame
         findings = find_findings(self.explainer(result))
-        if self.film.on_demand:
-            self.film.add_numbers(result)
+        if self.recording.on_demand:
+            self.recording.add_numbers(result)
             self._know(frame)
         else:
             self.show(result, findings)
@@ -271,7 +271,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def end(self) -> None:
         """Record the last scalars of the run."""
-        self.film.flush()
+        self.recording.flush()
 
     def wait_for_quiet(self) -> None:
         """Wait until no question is being answered."""
@@ -297,7 +297,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """Return a new desk. A page shows what is on its own desk alone."""
         with self._looking:
             self._desks += 1
-            desk = Desk(f"desk-{self._desks}", self.film.mark_logger, self.film.tried_logger)
+            desk = Desk(f"desk-{self._desks}", self.recording.mark_logger, self.recording.tried_logger)
             self.lanes[desk.lane] = desk.buffer
         return desk
 
@@ -309,7 +309,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
-        self.film.show(result, findings)
+        self.recording.show(result, findings)
         self._know(result.frame)
         if self.opening is None:
             self.opening = result.frame.stamp
@@ -328,7 +328,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     @contextmanager
     def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
-        """Return a context in which a page reads the film, its desk, or a run with other values.
+        """Return a context in which a page reads the recording, its desk, or a run with other values.
 
         Raises:
             UserError: there is no such buffer.
@@ -336,15 +336,15 @@ class RecordedDrive(Source, Observer[FrameResult]):
         buffer = self.lanes.get(lane)
         if buffer is None:
             raise UserError(f"there is no recording '{lane}'")
-        if lane == "film":
-            yield FilmReader(buffer, first, state, self)
+        if lane == "recording":
+            yield DriveReader(buffer, first, state, self)
         else:
             yield BufferReader(buffer, first, state, None if lane.startswith("desk") else lambda _: None)
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
         recorded = self._recorded_at(stamp)
-        return None if recorded is None else self.film.row(recorded[0])
+        return None if recorded is None else self.recording.row(recorded[0])
 
     def version(self, number: int) -> int:
         """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
@@ -358,14 +358,14 @@ class RecordedDrive(Source, Observer[FrameResult]):
             wanted: whether a page waits for it. The run pauses then.
         """
         version = self.version(number)
-        if (piece := self.film.frame(number, version)) is not None:
+        if (piece := self.recording.frame(number, version)) is not None:
             return piece
         try:
             with self.quiet() if wanted else nullcontext():
                 result = self.look(number) if wanted else self.look_aside(number)
                 if (tracks := self._tracks.get(number)) is not None:
                     result = replace(result, tracks=replace(tracks, trail=self._trail(number, tracks)))
-                piece = self.film.draw(result, find_findings(self.explainer(result)), version)
+                piece = self.recording.draw(result, find_findings(self.explainer(result)), version)
         except UserError:  # There is no such frame, or it cannot be read.
             return None
         self._know(result.frame)
@@ -506,7 +506,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
         """Return the selection of a click in a frame: a finding, or see ``select_click``."""
-        rows = self.film.findings_of(number, settings, path)
+        rows = self.recording.findings_of(number, settings, path)
         if instance is not None and 0 <= instance < len(rows):
             return rows[instance].selection
         return select_click(self.look(number, settings), self._tracks.get(number), path, instance, position)
@@ -530,7 +530,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         before, after = self.look(number), self.look(number, settings)
         if attempt is not None:
             attempt.check()
-            self.film.draw_tried(attempt.logger, self.explainer(after), settings, attempt.desk.known)
+            self.recording.draw_tried(attempt.logger, self.explainer(after), settings, attempt.desk.known)
             attempt.logger.flush()
             attempt.desk.add_tried(attempt)
         return before, after

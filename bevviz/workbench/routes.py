@@ -67,7 +67,7 @@ class Site:
             Route("/config.yaml", self.config),
             Route("/report/{number:int}/{name}", self.report),
             Route("/thumbnail/{number:int}", self.thumbnail),
-            WebSocketRoute("/film", self.recording),
+            WebSocketRoute("/recording", self.recording),
             WebSocketRoute("/talk", self.talk),
         ]
         return Guard(Starlette(routes=routes), self._token, self._port)
@@ -154,7 +154,7 @@ class Site:
         if workbench is None:
             await socket.close()
             return
-        lane, text = socket.query_params.get("lane", "film"), socket.query_params.get("from", "0")
+        lane, text = socket.query_params.get("lane", "recording"), socket.query_params.get("from", "0")
         state = PageState()
         with (
             contextlib.suppress(UserError, IndexError),  # The recording is not there, or no longer.

@@ -69,14 +69,14 @@ class RunningRobot(Source):
         live: the live run, before it starts.
 
     Attributes:
-        film: buffer with the newest pieces of the recording.
+        recording: buffer with the newest pieces of the recording.
         findings: findings in the frame that was held last.
     """
 
     def __init__(self, live: Live) -> None:
         super().__init__(live.scene.name, live.session)
         self.live = live
-        self.film = LiveBuffer(live, live.config.live.output_queue)
+        self.recording = LiveBuffer(live, live.config.live.output_queue)
         self.commands = {"hold": self._hold, "list": self._list, "snap": self._snap, "mark": self._mark}
         self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
         self._kept: OrderedDict[int, FrameResult] = OrderedDict()
@@ -96,13 +96,13 @@ class RunningRobot(Source):
         recording.set_log_time_enabled(False)
         self._marks = rr.binary_stream(recording)
         self._marker = FrameLogger(recording, live.config, live.scene)
-        live.attach(self.film, self.observe)
-        self.film.news.listen(self.news.tell)  # There is news while no frame comes, too.
+        live.attach(self.recording, self.observe)
+        self.recording.news.listen(self.news.tell)  # There is news while no frame comes, too.
 
     def close(self) -> None:
         """Close the buffer of the pages, and delete the bags."""
         self._end_list()
-        self.film.close()
+        self.recording.close()
         with self._making:
             while self._bags:
                 self._bags.pop().close()
@@ -138,7 +138,7 @@ class RunningRobot(Source):
     @contextmanager
     def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
         """Return a context in which a page reads the newest pieces. Marks of answers are among them."""
-        with self.film.shown(state) as page:
+        with self.recording.shown(state) as page:
             yield page
 
     # --- frames --------------------------------------------------------------------------------
@@ -227,12 +227,12 @@ class RunningRobot(Source):
     def _show_again(self, number: int) -> None:
         """Send a frame again from the flight recorder, if a page was opened after it."""
         delivered = self._delivered.get(number)
-        if delivered is None or self.film.opened < delivered.logged or number in self._whole:
+        if delivered is None or self.recording.opened < delivered.logged or number in self._whole:
             return
         packets = [packet for packet in self.live.flight.packets() if packet.time <= delivered.logged]
         start = max((row for row, packet in enumerate(packets) if packet.whole), default=len(packets))
         for packet in packets[start:]:
-            self.film.add(self.live.encoder.header + packet.data)
+            self.recording.add(self.live.encoder.header + packet.data)
         if start < len(packets):
             first = packets[start].time
             with self._lock:
@@ -350,7 +350,7 @@ class RunningRobot(Source):
     def mark(self, result: FrameResult, answer: Answer, desk: Desk | None = None) -> None:
         """Mark the object of an answer in every view of all pages."""
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
-        self.film.add(self._marks.read())
+        self.recording.add(self._marks.read())
 
     def try_values(
         self, number: int, settings: Settings, attempt: Attempt | None = None

@@ -9,7 +9,7 @@ from typing import Any
 
 from bevviz.errors import UserError
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
-from bevviz.report.cause import TriedValues
+from bevviz.report.report_subject import TriedValues
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex

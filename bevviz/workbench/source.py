@@ -140,7 +140,7 @@ class Source(Closable):
         """Return a context in which a page reads the recording.
 
         Args:
-            lane: ``film`` for the run, ``desk`` for answers and tried results.
+            lane: ``recording`` for the run, ``desk`` for answers and tried results.
             first: number of pieces that the page has.
             state: state of the page.
         """

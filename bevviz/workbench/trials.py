@@ -169,7 +169,7 @@ class _TrialObserver(Observer[FrameResult]):
 
     def __init__(self, drive: RecordedDrive, trial: Trial, config: Config) -> None:
         self._drive, self._trial = drive, trial
-        self._logger, self._stream = drive.film.tried_logger(config)
+        self._logger, self._stream = drive.recording.tried_logger(config)
         self._reasons = drive.findings.reasons()
 
     def observe(self, result: FrameResult) -> None:
@@ -177,8 +177,8 @@ class _TrialObserver(Observer[FrameResult]):
         drive, trial, frame = self._drive, self._trial, result.frame
         before, truth = drive.objects(frame.index), drive.truth(frame)
         explainer = drive.explainer(result)
-        if not drive.film.on_demand:  # Else a page tries the values on the frames that it shows.
-            drive.film.draw_tried(self._logger, explainer, trial.settings)
+        if not drive.recording.on_demand:  # Else a page tries the values on the frames that it shows.
+            drive.recording.draw_tried(self._logger, explainer, trial.settings)
         side_effects = effects(before, result.objects, explainer.traces.truth)
         findings = list(difference_findings(explainer, side_effects, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)

@@ -14,7 +14,7 @@ from bevviz.model.results import (
     Detections,
     Splits,
 )
-from bevviz.stages.frustum import claim_clusters
+from bevviz.stages.frustum_fusion import claim_clusters
 
 K = np.array([[300.0, 0, 320], [0, 300, 180], [0, 0, 1]])
 CAMERA = Intrinsics(640, 360, K)

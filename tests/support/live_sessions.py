@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.frames import Replay
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
+from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource

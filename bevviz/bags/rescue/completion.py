@@ -15,8 +15,8 @@ from mcap.records import Channel, Chunk, Header, Message, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
+from bevviz.bags.compression import unpack
 from bevviz.bags.mcap import CHANNEL, CHUNK, DATA_END, MAGIC, MESSAGE, RECORD, SCHEMA
-from bevviz.bags.reader import unpack
 from bevviz.errors import UserError, first_line
 from bevviz.support.files import lock_file, write_all
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevviz.model.frame import F32, I32, I64
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 
 def nms(xyxy: F32, class_id: I32, threshold: float, class_offset: float = 0.0) -> tuple[I32, F32]:

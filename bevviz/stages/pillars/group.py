@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.config.pillars import Feature
 from bevviz.model.frame import F32, F64, I32
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,30 +18,30 @@ const pieces = new Map(); // number of pieces that the viewer has received of ea
 const counted = (lane) => pieces.get(lane) ?? 0;
 let early = 0; // number of frames that were requested out of order
 let held = 0; // bytes of frames on demand that the viewer holds
-let film = null; // socket of the run
+let recording = null; // socket of the run
 let desk = ""; // name of this page's answers and tried results; a robot has none
 const others = new Map(); // sockets of the desk, and of runs with other values
 
 // Request the frame of this stamp next, if the viewer does not have it yet.
 export function want(stamp) {
-  if (film?.readyState !== WebSocket.OPEN) return;
+  if (recording?.readyState !== WebSocket.OPEN) return;
   if (!state.demand) early += 1;
-  film.send(String(stamp));
+  recording.send(String(stamp));
 }
 
 // Receive the recording of a run with other values, because its settings are shown.
 export function follow(lane) {
-  if (counted("film") && !others.has(lane)) others.set(lane, receive(lane)); // The layout has to arrive first.
+  if (counted("recording") && !others.has(lane)) others.set(lane, receive(lane)); // The layout has to arrive first.
 }
 
 function receive(lane) {
-  const first = counted(lane) - Math.min(counted(lane), lane === "film" ? early : 0);
-  const socket = socketAt(`/film?lane=${lane}&from=${first}`);
+  const first = counted(lane) - Math.min(counted(lane), lane === "recording" ? early : 0);
+  const socket = socketAt(`/recording?lane=${lane}&from=${first}`);
   socket.binaryType = "arraybuffer";
   let announced = null; // number of the frame on demand that comes next
   socket.onmessage = ({ data }) => {
     if (typeof data === "string") { announced = Number(data); return; }
-    if (!counted("film")) performance.mark("piece");
+    if (!counted("recording")) performance.mark("piece");
     toViewer({ type: "rrd" }, [new DataView(data)]);
     if (announced === null) pieces.set(lane, counted(lane) + 1);
     else {
@@ -55,15 +55,15 @@ function receive(lane) {
     if (desk) follow(desk);
     if (!lane.startsWith("desk")) nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
-  if (lane === "film" && state.demand) socket.onopen = () => want(state.time);
+  if (lane === "recording" && state.demand) socket.onopen = () => want(state.time);
   if (kind === "live") { // A page in the background draws nothing, and does not count as slow.
     socket.onopen = () => { if (document.hidden) socket.send("hidden"); };
   }
   return socket;
 }
 document.addEventListener("visibilitychange", () => {
-  if (kind === "live" && film?.readyState === WebSocket.OPEN) {
-    film.send(document.hidden ? "hidden" : "seen");
+  if (kind === "live" && recording?.readyState === WebSocket.OPEN) {
+    recording.send(document.hidden ? "hidden" : "seen");
   }
 });
 
@@ -76,13 +76,13 @@ export function connect() {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
       desk = message.desk;
-      viewerReady.then(() => { film = receive("film"); });
+      viewerReady.then(() => { recording = receive("recording"); });
     } else if (message.type === "failed") alarm(message.text);
     else if (message.type === "error") (failures.get(message.id) ?? handlers.error)(message);
     else handlers[message.type]?.(message);
   };
   questions.onclose = () => {
-    for (const socket of [film, ...others.values()]) socket?.close();
+    for (const socket of [recording, ...others.values()]) socket?.close();
     others.clear();
     handlers.gone?.();
     if (!$("gone").textContent) alarm("The server is gone: nothing is answered until it is back. Looking for it ...");

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Any
 
+from bevviz.fleet.bag_job import run
 from bevviz.fleet.jobs import Job, JobResult, JobResults
-from bevviz.fleet.work import run
-from bevviz.pipeline.cluster import connect
+from bevviz.pipeline.dask_frames import connect
 from bevviz.support.contexts import Closable
 
 WAITING = 2  # jobs for each thread of the cluster, so that no thread has to wait for the next one

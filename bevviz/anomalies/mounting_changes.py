@@ -18,7 +18,7 @@ import numpy as np
 from bevviz.anomalies.sensor_faults import SensorFault
 from bevviz.model.frame import F32, F64, I64, U8, Camera
 from bevviz.model.results import FrameResult
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 BINS = 360  # directions in which the range is compared
 BANDS = (20, 33, 46, 59, 72, 85, 98)  # percentiles of the elevations that bound the bands of a scan

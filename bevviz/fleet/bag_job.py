@@ -23,8 +23,8 @@ from bevviz.fleet.jobs import PARTIAL, Job, JobResult
 from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.ahead import has_networks, working_ahead
 from bevviz.pipeline.frame_workers import with_threads
+from bevviz.pipeline.network_prefetch import has_networks, working_ahead
 from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
 from bevviz.recording.recorder import DiskWatch, Recorder

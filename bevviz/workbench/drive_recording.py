@@ -27,7 +27,7 @@ TOGETHER = 50, 800  # frames whose numbers are sent together: the first ones, an
 BOTH = (entities.STAMP, entities.TRIED)
 
 
-class Film(Closable):
+class DriveRecording(Closable):
     """Recording of a drive.
 
     A frame of the drive as opened is logged on the timelines ``stamp`` and ``tried``. One with other values

@@ -27,7 +27,7 @@ from bevviz.stages.edges import (
     shrink,
     undistort,
 )
-from bevviz.support.kernel import kernel
+from bevviz.support.numba_kernel import kernel
 
 EVERY = 10  # frames from one check to the next, each of one camera with one LiDAR
 PAST = 6  # checks that are judged together: 6 s at 10 Hz with one camera

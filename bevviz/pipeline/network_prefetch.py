@@ -11,7 +11,7 @@ from bevviz.config import Config, object_network_params
 from bevviz.config.plugins import TOPIC, is_user_function
 from bevviz.model.frame import Frame
 from bevviz.model.protocols import Processor
-from bevviz.pipeline.cluster import ClusterFrames
+from bevviz.pipeline.dask_frames import ClusterFrames
 from bevviz.pipeline.frame_workers import FrameParts, FrameWorkers
 from bevviz.pipeline.result_store import open_store
 from bevviz.support import progress
