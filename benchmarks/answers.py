@@ -19,7 +19,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from benchmarks.journey import ANSWER, CHANGES, FRAMES, PICTURE, demo, serving
@@ -39,16 +39,14 @@ class Page:
         parts = urlsplit(address)
         self._number = 0
         self.sights: list[tuple[int, str]] = []
-        recording, self._desk, self._talk = (
-            stack.enter_context(
-                connect(
-                    f"ws://{parts.netloc}/{path}&{parts.query}",
-                    origin=Origin(f"http://{parts.netloc}"),
-                    max_size=None,
-                )
-            )
-            for path in ("recording?lane=recording", "recording?lane=desk", "talk?")
-        )
+
+        def opened(path: str) -> ClientConnection:
+            url, origin = f"ws://{parts.netloc}/{path}&{parts.query}", Origin(f"http://{parts.netloc}")
+            return stack.enter_context(connect(url, origin=origin, max_size=None))
+
+        self._talk = opened("talk?")
+        lane = self._next("welcome")["overlay"]
+        recording, self._overlay = (opened(f"recording?lane={name}") for name in ("recording", lane))
         recording.recv(timeout=WAIT)
         self.first = time.monotonic()
         self._talk.send(json.dumps({"id": 0, "type": "shown"}))
@@ -64,11 +62,11 @@ class Page:
         while answer["id"] != self._number:
             answer = self._next(kind)
         if drawn:
-            self._desk.recv(timeout=WAIT)
+            self._overlay.recv(timeout=WAIT)
         seconds = time.monotonic() - start
         while not drawn:  # what is marked is not what is waited for
             try:
-                self._desk.recv(timeout=0.05)
+                self._overlay.recv(timeout=0.05)
             except TimeoutError:
                 break
         return seconds

@@ -10,16 +10,19 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 import bevviz
+from bevviz.anomalies.detector import AnomalyDetector
 from bevviz.cli import main
-from bevviz.config import load
+from bevviz.config import Config, load
 from bevviz.drive import Drive
 from bevviz.findings.finding_list import CELL, FindingFrame, FindingList
 from bevviz.findings.frame_findings import Finding
 from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
+from bevviz.model.results import FrameResult
 from bevviz.pipeline import result_store
 from bevviz.pipeline.run import run
 from bevviz.recording import entities
@@ -28,6 +31,7 @@ from bevviz.workbench import drive_recording, recorded_drive
 from bevviz.workbench.buffers import FrameCache, PageState
 from bevviz.workbench.overview import STEP, overview_order
 from bevviz.workbench.recorded_drive import RecordedDrive
+from tests.support.logged_frames import frame_with_image
 from tests.support.waiting import until
 from tests.support.workbench_pages import FRAMES, demo_bag
 
@@ -93,6 +97,26 @@ def test_findings_of_single_frames_end_where_the_run_comes() -> None:
     listed.add([finding(3, 1, 3.0)])
     assert groups(listed)[-1] == [3]
     assert [0, 8] not in groups(listed) and [CELL, CELL + 8] in groups(listed)
+
+
+def test_an_overview_lists_images_that_show_nothing() -> None:
+    """A covered camera is listed once within each part of the drive, from frames far apart."""
+    image = np.random.default_rng(1).integers(0, 255, (90, 160, 3), np.uint8)
+    detector, listed, config = AnomalyDetector(), FindingList(), Config()
+    for number in overview_order(8 * CELL):
+        covered = 2 * CELL <= number < 4 * CELL
+        frame = frame_with_image(number, np.zeros_like(image) if covered else image)
+        anomalies = detector.update_alone(FrameResult.unprocessed(frame, config), config.anomalies)
+        assert [(a.kind, a.subject) for a in anomalies] == (
+            [("sensor", "camera front: black image")] if covered else []
+        )
+        listed.add_overview_anomalies(number, frame.stamp, anomalies)
+    found = [(kind, name, [one.text for one in frames]) for kind, name, frames in listed.content()]
+    text = "camera front: black image, mean grey value 0"
+    assert [(kind, name) for kind, name, _ in found] == 2 * [("anomaly", "sensor")]
+    assert all(texts[0].startswith(text) for _, _, texts in found)
+    listed.end_overview(8 * CELL)
+    assert not listed.content()
 
 
 def test_the_run_replaces_the_overview(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -845,14 +845,14 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
         bench = RecordedDrive(drive, again.frames)
         session = WorkbenchSession(bench)
         bench.observe(drive.at(frame=0))
-        desk, other = bench.open_desk(), bench.open_desk()
-        told = session.try_values(0, ("clustering.min_cluster_points=100000",), attempt=desk.attempt())
-        recoloured = session.try_values(0, ("ground.distance_threshold=0.5",), attempt=desk.attempt())
-        session.try_values(0, ("detector.conf_threshold=0.9",), attempt=desk.attempt())
+        overlay, other = bench.open_overlay(), bench.open_overlay()
+        told = session.try_values(0, ("clustering.min_cluster_points=100000",), attempt=overlay.attempt())
+        recoloured = session.try_values(0, ("ground.distance_threshold=0.5",), attempt=overlay.attempt())
+        session.try_values(0, ("detector.conf_threshold=0.9",), attempt=overlay.attempt())
         result = drive.at(frame=0)
         pieces = [
             recording[row]
-            for recording in (bench.recording.rows, desk.buffer)
+            for recording in (bench.recording.rows, overlay.buffer)
             for row in range(len(recording))
         ]
         assert len(other.buffer) == 0, "another page shows nothing of it"
@@ -885,14 +885,14 @@ def test_a_stopped_try_shows_nothing(bag: Path) -> None:
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         bench = RecordedDrive(drive, again.frames)
         bench.observe(drive.at(frame=0))
-        desk = bench.open_desk()
-        attempt = desk.attempt()
-        desk.stop()
+        overlay = bench.open_overlay()
+        attempt = overlay.attempt()
+        overlay.stop()
         with pytest.raises(UserError, match="cancelled"):
-            desk.add_tried(attempt)
-        assert len(desk.buffer) == 0
-        bench.try_values(0, ("clustering.eps=0.9",), desk.attempt())
-        assert len(desk.buffer) == 1
+            overlay.add_tried(attempt)
+        assert len(overlay.buffer) == 0
+        bench.try_values(0, ("clustering.eps=0.9",), overlay.attempt())
+        assert len(overlay.buffer) == 1
         bench.close()
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from bevviz.errors import UserError
-from bevviz.model.frame import Camera, Frame, Image
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.workbench.thumbnails import MOST, WIDTH, Thumbnails
+from tests.support.logged_frames import frame_with_image
 from tests.support.workbench_pages import (
     FRAMES,
     chromium,
@@ -250,20 +250,13 @@ def test_thumbnails_are_bounded() -> None:
     """A long drive has one for each of its parts, the first frame of the part that came."""
     thumbnails = Thumbnails(10 * MOST)
     for number in range(0, 10 * MOST, 3):
-        thumbnails.add(pictured_frame(number))
+        thumbnails.add(frame_with_image(number, np.full((2 * WIDTH, 4 * WIDTH, 3), number % 256, np.uint8)))
     shown = [thumbnails.near(number) for number in range(10 * MOST)]
     assert len({id(picture) for picture in shown}) == MOST
     picture = cv2.imdecode(np.frombuffer(shown[25] or b"", np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None and picture.shape == (WIDTH // 2, WIDTH, 3)
     assert abs(picture.mean() - 21) < 2  # frames 20 to 29 are a part
     assert Thumbnails(10).near(3) is None
-
-
-def pictured_frame(number: int) -> Frame:
-    """Return a frame whose image is as grey as its number."""
-    bgr = np.full((2 * WIDTH, 4 * WIDTH, 3), number % 256, np.uint8)
-    camera = Camera("front", Image(0, "front", bgr), None, None, None)
-    return Frame(number, number, 0, "", np.zeros((0, 3), np.float32), "base", cameras=(camera,))
 
 
 def test_a_shared_link_opens_on_another_machine(

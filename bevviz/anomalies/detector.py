@@ -64,6 +64,16 @@ class AnomalyDetector:
         }
         return tuple(sorted((anomaly for anomaly, _ in self._active.values()), key=lambda a: -a.rank))
 
+    def update_alone(self, result: FrameResult, config: AnomaliesConfig) -> tuple[Anomaly, ...]:
+        """Return the anomalies of a frame that does not follow the frame before, worst first."""
+        anomalies = [
+            *self._sensors.update_alone(result.frame),
+            *self._clocks(result, config),
+            *self._transforms(result, config),
+            *_stages(result, config),
+        ]
+        return tuple(sorted(anomalies, key=lambda anomaly: -anomaly.rank))
+
     def _found(self, result: FrameResult, config: AnomaliesConfig) -> Iterator[Anomaly]:
         """Yield the anomalies of this frame from every rule."""
         if result.tracks is not None:

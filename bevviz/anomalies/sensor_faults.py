@@ -64,6 +64,11 @@ class ImageWatch:
             self._image, self.gray = image, gray
         return self._faults
 
+    def update_alone(self, image: Image) -> SensorFault | None:
+        """Return the fault of an image that shows nothing. It does not follow the image before."""
+        self._dim_since = None
+        return next(self._exposure(image.stamp, _small(image.bgr)), None)
+
     def _repetition(self, image: Image, gray: U8) -> Iterator[SensorFault]:
         """Yield a frozen image, or the image after one that came twice."""
         before = self._image

@@ -42,6 +42,15 @@ class SensorWatch:
             text = f"{name} since {1e-9 * (fault.since - self._start):.1f} s{fault.detail}"
             yield Anomaly("sensor", name, text, "ERROR", fault.since, fault.rank)
 
+    def update_alone(self, frame: Frame) -> Iterator[Anomaly]:
+        """Yield the cameras whose image shows nothing. The frame does not follow the frame before."""
+        for camera in frame.cameras:
+            watch = self._images.setdefault(camera.name, ImageWatch(f"camera {camera.name}"))
+            fault = None if camera.image is None else watch.update_alone(camera.image)
+            if fault is not None:
+                name = f"{fault.sensor}: {fault.name}"
+                yield Anomaly("sensor", name, f"{name}{fault.detail}", "ERROR", fault.since, fault.rank)
+
     def _faults(self, result: FrameResult) -> Iterator[SensorFault]:
         """Yield the faults that each rule finds in this frame."""
         frame = result.frame

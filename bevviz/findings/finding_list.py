@@ -81,6 +81,7 @@ class FindingGroup:
     frames: list[FindingFrame] = field(default_factory=list)
     position: Position | None = None  # position in the last frame
     box: F32 | None = None
+    subject: str = ""  # of an anomaly
 
 
 class FindingList:
@@ -119,6 +120,14 @@ class FindingList:
                 if near is None:
                     groups.append(near := self._new(*kind))
                 self._extend(near, finding, taken_groups)
+
+    def add_overview_anomalies(self, frame: int, stamp: int, anomalies: Sequence[Anomaly]) -> None:
+        """Add the anomalies of a single frame, once within ``CELL`` frames, until ``end_overview``."""
+        with self._lock:
+            groups = self._overview.setdefault(frame // CELL, [])
+            for anomaly in anomalies:
+                if not any((one.what, one.subject) == ("anomaly", anomaly.subject) for one in groups):
+                    groups.append(self._new_anomaly(frame, stamp, anomaly))
 
     def end_overview(self, frame: int) -> None:
         """Remove the findings of single frames up to the cell of a frame. The run in order has reached it."""
@@ -166,11 +175,13 @@ class FindingList:
         """Add the anomalies that begin in a frame."""
         with self._lock:
             for anomaly in anomalies:
-                kind = anomaly.kind.replace("_", " ")
-                finding_frame = FindingFrame(
-                    frame, stamp, math.nan, "", text=anomaly.text, remark=ANOMALIES[anomaly.kind]
-                )
-                self._new("anomaly", kind).frames.append(finding_frame)
+                self._new_anomaly(frame, stamp, anomaly)
+
+    def _new_anomaly(self, frame: int, stamp: int, anomaly: Anomaly) -> FindingGroup:
+        group = self._new("anomaly", anomaly.kind.replace("_", " "))
+        group.subject, remark = anomaly.subject, ANOMALIES[anomaly.kind]
+        group.frames.append(FindingFrame(frame, stamp, math.nan, "", text=anomaly.text, remark=remark))
+        return group
 
     def content(self) -> list[tuple[str, str, list[FindingFrame]]]:
         """Return kind, name and frames of each group."""

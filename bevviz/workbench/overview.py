@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
+from bevviz.anomalies.detector import AnomalyDetector
 from bevviz.model.frame import Frame, Scene
 from bevviz.model.protocols import FrameSource
 from bevviz.model.results import FrameResult
@@ -57,19 +59,20 @@ class OverviewFrames:
 
 
 class SingleFrames:
-    """Processor of frames in any order, without tracks and anomalies, which need the frames before.
+    """Processor of frames in any order, without tracks and the anomalies that need the frames before.
 
     Args:
         session: session with the configuration and the networks.
     """
 
     def __init__(self, session: Session) -> None:
-        self._session = session
+        self._session, self._anomalies = session, AnomalyDetector()
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """Run the stages on a frame."""
         return perceive(frame, self._session.config, self._session.stages, network=network)
 
     def finish(self, result: FrameResult) -> FrameResult:
-        """Add the explanations to a result."""
-        return add_explanations(result, seen=False)
+        """Add the explanations and anomalies to a result."""
+        result = add_explanations(result, seen=False)
+        return replace(result, anomalies=self._anomalies.update_alone(result, result.config.anomalies))

@@ -39,22 +39,22 @@ class PageConnection:
     Args:
         workbench: the workbench session that the page asks.
         socket: an accepted socket.
-        desk: executor with one thread that answers the questions of all pages in turn.
+        questions: executor with one thread that answers the questions of all pages in turn.
         run: id of this run of the server.
     """
 
     def __init__(
-        self, workbench: WorkbenchSession, socket: WebSocket, desk: ThreadPoolExecutor, run: str
+        self, workbench: WorkbenchSession, socket: WebSocket, questions: ThreadPoolExecutor, run: str
     ) -> None:
         self._workbench, self._source = workbench, workbench.source
-        self._socket, self._desk, self._run = socket, desk, run
+        self._socket, self._questions, self._run = socket, questions, run
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._newest = 0  # of all messages
         self._asked = 0  # of the questions
         self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
         self._remarking = False
-        self._page_desk = self._source.open_desk()
+        self._overlay = self._source.open_overlay()
         self._tries = ThreadPoolExecutor(1, "tries")  # A slow try keeps no other question waiting.
         self._trying = 0  # number of the try in progress
         self._handlers = {
@@ -89,8 +89,8 @@ class PageConnection:
                     task.cancel()
                 self._stop_try()
                 self._tries.shutdown(wait=False)
-                if self._page_desk is not None:
-                    self._source.close_desk(self._page_desk)
+                if self._overlay is not None:
+                    self._source.close_overlay(self._overlay)
 
     # --- messages to the page ------------------------------------------------------------------
 
@@ -103,7 +103,7 @@ class PageConnection:
         return {
             "type": "welcome",
             "run": self._run,
-            "desk": "" if self._page_desk is None else self._page_desk.lane,
+            "overlay": "" if self._overlay is None else self._overlay.lane,
             "bag": source.title,
             "scans": source.scans,
             "truth": source.truth_of is not None,
@@ -193,14 +193,14 @@ class PageConnection:
             description = f"error of bevviz itself: {type(error).__name__}: {first_line(error)}"
             await self._send({"type": "error", "id": number, "text": description})
 
-    async def _at_desk(
+    async def _in_turn(
         self, number: int, work: Callable[[], Any], settings: Settings = (), *, idle: bool = False
     ) -> Any:
         """Run work about a frame on the thread of all pages, or with other values on that of this page.
 
         Idle work is skipped once the page has sent a newer message.
         """
-        own_thread = bool(settings) and self._page_desk is not None
+        own_thread = bool(settings) and self._overlay is not None
 
         def job() -> Any:
             if idle and number not in (self._asked, self._newest):
@@ -209,7 +209,7 @@ class PageConnection:
                 return work()
 
         return await asyncio.get_running_loop().run_in_executor(
-            self._tries if own_thread else self._desk, job
+            self._tries if own_thread else self._questions, job
         )
 
     async def _ask(self, number: int, message: Message) -> None:
@@ -246,7 +246,7 @@ class PageConnection:
             tree = {"pick": pick, "found": found, **answer.as_dict(), "beside": list(other_answers(others))}
             return selection, self._source.look(frame, settings), answer, tree
 
-        answered = await self._at_desk(number, work, settings)
+        answered = await self._in_turn(number, work, settings)
         if isinstance(answered, dict):
             await self._send({**answered, **head})
             return
@@ -254,8 +254,8 @@ class PageConnection:
         await self._send({"type": "answer", **head, **tree})
 
         async def follow_up() -> None:
-            await self._at_desk(number, lambda: self._source.mark(result, answer, self._page_desk))
-            hints = await self._at_desk(
+            await self._in_turn(number, lambda: self._source.mark(result, answer, self._overlay))
+            hints = await self._in_turn(
                 number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
             )
             if hints is not None:
@@ -301,18 +301,18 @@ class PageConnection:
         from bevviz.workbench.page_messages import controls
 
         self._stop_try()
-        desk, workbench, settings = self._page_desk, self._workbench, _settings(message)
-        attempt = None if desk is None else desk.attempt()
+        overlay, workbench, settings = self._overlay, self._workbench, _settings(message)
+        attempt = None if overlay is None else overlay.attempt()
         self._trying = number
         try:
             frame, identity = await self._frame(message), _identity(message)
-            effects = await self._at_desk(
+            effects = await self._in_turn(
                 number, lambda: workbench.try_values(frame, settings, identity, attempt), settings
             )
         finally:
             if self._trying == number:
                 self._trying = 0
-        pieces = 0 if desk is None else len(desk.buffer)
+        pieces = 0 if overlay is None else len(overlay.buffer)
         head = {"id": number, "frame": frame, "set": list(settings), "pieces": pieces}
         await self._send({"type": "tried", **head, **effects})
         new_controls = controls(self._source.configured(settings), self._opened)
@@ -325,16 +325,16 @@ class PageConnection:
 
         The old thread ends after the current step and the questions that wait behind the try.
         """
-        if self._trying and self._page_desk is not None:
+        if self._trying and self._overlay is not None:
             self._trying = 0
-            self._page_desk.stop()
+            self._overlay.stop()
             self._tries.shutdown(wait=False)
             self._tries = ThreadPoolExecutor(1, "tries")
 
     async def _settle(self, number: int, message: Message) -> None:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
         frame, settings = await self._frame(message), _settings(message)
-        await self._at_desk(number, lambda: self._source.look(frame, settings), settings, idle=True)
+        await self._in_turn(number, lambda: self._source.look(frame, settings), settings, idle=True)
 
     async def _remark_rows(self, number: int, message: Message) -> None:
         """Send the remarks on the first rows of the page's list, one by one, behind all questions."""
@@ -385,27 +385,27 @@ class PageConnection:
         reports = self._workbench.reports
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._at_desk(number, lambda: reports.begin(frame, settings, before, after, text), settings)
+        await self._in_turn(number, lambda: reports.begin(frame, settings, before, after, text), settings)
 
     async def _note(self, number: int, message: Message) -> None:
         file = self._workbench.tools.notes.path.name
         frame, text, identity = await self._frame(message), str(message["text"]), _identity(message)
-        about = await self._at_desk(
-            number, lambda: self._workbench.note(frame, text, identity, self._page_desk)
+        about = await self._in_turn(
+            number, lambda: self._workbench.note(frame, text, identity, self._overlay)
         )
         said = f"Noted about {about} in frame {frame}."
         await self._send({"type": "noted", "id": number, "file": file, "text": said})
 
     async def _unnote(self, number: int, message: Message) -> None:
         stamp, text = int(message["stamp"]), str(message["text"])
-        await self._at_desk(number, lambda: self._workbench.remove_note(stamp, text))
+        await self._in_turn(number, lambda: self._workbench.remove_note(stamp, text))
 
     async def _handle_finding(self, number: int, message: Message) -> None:
         """Keep that a finding is done or ignored."""
         from bevviz.workbench.page_messages import handled_finding
 
         finding = handled_finding(message)
-        await self._at_desk(number, lambda: self._workbench.handle(finding))
+        await self._in_turn(number, lambda: self._workbench.handle(finding))
 
     def _reply(self, command: Callable[[Message], dict[str, Any]], message: Message) -> dict[str, Any]:
         """Return the reply of the source to one of its commands."""

@@ -34,10 +34,10 @@ from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_messages import RobotQuestions, object_topics
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
-from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.drive_recording import DriveRecording
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
+from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
 from bevviz.workbench.session import DriveTools, WorkbenchSession
 from bevviz.workbench.source import Settings, Source
@@ -99,7 +99,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     Attributes:
         recording: recording of the drive.
-        lanes: buffers by name: ``recording``, the desk of each page, and the runs with other values.
+        lanes: buffers by name: ``recording``, the overlay of each page, and the runs with other values.
         over: whether the run over the drive has ended.
         robot_bag: the bag a third time, for the robot's own chain. None: nobody has asked.
     """
@@ -119,7 +119,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self.recording = DriveRecording(drive.scene, drive.config, self.again.total)
         self._thumbnails = Thumbnails(len(self.again.scans))
         self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
-        self._desks = 0  # number of desks until now
+        self._overlays = 0  # number of overlays until now
         self.over = False
         self._overview: OverviewFrames | None = None  # while it is made
         self._done, self._error = 0, ""
@@ -231,8 +231,10 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def observe_single(self, result: FrameResult) -> None:
         """List the findings of a frame of the overview. Then wait while a question is being answered."""
-        self.findings.add_overview(result.frame.index, find_findings(self.explainer(result)))
-        self._know(result.frame)
+        frame = result.frame
+        self.findings.add_overview(frame.index, find_findings(self.explainer(result)))
+        self.findings.add_overview_anomalies(frame.index, frame.stamp, result.anomalies)
+        self._know(frame)
         self._done += 1
         self.news.tell()
         self.wait_for_quiet()
@@ -293,19 +295,21 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     # --- recording -----------------------------------------------------------------------------
 
-    def open_desk(self) -> Desk:
-        """Return a new desk. A page shows what is on its own desk alone."""
+    def open_overlay(self) -> PageOverlay:
+        """Return a new overlay. A page shows what is on its own overlay alone."""
         with self._looking:
-            self._desks += 1
-            desk = Desk(f"desk-{self._desks}", self.recording.mark_logger, self.recording.tried_logger)
-            self.lanes[desk.lane] = desk.buffer
-        return desk
+            self._overlays += 1
+            overlay = PageOverlay(
+                f"overlay-{self._overlays}", self.recording.mark_logger, self.recording.tried_logger
+            )
+            self.lanes[overlay.lane] = overlay.buffer
+        return overlay
 
-    def close_desk(self, desk: Desk) -> None:
-        """Remove a desk whose page is closed."""
+    def close_overlay(self, overlay: PageOverlay) -> None:
+        """Remove an overlay whose page is closed."""
         with self._looking:
-            self.lanes.pop(desk.lane, None)
-        desk.close()
+            self.lanes.pop(overlay.lane, None)
+        overlay.close()
 
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
@@ -328,7 +332,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     @contextmanager
     def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
-        """Return a context in which a page reads the recording, its desk, or a run with other values.
+        """Return a context in which a page reads the recording, its overlay, or a run with other values.
 
         Raises:
             UserError: there is no such buffer.
@@ -339,7 +343,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         if lane == "recording":
             yield DriveReader(buffer, first, state, self)
         else:
-            yield BufferReader(buffer, first, state, None if lane.startswith("desk") else lambda _: None)
+            yield BufferReader(buffer, first, state, None if lane.startswith("overlay") else lambda _: None)
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
@@ -511,11 +515,11 @@ class RecordedDrive(Source, Observer[FrameResult]):
             return rows[instance].selection
         return select_click(self.look(number, settings), self._tracks.get(number), path, instance, position)
 
-    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None) -> None:
+    def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
         """Mark the object of an answer in every view of a page."""
-        if desk is not None:
-            mark_answers(desk.marker, result.frame, [answer], result.config.bev)
-            desk.add_marks()
+        if overlay is not None:
+            mark_answers(overlay.marker, result.frame, [answer], result.config.bev)
+            overlay.add_marks()
 
     def try_values(
         self, number: int, settings: Settings, attempt: Attempt | None = None
@@ -530,9 +534,9 @@ class RecordedDrive(Source, Observer[FrameResult]):
         before, after = self.look(number), self.look(number, settings)
         if attempt is not None:
             attempt.check()
-            self.recording.draw_tried(attempt.logger, self.explainer(after), settings, attempt.desk.known)
+            self.recording.draw_tried(attempt.logger, self.explainer(after), settings, attempt.overlay.known)
             attempt.logger.flush()
-            attempt.desk.add_tried(attempt)
+            attempt.overlay.add_tried(attempt)
         return before, after
 
 

@@ -55,7 +55,7 @@ class Site:
         self._startup, self._viewer, self._version, self._kind = startup, viewer, version, kind
         self._token, self._port = token, port
         self._run = secrets.token_hex(4)  # A page that reconnects to another run reloads.
-        self._desk = ThreadPoolExecutor(1, "desk")  # One thread answers all questions in turn.
+        self._questions = ThreadPoolExecutor(1, "questions")  # One thread answers all questions in turn.
 
     def application(self) -> ASGIApp:
         """Return the application that serves the page behind its access guard."""
@@ -189,7 +189,7 @@ class Site:
                 error = self._startup.error
                 await socket.send_json({"type": "failed", "text": str(error)})
                 return
-            await PageConnection(workbench, socket, self._desk, self._run).stay()
+            await PageConnection(workbench, socket, self._questions, self._run).stay()
 
 
 async def _listen(socket: WebSocket, state: PageState, event: asyncio.Event) -> None:

@@ -34,9 +34,9 @@ from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_messages import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
+from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportedBag, ReportMaker
 from bevviz.workbench.session import WorkbenchSession
 from bevviz.workbench.source import Message, Settings, Source
@@ -347,7 +347,7 @@ class RunningRobot(Source):
             instance = int(rows[instance]) if instance < len(rows) else None
         return select_click(result, result.tracks, path, instance, position)
 
-    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None = None) -> None:
+    def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None = None) -> None:
         """Mark the object of an answer in every view of all pages."""
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
         self.recording.add(self._marks.read())

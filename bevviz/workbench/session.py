@@ -16,8 +16,8 @@ from bevviz.why.frame_index import FrameIndex
 from bevviz.why.identity import Identity, find, identify
 from bevviz.why.resolve import select_subjects
 from bevviz.why.side_effects import effects
-from bevviz.workbench.desk import Attempt, Desk
 from bevviz.workbench.fix_search import FixSearch
+from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
@@ -257,7 +257,9 @@ class WorkbenchSession(Closable):
 
     # --- notes ---------------------------------------------------------------------------------
 
-    def note(self, number: int, text: str, identity: Identity | None, desk: Desk | None = None) -> str:
+    def note(
+        self, number: int, text: str, identity: Identity | None, overlay: PageOverlay | None = None
+    ) -> str:
         """Save a note about an object, or about the frame if the object is not in it. Return its subject.
 
         Raises:
@@ -267,7 +269,7 @@ class WorkbenchSession(Closable):
         selection = None if identity is None else self.follow(identity, number)[0]
         if selection is not None:
             answer = self.ask(number, (), selection)[0]
-            self.source.mark(result, answer, desk)
+            self.source.mark(result, answer, overlay)
             name = answer.subject.name
             pick = str(self.identity(number, (), selection, answer, identity))
         frame = result.frame

@@ -22,7 +22,7 @@ from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.robot_messages import FollowedObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
-from bevviz.workbench.desk import Attempt, Desk
+from bevviz.workbench.page_overlay import Attempt, PageOverlay
 
 Settings = tuple[str, ...]
 Message = Mapping[str, Any]  # message from the page
@@ -140,7 +140,7 @@ class Source(Closable):
         """Return a context in which a page reads the recording.
 
         Args:
-            lane: ``recording`` for the run, ``desk`` for answers and tried results.
+            lane: ``recording`` for the run, ``overlay`` for answers and tried results.
             first: number of pieces that the page has.
             state: state of the page.
         """
@@ -169,12 +169,12 @@ class Source(Closable):
     def frame_times(self) -> list[tuple[int, int]]:
         """Return stamp and number of each frame that a page can show."""
 
-    def open_desk(self) -> Desk | None:
-        """Return a new desk for a page. None: all pages share one recording."""
+    def open_overlay(self) -> PageOverlay | None:
+        """Return a new overlay for a page. None: all pages share one recording."""
         return None
 
-    def close_desk(self, desk: Desk) -> None:
-        """Remove a desk whose page is closed."""
+    def close_overlay(self, overlay: PageOverlay) -> None:
+        """Remove an overlay whose page is closed."""
 
     def asked_settings(self, settings: Settings, again: bool) -> Settings:
         """Return the settings that a question is about.
@@ -192,8 +192,8 @@ class Source(Closable):
         """Return the selection of a click in a frame, see ``bevviz.why.click.select_click``."""
 
     @abstractmethod
-    def mark(self, result: FrameResult, answer: Answer, desk: Desk | None) -> None:
-        """Mark the object of an answer in every view of the page of a desk."""
+    def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
+        """Mark the object of an answer in every view of the page of an overlay."""
 
     @abstractmethod
     def try_values(

@@ -12,6 +12,7 @@ from bevviz.config import load
 from bevviz.model import geometry
 from bevviz.model.decisions import explain
 from bevviz.model.frame import (
+    U8,
     Boxes3D,
     Camera,
     Cloud,
@@ -38,6 +39,15 @@ from bevviz.stages.bev import bev
 SCENE = Scene("drive", "lidar", ("lidar",), ("zed",), robot=True, truth=True)
 START = 1_700_000_000_123_456_789
 JPEG = cv2.imencode(".jpg", np.full((36, 64, 3), 90, np.uint8))[1].tobytes()
+
+
+def frame_with_image(number: int, bgr: U8) -> Frame:
+    """Return a frame of a drive at 10 Hz that holds one image and no points."""
+    stamp = START + number * 100_000_000
+    camera = Camera("front", Image(stamp, "front", bgr), None, None, None)
+    return Frame(number, stamp, 0, "", np.zeros((0, 3), np.float32), "base", cameras=(camera,))
+
+
 WORLD_FROM_LIDAR = geometry.transform(np.array([5.0, -2.0, 1.7]), np.array([0, 0, 0.3, 0.95]))
 LIDAR_FROM_CAMERA = geometry.transform(np.array([0.3, 0.0, -0.2]), np.array([-0.5, 0.5, -0.5, 0.5]))
 WORLD_FROM_CAMERA = WORLD_FROM_LIDAR @ LIDAR_FROM_CAMERA

@@ -19,8 +19,8 @@ const counted = (lane) => pieces.get(lane) ?? 0;
 let early = 0; // number of frames that were requested out of order
 let held = 0; // bytes of frames on demand that the viewer holds
 let recording = null; // socket of the run
-let desk = ""; // name of this page's answers and tried results; a robot has none
-const others = new Map(); // sockets of the desk, and of runs with other values
+let overlay = ""; // name of this page's answers and tried results; a robot has none
+const others = new Map(); // sockets of the overlay, and of runs with other values
 
 // Request the frame of this stamp next, if the viewer does not have it yet.
 export function want(stamp) {
@@ -50,10 +50,10 @@ function receive(lane) {
       announced = null;
       if (held > LIMIT) handlers.full();
     }
-    for (const one of awaited.filter(([, count]) => counted(desk) >= count)) one[0]();
-    awaited = awaited.filter(([, count]) => counted(desk) < count);
-    if (desk) follow(desk);
-    if (!lane.startsWith("desk")) nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
+    for (const one of awaited.filter(([, count]) => counted(overlay) >= count)) one[0]();
+    awaited = awaited.filter(([, count]) => counted(overlay) < count);
+    if (overlay) follow(overlay);
+    if (!lane.startsWith("overlay")) nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
   if (lane === "recording" && state.demand) socket.onopen = () => want(state.time);
   if (kind === "live") { // A page in the background draws nothing, and does not count as slow.
@@ -75,7 +75,7 @@ export function connect() {
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
       handlers.welcome(message);
-      desk = message.desk;
+      overlay = message.overlay;
       viewerReady.then(() => { recording = receive("recording"); });
     } else if (message.type === "failed") alarm(message.text);
     else if (message.type === "error") (failures.get(message.id) ?? handlers.error)(message);
@@ -111,9 +111,9 @@ export function send(message, failed) {
 }
 
 
-// Call a function once the viewer has so many pieces of the desk.
+// Call a function once the viewer has so many pieces of the overlay.
 let awaited = [];
 export function withPieces(count, then) {
-  if (counted(desk) >= count) then();
+  if (counted(overlay) >= count) then();
   else awaited.push([then, count]);
 }

@@ -1,4 +1,4 @@
-"""Desk of a page: the buffer with the answers and the tried results that this page alone shows."""
+"""Overlay of a page: the marks of its answers and its tried results, over the recording of the drive."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Attempt:
     """One try of other values. A newer try of the page, or its user, stops it.
 
     Args:
-        desk: desk of the page.
+        overlay: overlay of the page.
         logger: logger of the tried results.
         stream: stream of the logger.
     """
 
-    def __init__(self, desk: Desk, logger: FrameLogger, stream: rr.BinaryStream) -> None:
-        self.desk, self.logger, self.stream = desk, logger, stream
+    def __init__(self, overlay: PageOverlay, logger: FrameLogger, stream: rr.BinaryStream) -> None:
+        self.overlay, self.logger, self.stream = overlay, logger, stream
         self.stop = threading.Event()
 
     def check(self) -> None:
@@ -40,8 +40,8 @@ class Attempt:
             raise UserError("the try was cancelled")
 
 
-class Desk(Closable):
-    """Desk of one page.
+class PageOverlay(Closable):
+    """Overlay of one page.
 
     Args:
         lane: name by which the page requests the buffer.
