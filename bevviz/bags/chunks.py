@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
 
@@ -129,11 +130,22 @@ class ChunkReader:
     def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
         """Return the sorted log times of the connections ``ids`` with start <= time < stop."""
         parts = [np.zeros(0, np.int64)]
+        if start <= 0 and stop >= LAST_TIME:
+            return np.sort(np.concatenate([*parts, *(self._times.get(id_, parts[0]) for id_ in ids)]))
         for number, chunk in enumerate(self._index.chunks):
             if chunk.start < stop and chunk.end >= start:
                 parts += [self._times_of(number, connection) for connection in chunk.counts.keys() & set(ids)]
         times = np.sort(np.concatenate(parts))
         return times[(times >= start) & (times < stop)]
+
+    @cached_property
+    def _times(self) -> Mapping[int, I64]:
+        """Log times by connection. One pass over a large file reads the index of each chunk once."""
+        parts: dict[int, list[I64]] = {}
+        for number, chunk in enumerate(self._index.chunks):
+            for connection in chunk.counts:
+                parts.setdefault(connection, []).append(self._times_of(number, connection))
+        return {connection: np.concatenate(times) for connection, times in parts.items()}
 
     def close(self) -> None:
         """Close the file."""
