@@ -132,9 +132,9 @@ class ChunkReader:
         parts = [np.zeros(0, np.int64)]
         if start <= 0 and stop >= LAST_TIME:
             return np.sort(np.concatenate([*parts, *(self._times.get(id_, parts[0]) for id_ in ids)]))
-        for number, chunk in enumerate(self._index.chunks):
-            if chunk.start < stop and chunk.end >= start:
-                parts += [self._times_of(number, connection) for connection in chunk.counts.keys() & set(ids)]
+        for number in self._between(start, stop):
+            known = self._index.chunks[number].counts.keys() & set(ids)
+            parts += [self._times_of(number, connection) for connection in known]
         times = np.sort(np.concatenate(parts))
         return times[(times >= start) & (times < stop)]
 
@@ -155,9 +155,21 @@ class ChunkReader:
         """Return the messages of each chunk in order of log time."""
         return [
             self._ordered(number, wanted, start, stop, few)
-            for number, chunk in enumerate(self._index.chunks)
-            if chunk.start < stop and chunk.end >= start and not chunk.counts.keys().isdisjoint(wanted)
+            for number in self._between(start, stop)
+            if not self._index.chunks[number].counts.keys().isdisjoint(wanted)
         ]
+
+    def _between(self, start: int, stop: int) -> list[int]:
+        """Return the numbers of the chunks that may have messages with start <= log time < stop."""
+        first, last = self._spans
+        numbers: list[int] = np.flatnonzero((first < min(stop, LAST_TIME)) & (last >= start)).tolist()
+        return numbers
+
+    @cached_property
+    def _spans(self) -> tuple[I64, I64]:
+        """Log times of the first and of the last message of each chunk."""
+        chunks = self._index.chunks
+        return np.array([c.start for c in chunks], np.int64), np.array([c.end for c in chunks], np.int64)
 
     def _ordered(
         self, number: int, wanted: Collection[int], start: int, stop: int, few: bool
