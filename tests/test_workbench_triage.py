@@ -175,7 +175,7 @@ def test_frames_are_stepped_one_by_one(page: Page) -> None:
 
 
 def test_parameters_are_browsed_by_stage(page: Page) -> None:
-    """A slider and the boxes of a list change them."""
+    """A slider and the boxes of a list change them. The keys work there."""
     page.locator("#controls summary", has_text="bev").click()
     page.locator("[id='control-bev.channels'] label", has_text="height").locator("input").check()
     until(lambda: state(page).get("set") == ['bev.channels=["height","occupancy"]'])
@@ -185,6 +185,8 @@ def test_parameters_are_browsed_by_stage(page: Page) -> None:
     slider.evaluate("(e) => { e.value = 0.9; e.dispatchEvent(new Event('change')); }")
     until(lambda: "clustering.eps=0.9" in state(page).get("set", []))
     assert "1 changed" in page.inner_text("#controls")
+    slider.press("u")
+    until(lambda: state(page).get("set") == ['bev.channels=["height","occupancy"]'])
     page.click("#reset")
     until(lambda: "As it was opened" in page.inner_text("#effect"))
 

@@ -416,7 +416,7 @@ $("keys").onclick = actions["?"];
 $("help").onclick = () => $("help").close();
 window.addEventListener("keydown", (event) => {
   const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
-  const typing = inPanel && ["INPUT", "SELECT"].includes(event.target.tagName);
+  const typing = inPanel && event.target.matches("input:not([type=range], [type=checkbox]), select");
   if (typing && event.key === "Escape") event.target.blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
   event.preventDefault();
