@@ -422,8 +422,8 @@ class Walk:
     def _slide(self, pane: Pane, key: str, part: float) -> str:
         """Move the slider of a parameter to a part of its range."""
         slider = pane.page.locator(f"input[aria-label='{key}, slider']")
-        slider.focus()  # The keys work there, too.
         setting = f"{key}={slider.evaluate(SLIDE, part)}"
+        pane.page.evaluate("document.activeElement.blur()")
         self._try(pane, (*(one for one in pane.values if not one.startswith(f"{key}=")), setting))
         return f"slider of {setting}"
 
