@@ -23,7 +23,7 @@ from rerun.experimental import ViewerClient
 from tqdm import tqdm
 
 import bevviz
-from benchmarks.measure import machine
+from benchmarks.measure import machine, peak_memory
 from benchmarks.pages import write_section
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities, rerun_cli
@@ -130,9 +130,7 @@ class Watched:
     @property
     def peak(self) -> float:
         """MB that it had at most."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        line = next(line for line in status.splitlines() if line.startswith("VmHWM:"))
-        return int(line.split()[1]) / 1e3
+        return peak_memory(self.process.pid)
 
 
 @contextmanager

@@ -79,12 +79,12 @@ def run(*command: str) -> Finished:
 
 def _watch(process: subprocess.Popen[bytes], looks: list[float]) -> None:
     while process.returncode is None:
-        looks.append(_peak(process.pid))
+        looks.append(peak_memory(process.pid))
         time.sleep(0.02)
 
 
-def _peak(pid: int) -> float:
-    """Most memory in MB that a running process had so far; 0 where it cannot be told."""
+def peak_memory(pid: int) -> float:
+    """Return the most memory in MB that a running process had so far; 0 where it cannot be told."""
     try:
         status = Path(f"/proc/{pid}/status").read_text()
     except OSError:

@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from benchmarks.measure import peak_memory
 from bevviz.findings.finding_list import CELL
 from tests.support.workbench_pages import serving
 
@@ -46,7 +47,7 @@ def main() -> None:
         start = time.monotonic()
         with serving("open", str(options.bag.resolve()), model=options.model) as (address, server):
             early, whole = watch(address, start, options.after)
-            seconds, memory = time.monotonic() - start, peak(server.pid)
+            seconds, memory = time.monotonic() - start, peak_memory(server.pid)
     worst = sorted(whole.values(), key=order)[:WORST]
     print(
         "the worst:",
@@ -97,12 +98,6 @@ def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
         return False
     frames = [sight[0] for sight in other["sights"]]
     return any(abs(sight[0] - frame) <= CELL for sight in one["sights"] for frame in frames)
-
-
-def peak(pid: int) -> float:
-    """Return the MB that a process had at most."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM:")).split()[1]) / 1e3
 
 
 if __name__ == "__main__":

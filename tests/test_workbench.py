@@ -530,7 +530,7 @@ def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None
 
 
 def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
-    """Of a recording that nobody acknowledges a few pieces come, and the one that is asked for."""
+    """A page that acknowledges no piece gets a few pieces, and the one that it asks for."""
     from websockets.sync.client import connect
     from websockets.typing import Origin
 

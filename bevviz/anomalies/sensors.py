@@ -38,9 +38,7 @@ class SensorWatch:
             self.clear()
         self._stamp = frame.stamp
         for fault in self._faults(result):
-            name = f"{fault.sensor}: {fault.name}"
-            text = f"{name} since {1e-9 * (fault.since - self._start):.1f} s{fault.detail}"
-            yield Anomaly("sensor", name, text, "ERROR", fault.since, fault.rank)
+            yield _anomaly(fault, f" since {1e-9 * (fault.since - self._start):.1f} s")
 
     def update_alone(self, frame: Frame) -> Iterator[Anomaly]:
         """Yield the cameras whose image shows nothing. The frame does not follow the frame before."""
@@ -48,8 +46,7 @@ class SensorWatch:
             watch = self._images.setdefault(camera.name, ImageWatch(f"camera {camera.name}"))
             fault = None if camera.image is None else watch.update_alone(camera.image)
             if fault is not None:
-                name = f"{fault.sensor}: {fault.name}"
-                yield Anomaly("sensor", name, f"{name}{fault.detail}", "ERROR", fault.since, fault.rank)
+                yield _anomaly(fault)
 
     def _faults(self, result: FrameResult) -> Iterator[SensorFault]:
         """Yield the faults that each rule finds in this frame."""
@@ -73,6 +70,12 @@ class SensorWatch:
             mounting = self._mountings.setdefault(camera.name, MountingWatch(camera.name, frame.lidar))
             yield from mounting.update(camera, gray, scene, frame.stamp, trusted=not faults)
         yield from self._placement.update(frame, clouds, distrusted)
+
+
+def _anomaly(fault: SensorFault, since: str = "") -> Anomaly:
+    """Return a fault as an anomaly. ``since`` says when it began, if that is known."""
+    name = f"{fault.sensor}: {fault.name}"
+    return Anomaly("sensor", name, f"{name}{since}{fault.detail}", "ERROR", fault.since, fault.rank)
 
 
 def _clouds(frame: Frame) -> tuple[Cloud, ...]:

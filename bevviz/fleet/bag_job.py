@@ -116,9 +116,9 @@ def _fill(
             else:
                 observers += [MarkRecorder(sinks.recording), estimator]
             assert sinks.file is not None
-            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session)
-            if not job.truth:  # The workbench takes stated labels for the frames' own.
-                collector.keeper = list_keeper(source, session, job.config)
+            # The workbench takes stated labels for the frames' own.
+            keeper = None if job.truth else list_keeper(source, session, job.config)
+            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, keeper)
             watchers = [*observers, collector, DiskWatch(sinks)]
             with working_ahead(session, source, [config], helpers if has_networks(config) else 1) as ahead:
                 if run_frames(source, ahead, watchers).interrupted:
@@ -142,11 +142,7 @@ def _fill(
 
 
 class _RowCollector(Observer[FrameResult]):
-    """Observer that makes a row for each frame. It ends the run if the recording was removed.
-
-    Attributes:
-        keeper: keeps the list of findings for the workbench. None: it is not kept.
-    """
+    """Observer that makes a row for each frame. It ends the run if the recording was removed."""
 
     def __init__(
         self,
@@ -156,9 +152,9 @@ class _RowCollector(Observer[FrameResult]):
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
         session: Session,
+        keeper: ListKeeper | None,
     ) -> None:
-        self.keeper: ListKeeper | None = None
-        self._session = session
+        self._session, self._keeper = session, keeper
         self._job, self._rows, self._recording = job, rows, recording
         self._on_frame, self._evaluation = on_frame, evaluation
         self._findings = FindingCollector(evaluation)
@@ -180,16 +176,16 @@ class _RowCollector(Observer[FrameResult]):
         truth = None if judged is None else judged[1]
         explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names, truth)
         values[FINDINGS] = self._findings.of_frame(explainer)
-        if self.keeper is not None:
-            self.keeper.add(explainer)
+        if self._keeper is not None:
+            self._keeper.add(explainer)
         self._rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
             raise WithdrawnError
 
     def end(self) -> None:
-        if self.keeper is not None:
-            self.keeper.end()
+        if self._keeper is not None:
+            self._keeper.end()
         for _, negative_row, jpegs in self._worst:
             self._rows[-negative_row] |= jpegs
         if self._evaluation is not None:
