@@ -203,8 +203,6 @@ def _compressed_cloud(form: str) -> list[Row]:
         cloud = made.cloud(stamp, np.random.default_rng(0).normal(0, 9, (400, 4)).astype(np.float32))
         if form == "draco":
             message = samples.draco(b64decode(samples.DRACO[0]))
-        elif form == "cloudini":
-            message = samples.compressed(made, cloud, form, samples.CLOUDINI["v5_lossy_zstd"].tobytes())
         else:
             message = samples.compressed(made, cloud, form, samples.packed(form, cloud.data.tobytes()))
         return replace(message, header=cloud.header)
@@ -390,7 +388,7 @@ KINDS: Mapping[str, Kind] = {
     "Ouster metadata": Kind(_ouster, "/ouster/metadata", needed=True),
     **{
         f"CompressedPointCloud2, {form}": Kind(partial(_compressed_cloud, form))
-        for form in ("zstd", "zlib", "draco", "cloudini")
+        for form in ("zstd", "zlib", "draco")
     },
     **{f"{name}, h264": Kind(partial(_video, kind), videos.VIDEO) for name, kind in VIDEO.items()},
     "CompressedVideo, h265": Kind(partial(_video, VIDEO["CompressedVideo"], "h265"), videos.VIDEO),

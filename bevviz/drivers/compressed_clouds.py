@@ -1,4 +1,4 @@
-"""Decoder for CompressedPointCloud2 messages of point_cloud_transport: zstd, zlib, draco and cloudini."""
+"""Decoder for CompressedPointCloud2 messages of point_cloud_transport: zstd, zlib and draco."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ def decompress(msg: Any) -> Any:
     """
     # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
     data = memoryview(msg.compressed_data).tobytes()
-    if msg.format == "cloudini":
-        return _from_cloudini(msg, data)
     width, height = int(msg.width), int(msg.height)
     size = height * max(int(msg.row_step), width * int(msg.point_step))
     if msg.format == "zstd":
@@ -39,9 +37,7 @@ def decompress(msg: Any) -> Any:
         unpacked = _from_draco(msg, data)
         width, height = len(unpacked) // max(int(msg.point_step), 1), 1
     else:
-        raise ValueError(
-            f"a cloud compressed by '{msg.format}' is not read: zstd, zlib, draco and cloudini are"
-        )
+        raise ValueError(f"a cloud compressed by '{msg.format}' is not read: zstd, zlib and draco are")
     return make(
         "sensor_msgs/msg/PointCloud2",
         header=msg.header,
@@ -52,33 +48,6 @@ def decompress(msg: Any) -> Any:
         point_step=msg.point_step,
         row_step=width * int(msg.point_step) if msg.format == "draco" else msg.row_step,
         data=unpacked,
-        is_dense=msg.is_dense,
-    )
-
-
-def _from_cloudini(msg: Any, data: bytes) -> Any:
-    """Make a PointCloud2 from cloudini data.
-
-    The size is that of the data's own header. The message may state more points.
-    """
-    from bevviz.drivers import cloudini  # It compiles loops: numba takes a quarter of a second to import.
-
-    header, points = cloudini.decode(data) if data else (cloudini.EMPTY, np.zeros(0, np.uint8))
-    fields = [
-        make("sensor_msgs/msg/PointField", name=f.name, offset=f.offset, datatype=f.type, count=1)
-        for f in header.fields
-        if f.type in SCALARS and f.offset != cloudini.NOWHERE
-    ]
-    return make(
-        "sensor_msgs/msg/PointCloud2",
-        header=msg.header,
-        height=header.height,
-        width=header.width,
-        fields=fields if data else msg.fields,
-        is_bigendian=False,
-        point_step=header.point_step or msg.point_step,
-        row_step=header.width * header.point_step,
-        data=points,
         is_dense=msg.is_dense,
     )
 

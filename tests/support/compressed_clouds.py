@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,6 +61,3 @@ def draco(data: bytes) -> Any:
     cloud = made.cloud(bags.START, np.zeros((12, 4), np.float32))
     cloud.fields, cloud.point_step, cloud.row_step = fields, 22, 12 * 22
     return compressed(made, cloud, "draco", data)
-
-
-CLOUDINI = np.load(Path(__file__).parents[1] / "references" / "clouds" / "cloudini.npz")
