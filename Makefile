@@ -1,24 +1,31 @@
-# A thin layer over pip: the README spells the same commands out.
+# A thin layer over uv, which pip installs first. CONTRIBUTING.md has the same commands for pip alone.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
 # The versions that the tests passed with. CONSTRAINTS= takes the newest that pyproject.toml allows.
 CONSTRAINTS ?= docs/constraints.txt
-INSTALL = $(BIN)/pip install --quiet $(CONSTRAINTS:%=--constraint %)
+INSTALL = VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet $(CONSTRAINTS:%=--constraint %)
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: demo test test-fast check docs bench accuracy constraints sbom wheel clean
+# One part of N of the long tests, as K/N. All of them without it.
+SHARE ?= 0/1
+
+.PHONY: demo test test-long test-fast check docs bench accuracy constraints sbom wheel clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(PYTEST) -m "not long"
+
+test-long: $(VENV)/.tested
+	$(PYTEST) -m long --share $(SHARE)
 
 # The parts that are not ours to choose: data classes, pydantic, compiled kernels, ONNX, readers, the command line.
 FAST = config perceive run clustering fusion tracking messages detector info
 test-fast: $(VENV)/.tested
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(FAST:%=tests/test_%.py)
+	$(PYTEST) -q -m "not long" $(FAST:%=tests/test_%.py)
 
 check: $(VENV)/.tested
 	$(BIN)/ruff check .
@@ -63,7 +70,7 @@ wheel: .venv-release/.installed
 
 $(VENV)/.installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --upgrade "pip>=25.1,<27"
+	$(BIN)/pip install --quiet "uv>=0.9,<1"
 	$(INSTALL) --editable ".[workbench]"
 	touch $@
 

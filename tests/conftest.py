@@ -37,11 +37,23 @@ FIRST = (
 )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort the longest tests first, and let real-time tests fail once, as on a busy machine.
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that divides the files of tests into shares."""
+    parser.addoption("--share", default="0/1", metavar="K/N", help="run every N-th file, from number K on")
 
-    Such a failure is reported as a rerun.
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave one share of the files, and sort the longest first.
+
+    Let real-time tests fail once, as on a busy machine. Such a failure is reported as a rerun.
     """
+    number, shares = map(int, config.getoption("share").split("/"))
+    if shares > 1:
+        marked = config.option.markexpr == "long"
+        files = sorted({item.path for item in items if not marked or item.get_closest_marker("long")})
+        chosen = set(files[number % shares :: shares])
+        config.hook.pytest_deselected(items=[item for item in items if item.path not in chosen])
+        items[:] = [item for item in items if item.path in chosen]
     rank = {f"{name}.py": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
     for item in items:
