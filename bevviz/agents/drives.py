@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,8 +9,17 @@ from functools import cached_property
 from pathlib import Path
 
 from bevviz.anomalies import FailureSummary, Onsets
-from bevviz.config import Config, changed_config, changes
-from bevviz.config.keys import values
+from bevviz.config import (
+    TUTORIAL_NAMES,
+    Config,
+    changed_config,
+    field_of,
+    keys,
+    unknown_key,
+    untrusted_layers,
+)
+from bevviz.config.keys import is_number_or_choice
+from bevviz.config.trust import MESSAGE
 from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
@@ -101,20 +108,24 @@ class RunFindings(Observer[FrameResult]):
 
 
 def agent_config(config: Config, settings: Sequence[str]) -> Config:
-    """Return the configuration with an agent's values. No value names a file, a topic or a function.
+    """Return the configuration with an agent's values, which are numbers, booleans and declared choices.
 
     Raises:
-        UserError: an unknown key, a wrong value, or a value that only the user may state.
+        UserError: an unknown key, a wrong value, or a parameter that only the user may state. Nothing is
+            looked up before: not even whether a file exists.
     """
-    changed = changed_config(config, settings)
-    texts = values(changed)
-    for key in changes(config, changed):
-        value = texts[key]
-        if key.endswith((".model", ".names")) or re.search(r"[/\\:]", json.dumps(value, default=str)):
-            raise UserError(
-                f"{key}: files, topics and functions are stated by the user: bevviz mcp --set {key}=..."
-            )
-    return changed
+    for layer in untrusted_layers(settings, trust=MESSAGE):
+        for stated, value in layer.values.items():
+            key = TUTORIAL_NAMES.get(stated, stated)
+            info = field_of(key, config)
+            if info is None:
+                raise UserError(f"{layer.where}: {unknown_key(key, [*keys(config)])}")
+            if not is_number_or_choice(info, value):
+                raise UserError(
+                    f"{key}: an agent states numbers, booleans and built-in choices; names, files, topics "
+                    f"and functions are stated by the user: bevviz mcp --set {key}=..."
+                )
+    return changed_config(config, settings)
 
 
 def batch_drives(results: Sequence[tuple[Path, RunInfo]]) -> dict[str, Callable[[], AskedDrive]]:

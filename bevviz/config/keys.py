@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 import annotated_types
 from pydantic import BaseModel
@@ -13,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from bevviz.config.methods import params_of
 from bevviz.config.sections import Config, Section
-from bevviz.config.value_types import Unit
+from bevviz.config.value_types import StageMethods, Unit
 
 TUTORIAL_NAMES = {
     "voxel_size": "voxel.size",
@@ -152,10 +153,11 @@ def field_of(key: str, config: Config | None = None) -> FieldInfo | None:
             unknown.
     """
     section, _, name = key.partition(".")
-    if config is not None and name.startswith("params."):
-        return params_of(config, section).get(name.removeprefix("params."))
     model = _model(section)
-    return Config.model_fields.get(key) if model is None else model.model_fields.get(name)
+    info = Config.model_fields.get(key) if model is None else model.model_fields.get(name)
+    if info is not None or config is None:
+        return info
+    return params_of(config, section).get(name.removeprefix("params."))  # The word params may be left out.
 
 
 def limits_of(info: FieldInfo) -> tuple[Any, Any]:
@@ -167,6 +169,34 @@ def limits_of(info: FieldInfo) -> tuple[Any, Any]:
         if isinstance(rule, annotated_types.Le | annotated_types.Lt):
             high = rule.le if isinstance(rule, annotated_types.Le) else rule.lt
     return low, high
+
+
+def is_number_or_choice(info: FieldInfo, value: Any) -> bool:
+    """Return whether a value can only be a number, a boolean or a choice that bevviz declares.
+
+    Such a value names no file, topic or function. The declaration of the parameter decides, and not the look
+    of the value: a file may have any name. Of a stage's method, the built-in ones are choices.
+
+    Args:
+        info: field of the parameter.
+        value: value that is stated for it.
+    """
+    for rule in info.metadata:
+        methods = getattr(getattr(rule, "func", None), "__self__", None)
+        if isinstance(methods, StageMethods):
+            return value in methods.ours
+    return _holds_numbers_or_choices(info.annotation)
+
+
+def _holds_numbers_or_choices(annotation: Any) -> bool:
+    """Return whether a type holds only numbers, booleans and declared choices."""
+    if annotation in (bool, int, float, NoneType) or get_origin(annotation) is Literal:
+        return True
+    if hasattr(annotation, "__metadata__"):  # Annotated
+        return _holds_numbers_or_choices(annotation.__origin__)
+    items = [item for item in get_args(annotation) if item is not ...]
+    is_container = get_origin(annotation) in (tuple, list, Union, UnionType)
+    return is_container and bool(items) and all(map(_holds_numbers_or_choices, items))
 
 
 def _model(section: str) -> type[BaseModel] | None:
