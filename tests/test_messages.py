@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from bevviz.export.folder import rectify
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages import (
     camera_info,
@@ -32,6 +33,7 @@ from bevviz.messages import (
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.guard import guard
 from bevviz.model import geometry
+from bevviz.stages import edges
 
 SEC, NANOSEC = 1_700_000_000, 123_456_789
 STAMP = SEC * 1_000_000_000 + NANOSEC
@@ -602,10 +604,45 @@ def test_bad_camera_infos_are_named() -> None:
         match="/info: distortion model 'mei' is not supported; supported are equidistant, plumb_bob",
     ):
         camera_info.decode_camera_info(info_message("mei"), False, "/info")
-    with pytest.raises(MessageError, match=r"/info: coefficients after the eighth \(OpenCV's thin prism"):
+    with pytest.raises(MessageError, match=r"/info: more than 8 coefficients .* \(OpenCV's thin prism"):
         camera_info.decode_camera_info(info_message("rational_polynomial", np.full(14, 0.01)), False, "/info")
     with pytest.raises(MessageError, match=r"/info: .* are no coefficients"):
         camera_info.decode_camera_info(info_message(d=[math.nan]), False, "/info")
+    for model, d in [("equidistant", np.full(5, 0.01)), ("plumb_bob", [1e9]), ("plumb_bob", [-math.inf])]:
+        with pytest.raises(MessageError, match="/info: "):
+            camera_info.decode_camera_info(info_message(model, d), False, "/info")
+    for wrong in ({0: 1e30}, {2: math.nan}, {4: 1e9}, {5: -math.inf}, {1: 1e200}):
+        k = np.array(K, np.float64)
+        for place, number in wrong.items():
+            k[place] = number
+        with pytest.raises(MessageError, match=r"/info: .*calibrate"):
+            camera_info.decode_camera_info(info_message(k=k, K=k), False, "/info")
+    p = np.array(P, np.float64)
+    p[3] = math.nan
+    with pytest.raises(MessageError, match=r"/info: .*calibrate"):
+        camera_info.decode_camera_info(info_message(p=p, P=p), True, "/info")
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant", ""])
+@pytest.mark.parametrize("count", range(1, 15))
+def test_any_number_of_coefficients_is_the_lens_that_it_states(model: str, count: int) -> None:
+    """OpenCV takes 4, 5, 8, 12 or 14. Each further coefficient is zero, which is the same lens."""
+    stated = np.zeros(count)
+    limit = 4 if model == "equidistant" else 8
+    stated[:limit] = np.linspace(0.01, 0.02, 8)[: min(count, limit)]
+    intrinsics = camera_info.decode_camera_info(info_message(model, stated), rectified=False)
+    points = np.array([[0.3, 0.1, 2.0], [-1.0, 0.5, 4.0]])
+    full = np.zeros(limit)
+    full[: min(count, limit)] = stated[:limit]
+    lens = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
+    expected = lens(points[:, None], np.zeros(3), np.zeros(3), intrinsics.K, full)[0][:, 0]
+    pixels, _ = geometry.project(points, intrinsics)
+    np.testing.assert_allclose(pixels, expected, atol=1e-3)
+    np.testing.assert_allclose(
+        geometry.rays(pixels, intrinsics)[:, :2], points[:, :2] / points[:, 2:], atol=1e-5
+    )
+    image = np.zeros((36, 64, 3), np.uint8)
+    assert edges.undistort(image, intrinsics).shape == rectify(image, intrinsics).shape == image.shape
 
 
 # --- transforms --------------------------------------------------------------------------------

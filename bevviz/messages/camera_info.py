@@ -19,6 +19,9 @@ _DISTORTION = {
     "kannala_brandt4": "equidistant",  # name in librealsense
 }
 
+OPENCV_COUNTS = (4, 5, 8)  # numbers of coefficients that OpenCV takes; of an equidistant lens the first
+MAX_NUMBER = 1e6  # Largest coefficient, and largest focal length or centre in pixels, of any real camera.
+
 
 def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") -> Intrinsics:
     """Return the camera model of a sensor_msgs/CameraInfo, for images as they are published.
@@ -33,7 +36,8 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
         topic: topic of the message, for errors.
 
     Raises:
-        MessageError: the camera is not calibrated, or its distortion model is not supported.
+        MessageError: the camera is not calibrated, its distortion model is not supported, or a number is
+            absurd.
     """
     K, D, P = (np.asarray(either(msg, n, n.lower()), np.float64) for n in "KDP")
     matrix, baseline = K.reshape(3, 3), (0.0, 0.0)
@@ -42,16 +46,18 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
         baseline = -float(P[3] / P[0]), -float(P[7] / P[5] if P[5] else 0.0)
     if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise MessageError(f"{topic}: the camera is uncalibrated (K is zero or not finite); calibrate it")
-    model = ""
+    if max(np.abs(matrix).max(), *map(abs, baseline)) > MAX_NUMBER or not np.isfinite(baseline).all():
+        raise MessageError(f"{topic}: {matrix.tolist()} is no camera matrix in pixels; calibrate the camera")
+    model, coefficients = "", np.zeros(0)
     if not rectified and (np.any(D) or (len(D) and _is_fisheye(msg.distortion_model))):
-        model = _distortion(msg.distortion_model, D, topic)
+        model, coefficients = _distortion(msg.distortion_model, D, topic)
     matrix = matrix.copy()
     matrix[0, 2] -= msg.roi.x_offset
     matrix[1, 2] -= msg.roi.y_offset
     binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
     matrix[:2] /= binning[:, None]
     width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
-    return Intrinsics(int(width), int(height), matrix, model, D if model else np.zeros(0), baseline)
+    return Intrinsics(int(width), int(height), matrix, model, coefficients, baseline)
 
 
 def _is_fisheye(name: str) -> bool:
@@ -59,18 +65,30 @@ def _is_fisheye(name: str) -> bool:
     return _DISTORTION.get(name.lower()) == "equidistant"
 
 
-def _distortion(name: str, D: F64, topic: str) -> str:
+def _distortion(name: str, D: F64, topic: str) -> tuple[str, F64]:
+    """Return the model and as many coefficients as OpenCV takes.
+
+    Coefficients that are not stated are zero. That is the same lens: each is the factor of one term of a sum
+    (k of a power of the radius or of the angle, p1 and p2 of the tangential terms), and all tools state them
+    in this order: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of an equidistant lens.
+
+    Raises:
+        MessageError: the model is not supported, or these are no coefficients of it.
+    """
     model = _DISTORTION.get(name.lower())
     if model is None:
         raise MessageError(
             f"{topic}: distortion model '{name}' is not supported; supported are "
             f"{', '.join(sorted(set(_DISTORTION.values())))}"
         )
-    if np.any(D[8:]) and np.isfinite(D).all() and model != "equidistant":
-        raise MessageError(
-            f"{topic}: coefficients after the eighth (OpenCV's thin prism and tilt) are not supported; "
-            "calibrate without them"
-        )
-    if not np.isfinite(D).all() or np.any(D[8:]) or (model == "equidistant" and len(D) < 4):
+    if not (np.abs(D) <= MAX_NUMBER).all():  # not true of NaN, too
         raise MessageError(f"{topic}: {D.tolist()} are no coefficients of the distortion model '{name}'")
-    return model
+    counts = OPENCV_COUNTS[:1] if model == "equidistant" else OPENCV_COUNTS
+    if np.any(D[counts[-1] :]):
+        raise MessageError(
+            f"{topic}: more than {counts[-1]} coefficients of the distortion model '{model}' (OpenCV's thin "
+            "prism and tilt) are not supported; calibrate without them"
+        )
+    coefficients = np.zeros(next((count for count in counts if len(D) <= count), counts[-1]))
+    coefficients[: len(D)] = D[: len(coefficients)]
+    return model, coefficients
