@@ -317,13 +317,35 @@ def external(path: Path, location: str, length: int | None = None) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("location", ["../secret.bin", "/etc/passwd", "link.bin", "missing.bin", "/dev/zero"])
+@pytest.mark.parametrize(
+    "location",
+    [
+        "../secret.bin",
+        "sub/../../secret.bin",
+        "/etc/passwd",
+        "link.bin",
+        "up/secret.bin",
+        "missing.bin",
+        "/dev/zero",
+    ],
+)
 def test_weights_outside_of_the_folder_are_not_read(location: str, tmp_path: Path) -> None:
     (tmp_path / "secret.bin").write_bytes(bytes(4000))
     folder = tmp_path / "model"
     folder.mkdir()
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    (folder / "up").symlink_to(tmp_path)
+    (folder / "sub").mkdir()
     assert "onnxruntime cannot load it: External data path" in refused(external(folder / "m.onnx", location))
+
+
+@pytest.mark.parametrize("version", ["1.20.0", "1.23.2", "1.24.0"])
+def test_an_onnxruntime_that_reads_such_weights_is_refused(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("onnxruntime.__version__", version)
+    said = refused(constant(tmp_path / "m.onnx", {}))
+    assert f"onnxruntime {version} lets a model read files outside of its folder: install 1.24.1" in said
 
 
 def unknown_operator(path: Path) -> str:

@@ -43,6 +43,9 @@ MAX_NAME = 1000  # characters in the name of an input or output, which stands in
 CHECK_SECONDS = 0.05  # seconds between two checks of the memory; up to 100 MB are filled in this time
 STOP_SECONDS = 1.0  # seconds that a network has to end after a stop request
 SUFFIX = "ExecutionProvider"
+# The first onnxruntime that reads no weights outside of a model's folder. pyproject.toml asks for it, but
+# onnxruntime-gpu and other builds are installed in its place, and pip does not check their version.
+FIRST_SAFE = (1, 24, 1)
 LOG_FATAL = 4  # onnxruntime's severity "fatal", so that it does not print errors that we report ourselves
 MAX_LISTED = 8  # inputs or outputs in an error message
 MAX_LISTED_TEXT = 200  # characters of each text in an error message
@@ -224,6 +227,11 @@ def _load(
     path: Path, providers: Sequence[str], options: ort.SessionOptions, where: str, seconds: float
 ) -> Any:
     """Load a network within the limits."""
+    if tuple(map(int, re.findall(r"\d+", ort.__version__)[:3])) < FIRST_SAFE:
+        raise UserError(
+            f"{where}: onnxruntime {ort.__version__} lets a model read files outside of its folder: install "
+            f"{'.'.join(map(str, FIRST_SAFE))} or newer"
+        )
     _share_limited_memory()
     options.log_severity_level = LOG_FATAL
     options.add_session_config_entry("session.use_env_allocators", "1")
@@ -236,8 +244,7 @@ def _load(
         return ort.InferenceSession(path, options, names, enable_fallback=0)
 
     def end() -> None:
-        if hasattr(options, "set_load_cancellation_flag"):  # onnxruntime 1.21
-            options.set_load_cancellation_flag(True)
+        options.set_load_cancellation_flag(True)
 
     try:
         return _watch(load, end, seconds, "load")
