@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 
@@ -95,8 +95,6 @@ class BagSource(Closable):
         at: str | None = None,
     ) -> None:
         self.config = config
-        self.selection = FrameSelection(start, end, every, frames)
-        self._paths = tuple(paths)
         self.recording = Recording(paths, config.source)
         try:
             self.results = self._open_results()
@@ -230,24 +228,6 @@ class BagSource(Closable):
         """Numbers of the selected frames."""
         chosen = self._chosen
         return range(self._first + chosen.start, self._first + chosen.stop, chosen.step)
-
-    @property
-    def opener(self) -> Callable[[], BagSource]:
-        """Function that opens the same frames again, also in another process."""
-        paths = tuple(path if address_of(path) else path.absolute() for path in self._paths)
-        return partial(self.selection.source, paths, self.config)
-
-    def part(self, first: int, stop: int) -> Iterator[Frame]:
-        """Yield a part of the selected frames without reading those before it.
-
-        Args:
-            first: place of the first frame among the selected ones.
-            stop: place after the last one.
-        """
-        part = self._chosen[first:stop]
-        scans = self.scans[int(np.searchsorted(self.scans, self._low)) :]
-        low, high = int(scans[part[0]]), int(scans[part[-1]]) + 1
-        return self._frames(low, high, self._first + part[0], range(0, len(part) * part.step, part.step))
 
     def __iter__(self) -> Iterator[Frame]:
         return self._frames(self._low, self._high, self._first, self._chosen)

@@ -9,7 +9,6 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
-    add_jobs,
     add_keep,
     add_output,
     add_selection,
@@ -30,7 +29,6 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(bag)
     add_selection(group)
-    add_jobs(group)
     add_config(bag)
     add_keep(add_output(bag))
     bag.set_defaults(run=_bag)
@@ -43,4 +41,4 @@ def _bag(options: argparse.Namespace) -> int:
     config = load_config(options)
     with open_bag(options, config) as source:
         default = Path(options.paths[0].stem + ".rrd")
-        return process(Drive(source, config), Outputs.of(options), default, source, options.jobs)
+        return process(Drive(source, config), Outputs.of(options), default)

@@ -200,8 +200,7 @@ def _execute(
             from bevviz.fleet.processes import Processes
 
             workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-            count = min(workers, len(todo))
-            engine = stack.enter_context(Processes(count, workers // count))
+            engine = stack.enter_context(Processes(min(workers, len(todo))))
         yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
 
 

@@ -10,7 +10,6 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
-    add_jobs,
     add_output,
     add_selection,
     add_truth,
@@ -47,7 +46,6 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(compare)
     add_selection(group)
-    add_jobs(group)
     add_config(compare)
     sides = compare.add_argument_group("the two sides", "What --set, --config and --preset say is for both.")
     for side in "ab":
@@ -123,7 +121,6 @@ def _run(
     from bevviz.compare.sides import ComparisonRecorder, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
-    from bevviz.pipeline.network_prefetch import working_ahead
 
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
 
@@ -138,8 +135,7 @@ def _run(
         _report(summary, options)
 
     outputs = Outputs.of(options).or_file(_default(options))
-    with working_ahead(processor, source, configs, options.jobs) as ahead:
-        return run_logged(source, ahead, config, outputs, observers, finish)
+    return run_logged(source, processor, config, outputs, observers, finish)
 
 
 def _saved(options: argparse.Namespace) -> int:

@@ -10,7 +10,6 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
-    add_jobs,
     add_keep,
     add_limits,
     add_output,
@@ -58,7 +57,6 @@ def add(commands: Commands) -> None:
     )
     group = add_bag(evaluate)
     add_selection(group)
-    add_jobs(group)
     add_truth(evaluate)
     add_limits(evaluate)
     add_config(evaluate)
@@ -145,18 +143,15 @@ def _run(
     """
     from bevviz.anomalies import FailureSummary
     from bevviz.findings.run_table import list_keeper
-    from bevviz.pipeline.network_prefetch import working_ahead
     from bevviz.pipeline.session import Session
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
-    ahead = working_ahead(session, frames, [config], options.jobs)
     # The workbench takes stated labels for the frames' own. This run has them apart.
     keeper = None if options.truth or options.kitti_labels else list_keeper(frames, session)
     kept = [] if keeper is None else [keeper]
     if not outputs:
         print_hints(frames.scene, config)
-        with ahead as processor:
-            end = run_with_progress(frames, processor, [judge, failures, *kept])
+        end = run_with_progress(frames, session, [judge, failures, *kept])
         warn([*frames.warnings, *failures.warnings])
         return table_status(end)
     from bevviz.recording.recorder import Recorder
@@ -176,8 +171,7 @@ def _run(
         if not json_on_stdout(options):
             print(table(), flush=True)
 
-    with ahead as processor:
-        return run_logged(frames, processor, config, outputs, observers, finish)
+    return run_logged(frames, session, config, outputs, observers, finish)
 
 
 def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:

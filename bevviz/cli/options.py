@@ -226,24 +226,6 @@ def add_selection(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--frames", type=frame_range, metavar="A:B", help="run scans A to B-1, counted from 0")
 
 
-def add_jobs(group: argparse._ActionsContainer) -> None:
-    """Add the options for processes that run the networks ahead. Both go to ``options.jobs``."""
-    where = group.add_mutually_exclusive_group()
-    where.add_argument(
-        "--jobs",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="processes that run the networks on frames ahead (default: 1, no further process)",
-    )
-    where.add_argument(
-        "--dask",
-        dest="jobs",
-        metavar="ADDRESS",
-        help="the same on a Dask cluster with the same files and store, e.g. tcp://host:8786",
-    )
-
-
 def open_bag(options: argparse.Namespace, config: Config) -> BagSource:
     """Open the bag and the frames that the options of ``add_bag`` and ``add_selection`` select."""
     from bevviz.bags.source import BagSource

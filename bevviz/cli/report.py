@@ -9,7 +9,6 @@ from bevviz.cli.options import (
     Commands,
     add_bag,
     add_config,
-    add_jobs,
     add_keep,
     add_subject,
     load_config,
@@ -38,7 +37,6 @@ def add(commands: Commands) -> None:
     group = add_bag(report)
     group.add_argument("--at", metavar="TIME", help="the time that the report is about")
     group.add_argument("--before", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
-    add_jobs(group)
     group.add_argument("--after", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
     add_subject(report, "The object that the report is about. Nothing: the worst of the frame.")
     add_config(report)
@@ -101,7 +99,6 @@ def _report(options: argparse.Namespace) -> int:
             include_model=options.include_model,
             force=options.force,
             notes=list(Notes(options.paths)),
-            jobs=options.jobs,
         )
     )
     warn(report.warnings)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -16,10 +15,8 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.drive import Drive
-    from bevviz.model.frame import Frame
     from bevviz.model.protocols import Items, Observer, Processor
     from bevviz.model.results import FrameResult
-    from bevviz.pipeline.frame_workers import FrameParts
     from bevviz.pipeline.run import RunEnd
 
 T = TypeVar("T")
@@ -44,21 +41,16 @@ def table_status(end: RunEnd) -> int:
     return 0 if end.frames else 1
 
 
-def process(
-    drive: Drive, outputs: Outputs, default: Path, source: FrameParts | None = None, jobs: int | str = 1
-) -> int:
+def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     """Run every stage on every frame and log the results to every output. Return the exit status.
 
     Args:
         drive: the frames.
         outputs: requested outputs.
         default: file to save if nothing can be shown.
-        source: the frames, if other processes can read them.
-        jobs: number of processes that run the networks ahead, 1: none; or the address of a Dask cluster.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
     from bevviz.evaluate.marks import MarkRecorder
-    from bevviz.pipeline.network_prefetch import working_ahead
     from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()
@@ -75,11 +67,7 @@ def process(
         warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")
 
-    with ExitStack() as stack:
-        processor: Processor[Frame, FrameResult] = session
-        if source is not None:
-            processor = stack.enter_context(working_ahead(session, source, [drive.config], jobs))
-        return run_logged(drive.frames, processor, drive.config, outputs.or_file(default), observers, finish)
+    return run_logged(drive.frames, session, drive.config, outputs.or_file(default), observers, finish)
 
 
 def run_logged(

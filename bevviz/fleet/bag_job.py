@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
@@ -23,8 +24,6 @@ from bevviz.fleet.jobs import PARTIAL, Job, JobResult
 from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.frame_workers import with_threads
-from bevviz.pipeline.network_prefetch import has_networks, working_ahead
 from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
 from bevviz.recording.recorder import DiskWatch, Recorder
@@ -46,7 +45,7 @@ class WithdrawnError(Exception):
         super().__init__("its unfinished recording was removed")
 
 
-def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None, helpers: int = 1) -> JobResult:
+def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None) -> JobResult:
     """Run the pipeline over a bag. Recording and table get their final names when both are complete.
 
     Unfinished files are deleted at the end. If another process deletes the recording, the job ends.
@@ -55,7 +54,6 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None, hel
         job: the bag and its settings.
         threads: largest number of threads of the network, unless the configuration has one.
         on_frame: called after each frame.
-        helpers: number of processes that run the networks ahead. 1: none.
 
     Raises:
         WithdrawnError: the unfinished recording was removed.
@@ -66,7 +64,7 @@ def run(job: Job, threads: int, on_frame: Callable[[], None] = lambda: None, hel
     recording = job.folder / PARTIAL / f"{job.name}-{os.getpid()}-{uuid4().hex[:8]}.rrd"
     table = recording.with_suffix(".parquet")
     try:
-        info = _fill(job, recording, rows, threads, on_frame, start, helpers)
+        info = _fill(job, recording, rows, threads, on_frame, start)
         write_table(table, rows, info)
         job.table.unlink(missing_ok=True)  # An older table must not vouch for the new recording.
         recording.replace(job.recording)
@@ -86,14 +84,13 @@ def _fill(
     threads: int,
     on_frame: Callable[[], None],
     start: float,
-    helpers: int,
 ) -> RunInfo:
     """Write the recording and append a row for each frame. Return the description of the run.
 
     Raises:
         UserError: the bag cannot be used, or has no frame.
     """
-    config = with_threads(job.config, threads)  # used by the stages only
+    config = _with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
     estimator = RecallEstimator()
     with job.selection.source([job.bag], job.config) as source:
@@ -120,9 +117,8 @@ def _fill(
             keeper = None if job.truth else list_keeper(source, session, job.config)
             collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, keeper)
             watchers = [*observers, collector, DiskWatch(sinks)]
-            with working_ahead(session, source, [config], helpers if has_networks(config) else 1) as ahead:
-                if run_frames(source, ahead, watchers).interrupted:
-                    raise KeyboardInterrupt
+            if run_frames(source, session, watchers).interrupted:
+                raise KeyboardInterrupt
         warnings = tuple(source.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
@@ -139,6 +135,13 @@ def _fill(
             file_hash(recording),
             estimator.estimates()[0].as_tree() if evaluation is None else None,
         )
+
+
+def _with_threads(config: Config, threads: int) -> Config:
+    """Return a configuration whose networks have this number of threads, unless it states another one."""
+    detector = config.detector
+    detector = detector.model_copy(update={"threads": detector.threads or threads})
+    return config.model_copy(update={"detector": detector})
 
 
 class _RowCollector(Observer[FrameResult]):

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
+from bevviz.errors import UserError, first_line
 from bevviz.fleet.bag_job import run
 from bevviz.fleet.jobs import Job, JobResult, JobResults
-from bevviz.pipeline.dask_frames import connect
+from bevviz.recording.ports import is_listening
 from bevviz.support.contexts import Closable
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 WAITING = 2  # jobs for each thread of the cluster, so that no thread has to wait for the next one
 TICK = 0.2  # seconds
@@ -29,7 +34,7 @@ class Cluster(Closable):
     """
 
     def __init__(self, address: str) -> None:
-        self._client = connect(address)
+        self._client = _connect(address)
 
     def close(self) -> None:
         """Disconnect from the cluster."""
@@ -76,6 +81,28 @@ class Cluster(Closable):
                     yield result
         finally:
             self._client.cancel(list(running))
+
+
+def _connect(address: str) -> Client:
+    """Return a client of a cluster.
+
+    Args:
+        address: of the scheduler, tcp://host:8786.
+
+    Raises:
+        UserError: Dask is not installed, or no scheduler answers at the address.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UserError("--dask needs Dask: pip install 'bevviz[dask]'") from None
+    url = urlsplit(address)
+    if url.hostname and url.port and not is_listening(url.hostname, url.port):
+        raise UserError(f"--dask {address}: nobody answers there; 'dask scheduler' starts one")
+    try:
+        return Client(address, timeout="10s")
+    except (OSError, ValueError, TimeoutError) as error:
+        raise UserError(f"--dask {address}: no scheduler answers there ({first_line(error)})") from None
 
 
 def _result(job: Job, future: Any) -> JobResult:

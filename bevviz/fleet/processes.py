@@ -36,12 +36,11 @@ class Processes(Closable):
 
     Args:
         count: number of processes that run at the same time.
-        helpers: number of processes beside each that run the networks ahead. 1: none.
     """
 
-    def __init__(self, count: int, helpers: int = 1) -> None:
-        self.count, self._helpers = count, helpers
-        self._threads = max(1, (os.cpu_count() or 1) // max(count * helpers, 1))
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._threads = max(1, (os.cpu_count() or 1) // max(count, 1))
         self._idle: list[_Worker] = []
         try:
             while len(self._idle) < count:
@@ -116,15 +115,7 @@ class Processes(Closable):
             self.close()
 
     def _start(self, *, speaks: bool = False) -> _Worker:
-        started = start_worker(
-            _work,
-            self._threads,
-            speaks,
-            self._helpers,
-            name="bevviz batch",
-            threads=self._threads,
-            daemon=self._helpers == 1,
-        )
+        started = start_worker(_work, self._threads, speaks, name="bevviz batch", threads=self._threads)
         return _Worker(started.process, started.pipe)
 
     def _assign(self, worker: _Worker, job: Job) -> _Worker:
@@ -149,7 +140,7 @@ def _judge(worker: _Worker, job: Job, message: JobResult | str | None) -> tuple[
     return True, JobResult(job.name, error=message or f"its process ended {worker.reason()}")
 
 
-def _work(pipe: Connection, threads: int, speaks: bool, helpers: int) -> None:
+def _work(pipe: Connection, threads: int, speaks: bool) -> None:
     """Run jobs in the worker process until the other end of the pipe is closed."""
     # Workers compile the stages at the same time. Only one of them reports it.
     progress.set_receiver(
@@ -163,7 +154,7 @@ def _work(pipe: Connection, threads: int, speaks: bool, helpers: int) -> None:
         except EOFError:
             return
         try:
-            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME), helpers)
+            result: JobResult | str = run(job, threads, lambda: pipe.send(_FRAME))
         except BrokenPipeError:
             return  # The batch has ended.
         except Exception as error:

@@ -187,21 +187,6 @@ def add_explanations(result: FrameResult, *, seen: bool = True) -> FrameResult:
     )
 
 
-def run_networks(frame: Frame, config: Config, stages: Stages) -> None:
-    """Run the networks alone on a frame, for the store of results that they keep theirs in.
-
-    Args:
-        frame: the frame.
-        config: configuration of the networks.
-        stages: the networks, from ``StageLoader.load_networks``.
-    """
-    log, objects = StageLog(), stages.objects
-    for camera in frame.cameras:
-        _detect(log, frame, camera, config, stages)
-    if isinstance(objects, StoredObjectNetwork) and len(frame.points):
-        log.guard("objects", lambda: objects(frame.points, frame.fields.get("intensity"), log.call))
-
-
 # --- stages by the configured method -----------------------------------------------------------
 
 

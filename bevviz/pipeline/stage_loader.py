@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bevviz.config import Config, DetectorConfig, object_network_params
 from bevviz.config.pillars import INPUT_PARAMS
-from bevviz.config.plugins import TOPIC, is_user_function
+from bevviz.config.plugins import TOPIC
 from bevviz.model.frame import Camera
 from bevviz.model.results import Detections
 from bevviz.pipeline.result_store import ResultStore, StoredDetector, StoredObjectNetwork, open_store
@@ -83,20 +83,6 @@ class StageLoader:
             network=detector if network is None else self._with_store(network, config),
             detector=None if network is None else network.restated(config.detector),
             detect=detect,
-        )
-
-    def load_networks(self, config: Config) -> Stages:
-        """Return only the networks of a configuration whose results the store keeps. No function is imported.
-
-        Raises:
-            UserError: a network cannot be used.
-        """
-        names_function = is_user_function(config.detector.model)
-        network = None if names_function else self._network(config.detector)
-        return Stages(
-            objects=None if object_network_params(config) is None else self._objects(config),
-            network=None if network is None else self._with_store(network, config),
-            detector=None if network is None else network.restated(config.detector),
         )
 
     def _function(self, config: Config, section: str) -> UserStage | None:

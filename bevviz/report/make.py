@@ -22,7 +22,6 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Camera, Frame, Scene
 from bevviz.model.protocols import Observer
 from bevviz.model.results import Detections, FrameResult
-from bevviz.pipeline.network_prefetch import working_ahead
 from bevviz.pipeline.notes import Note
 from bevviz.pipeline.run import Progress, run
 from bevviz.pipeline.session import Session
@@ -94,7 +93,6 @@ class ReportRequest:
         asked: answers about other frames.
         tried: values that the user tried.
         notes: notes of the whole drive.
-        jobs: number of processes that run the networks ahead, 1: none; or the address of a Dask cluster.
     """
 
     paths: Sequence[Path]
@@ -115,7 +113,6 @@ class ReportRequest:
     asked: Sequence[Answer] = ()
     tried: TriedValues | None = None
     notes: Sequence[Note] = ()
-    jobs: int | str = 1
 
 
 @dataclass(slots=True)
@@ -216,9 +213,7 @@ def make(
             recording, public, summary, window.at, request.note, notes, answers, session.stages.provider
         )
         watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
-        jobs = 1 if request.redact else request.jobs
-        ahead = stack.enter_context(working_ahead(session, source, [request.config], jobs))
-        outcome = run(source, ahead, watchers, stop=stop)
+        outcome = run(source, session, watchers, stop=stop)
         written.interrupted = outcome.interrupted or (stop is not None and stop.is_set())
         written.frames = len(summary.frames)
         written.warnings += [warning for warning in source.warnings if warning not in written.warnings]

@@ -35,9 +35,7 @@ class WorkerProcess:
         return reason + ("; out of memory?" if code == -signal.SIGKILL else "")
 
 
-def start_worker(
-    target: Callable[..., None], *arguments: object, name: str, threads: int, daemon: bool = True
-) -> WorkerProcess:
+def start_worker(target: Callable[..., None], *arguments: object, name: str, threads: int) -> WorkerProcess:
     """Start a process that calls ``target`` with its end of a pipe and the arguments.
 
     Args:
@@ -45,11 +43,10 @@ def start_worker(
         arguments: further arguments. The standard pickle has to know them.
         name: name of the process.
         threads: threads of OpenBLAS and Open3D, which read the number when they are loaded.
-        daemon: whether a normal end of this process ends it. Such a process may not start others.
     """
     context = get_context("spawn")  # A fork would copy threads of Rerun and onnxruntime amid their work.
     ours, theirs = context.Pipe()
-    process = context.Process(target=target, args=(theirs, *arguments), name=name, daemon=daemon)
+    process = context.Process(target=target, args=(theirs, *arguments), name=name, daemon=True)
     # A worker looks for Python's own modules first, not for files of the working directory.
     variables = {"PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": str(threads)}
     # The worker inherits the signal mask: this process alone handles signals of the terminal and ends its
