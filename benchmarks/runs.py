@@ -95,7 +95,11 @@ def logged_points(recording: Path) -> int:
     total = 0
     for chunk in RrdReader(recording).stream():
         path = chunk.entity_path
-        if chunk.is_static or not path.endswith("/points") or path != entities.points(path.split("/")[2]):
+        if (
+            chunk.is_static
+            or not path.endswith("/points")
+            or path != entities.POINTS.path(path.split("/")[2])
+        ):
             continue
         batch = chunk.to_record_batch()
         if "Points3D:positions" in batch.schema.names:

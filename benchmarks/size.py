@@ -84,7 +84,7 @@ def counted(recording: Path) -> tuple[int, int, int]:
         frames.update(batch.column(entities.FRAME).to_pylist())
         rows += batch.num_rows if path.startswith(DECIDED) else 0
         sensor = path.removeprefix(f"{entities.WORLD}/").split("/")[0]
-        if path == entities.points(sensor) and "Points3D:positions" in batch.schema.names:
+        if path == entities.POINTS.path(sensor) and "Points3D:positions" in batch.schema.names:
             raw += batch.num_rows - batch.column("Points3D:positions").null_count
     return len(frames), raw, rows
 

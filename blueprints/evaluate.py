@@ -12,8 +12,8 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     """Return the layout."""
     side: list[rrb.Container | rrb.View] = [views.cameras(scene)] if scene.cameras else []
     judged = (
-        f"{entities.ROBOT}/**",
-        entities.judged("**"),
+        f"{entities.ROBOT.above}/**",
+        entities.JUDGED.path("**"),
         f"- {entities.FUSED}/**",  # the same boxes, in other colours
     )
     words = rrb.Tabs(
@@ -21,7 +21,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         rrb.TextDocumentView(name="Evaluation", origin=entities.EVALUATE_ABOUT),
         views.explain(),
     )
-    counts = [entities.judged_count(outcome) for outcome in ("true", "missed", "false")]
+    counts = [entities.JUDGED_COUNT.path(outcome) for outcome in ("true", "missed", "false")]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(

@@ -18,7 +18,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                views.space(scene, beside=[f"{entities.ROBOT}/**", *compare.changes()]),
+                views.space(scene, beside=[f"{entities.ROBOT.above}/**", *compare.changes()]),
                 rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[2] * len(side), 3]),
                 rrb.Vertical(compare.version(), words, row_shares=[1, 2]),
                 column_shares=[5, 4, 3],

@@ -13,7 +13,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     side: list[rrb.Container | rrb.View] = (
         [views.cameras(scene, why=True, weak=True)] if scene.cameras else []
     )
-    beside = (f"{entities.ROBOT}/**", f"{entities.WHY}/**")
+    beside = (f"{entities.ROBOT.above}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
         rrb.Horizontal(
             views.spaces(scene, beside=beside),

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from bevviz.cli import main
+from bevviz.recording import entities
 from tests.support.recordings import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,6 +139,12 @@ def test_links_of_the_pages_that_are_no_part_of_the_site() -> None:
         path = ROOT / page
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", path.read_text()):
             assert "://" in target or (path.parent / target).exists(), f"{page}: {target}"
+
+
+def test_the_page_of_recordings_has_the_entities_of_the_code() -> None:
+    text = (ROOT / "docs/recordings.md").read_text()
+    rows = [line for line in text.splitlines() if re.match(r"\| `[/<].*\|.*\|.*\|$", line)]
+    assert rows == [entity.row for entity in entities.table().values()]
 
 
 def test_every_command_and_option_on_a_page_exists() -> None:

@@ -102,7 +102,7 @@ def test_outlines_are_where_the_masks_are(tmp_path: Path) -> None:
         log_detections(to, result, [])
         to.end()
     recording.disconnect()
-    (strips,) = Recording(tmp_path / "masks.rrd").column(entities.masks("front"), "LineStrips2D:strips")
+    (strips,) = Recording(tmp_path / "masks.rrd").column(entities.MASKS.path("front"), "LineStrips2D:strips")
     outline = np.concatenate([np.array(strip) for strip in strips])
     box = silhouette(PERSON) + 0.5  # counted from the corner of the first pixel
     np.testing.assert_allclose([*outline.min(axis=0), *outline.max(axis=0)], box, atol=2.0)  # a cell

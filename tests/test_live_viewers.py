@@ -53,11 +53,11 @@ def test_viewers_get_fewer_points_and_files_all(
         return Recording(path)
 
     whole, thinned = recording("file.rrd", packet.data), recording("viewer.rrd", packet.shown)
-    path = entities.points(frame.lidar)
+    path = entities.POINTS.path(frame.lidar)
     (every,) = whole.column(path, "Points3D:positions")
     (few,) = thinned.column(path, "Points3D:positions")
     assert np.array_equal(np.array(every), frame.points) and len(few) == LIMIT
-    for entity in (path, entities.ground(frame.lidar), entities.clusters(frame.lidar)):
+    for entity in (path, entities.GROUND.path(frame.lidar), entities.CLUSTERS.path(frame.lidar)):
         points, classes = (whole.column(entity, f"Points3D:{part}")[0] for part in ("positions", "class_ids"))
         shown, of_shown = (
             thinned.column(entity, f"Points3D:{part}")[0] for part in ("positions", "class_ids")
@@ -68,8 +68,8 @@ def test_viewers_get_fewer_points_and_files_all(
             assert [class_of[tuple(point)] for point in shown] == of_shown
         else:
             assert of_shown == classes
-    (boxes,) = thinned.column(entities.clusters(frame.lidar), "Boxes3D:centers")
-    assert [boxes] == whole.column(entities.clusters(frame.lidar), "Boxes3D:centers") and len(boxes) > 1
+    (boxes,) = thinned.column(entities.CLUSTERS.path(frame.lidar), "Boxes3D:centers")
+    assert [boxes] == whole.column(entities.CLUSTERS.path(frame.lidar), "Boxes3D:centers") and len(boxes) > 1
     assert thinned.at.keys() == whole.at.keys()
     assert all(thinned.at[path].keys() == whole.at[path].keys() for path in whole.at), (
         "nothing else is left out"

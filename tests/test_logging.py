@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -43,6 +44,7 @@ from bevviz.model.results import (
     Objects,
     Tracks,
 )
+from bevviz.recording import entities
 from bevviz.recording.boxes import TRACK_LANES, TrackLanes
 from bevviz.recording.cloud import round_voxels
 from bevviz.recording.decisions import decision_page
@@ -600,6 +602,14 @@ def test_tracks_are_logged_with_their_trails(record: Callable[..., Recording]) -
     assert found.column("/tracks/states/00", "StateChange:state") == [["person #0"]]
     speeds = found.column("/tracks/speed_m_s", "Scalars:scalars")
     assert [np.isfinite(lanes).sum() for lanes in speeds] == [0, 0, 1, 1]
+
+
+def test_every_entity_is_in_the_table(record: Callable[..., Recording]) -> None:
+    found = record([make()])
+    templates = "|".join(re.sub(r"{\w+}", ".+", entity) for entity in entities.table().values())
+    assert [path for path in found.at if not re.fullmatch(rf"(?:{templates})|/__properties.*", path)] == []
+    assert entities.CLASS_STATE.path("zed", "traffic light/red") == "/explain/states/zed/traffic_light_red"
+    assert entities.ROBOT.path("/a/b c") == "/robot/a/b_c"
 
 
 def test_lanes_are_few_and_are_kept() -> None:

@@ -184,12 +184,12 @@ def test_frames_on_demand_are_complete_in_any_order(long_drive: RecordedDrive, t
     tracks = long_drive.tracks(3)
     assert tracks is not None
     shown = entities_at(tmp_path, pieces)
-    assert {entities.TRAILS, entities.image("zed"), entities.points("rslidar")} <= shown[2] & shown[
+    assert {entities.TRAILS, entities.IMAGE.path("zed"), entities.POINTS.path("rslidar")} <= shown[2] & shown[
         3
     ] & shown[5]
     numbers = [long_drive.recording.rows[row] for row in range(1, len(long_drive.recording.rows))]
     totals = entities_at(tmp_path, dict(enumerate(numbers)))
-    assert {entities.count("clusters"), entities.stage_time("total")} <= set.union(*totals.values())
+    assert {entities.COUNT.path("clusters"), entities.STAGE_TIME.path("total")} <= set.union(*totals.values())
     assert not any(path.startswith(entities.WORLD) for paths in totals.values() for path in paths)
 
 

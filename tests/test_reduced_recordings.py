@@ -176,20 +176,20 @@ def test_inspect_keeps_voxels_and_raw_clouds_at_findings(
         assert kept[frame] == whole.at[raw]["Points3D:positions"][frame], "exact"
         assert less.at[raw]["Points3D:class_ids"][frame] == whole.at[raw]["Points3D:class_ids"][frame]
     assert less.cleared(raw) == {1, DARK + 6, 22}, "nothing that is shown is older"
-    places = [entities.obstacles(lidar), entities.clusters(lidar)]
+    places = [entities.OBSTACLES.path(lidar), entities.CLUSTERS.path(lidar)]
     for frame in (0, 7, DARK):
         before, after = points_at(whole, places[:1], frame), points_at(less, places, frame)
         assert len(before) == len(after)
         away = np.abs(before[:, None] - after[None]).max(axis=2)
         assert max(away.min(axis=0).max(), away.min(axis=1).max()) <= 1 / 32 + 1 / 128, "half a step, twice"
         for ids in (whole, less):
-            columns = ids.at[entities.clusters(lidar)]
+            columns = ids.at[entities.CLUSTERS.path(lidar)]
             assert len(columns["Points3D:class_ids"][frame]) == len(columns["Points3D:positions"][frame])
     assert saved["inspect"].stat().st_size < saved["everything"].stat().st_size
     assert saved["report"].stat().st_size < saved["inspect"].stat().st_size
     report = read["report"]
     assert raw not in report.at
-    assert entities.clusters(lidar) in report.at
+    assert entities.CLUSTERS.path(lidar) in report.at
 
 
 def test_the_recording_says_what_it_lacks(saved: dict[str, Path], read: dict[str, Recording]) -> None:

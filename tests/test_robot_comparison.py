@@ -438,13 +438,13 @@ def test_the_recording_shows_both(tmp_path: Path) -> None:
     found = recorded(tmp_path / "a.rrd", result)
     assert found.at[entities.FUSED]["opinion"][index] == ["confirmed", "contradicted"]
     assert found.at[entities.FUSION]["missed"][index] == [False] + [True] * (len(fused) - 1)
-    says = found.at[entities.outlines(entities.FUSED)]["says"][index]
+    says = found.at[entities.OUTLINES.path(entities.FUSED)]["says"][index]
     assert ": confirmed by " in says[0] and ": contradicted by " in says[1]
-    written = found.at[entities.names(entities.FUSED)]["Points3D:labels"][index]
+    written = found.at[entities.NAMES.path(entities.FUSED)]["Points3D:labels"][index]
     assert "car 0.90, contradicted" in written
-    beside = found.at[entities.names(entities.FUSION)]["Points3D:labels"][index]
+    beside = found.at[entities.NAMES.path(entities.FUSION)]["Points3D:labels"][index]
     assert beside[0] == "" and any(label.endswith(", missed") for label in beside)
-    counts = {what: found.at[entities.count(what)]["Scalars:scalars"][index] for what in OPINIONS}
+    counts = {what: found.at[entities.COUNT.path(what)]["Scalars:scalars"][index] for what in OPINIONS}
     assert counts["confirmed"] == counts["contradicted"] == [1.0] and counts["missed"] == [len(fused) - 1.0]
     [page] = found.text(entities.EXPLAIN)
     assert "**contradicted** car 0.90 at 12.0 m" in page.replace("\\", "")
@@ -457,8 +457,8 @@ def test_the_images_and_the_look_from_above_show_what_is_said(tmp_path: Path) ->
     fused, index = result.opinions.fused, result.frame.index
     told = {e.text: e.row for e in result.explanations if e.subject in ("object", "fused")}
     found = recorded(tmp_path / "a.rrd", result)
-    views: list[Callable[[str], str]] = [entities.overlay_opinion]
-    views += [partial(entities.image_opinion, camera.name) for camera in result.frame.cameras]
+    views: list[Callable[[str], str]] = [entities.OVERLAY_OPINION.path]
+    views += [partial(entities.IMAGE_OPINION.path, camera.name) for camera in result.frame.cameras]
     seen = Counter[str]()
     for view, (opinion, color) in product(views, OPINION_COLORS.items()):
         path = view(opinion)
@@ -472,11 +472,13 @@ def test_the_images_and_the_look_from_above_show_what_is_said(tmp_path: Path) ->
             if opinion == "missed":
                 asked = Selection(detection=int(fused.detection[row]), camera=fused.camera[row])
             assert select_click(result, None, path, instance, (0.0, 0.0)) == asked
-            assert select_click(result, None, entities.names(path), instance, (0.0, 0.0)) == asked
+            assert select_click(result, None, entities.NAMES.path(path), instance, (0.0, 0.0)) == asked
         seen[opinion] += len({*says})
     assert seen["contradicted"] >= 2 and seen["confirmed"] >= 2
     assert seen["missed"] > result.opinions.missed.sum()
-    names = found.at[entities.names(entities.overlay_opinion("contradicted"))]["Points2D:labels"][index]
+    names = found.at[entities.NAMES.path(entities.OVERLAY_OPINION.path("contradicted"))]["Points2D:labels"][
+        index
+    ]
     assert names == ["car contradicted"] * 2  # a single row stands twice
 
 
@@ -520,7 +522,7 @@ def test_of_our_own_objects_nothing_is_made_or_logged(tmp_path: Path) -> None:
     found = recorded(tmp_path / "a.rrd", result)
     logged = {*found.at, *found.static}
     assert not [path for path in logged if path.startswith(entities.FUSION) or "/opinions" in path]
-    assert not any(found.at[entities.count(what)] for what in OPINIONS)
+    assert not any(found.at[entities.COUNT.path(what)] for what in OPINIONS)
 
 
 # --- when asked --------------------------------------------------------------------------------
@@ -567,9 +569,9 @@ def test_a_click_on_either_box_asks_about_it() -> None:
     result = foreign()
     assert result.opinions is not None
     fused, place = result.opinions.fused, (1.0, 2.0, 3.0)
-    assert select_click(result, None, entities.outlines(entities.FUSED), 1, place) == Selection(object=1)
+    assert select_click(result, None, entities.OUTLINES.path(entities.FUSED), 1, place) == Selection(object=1)
     for j in range(len(fused)):
-        found = select_click(result, None, entities.outlines(entities.FUSION), j, place)
+        found = select_click(result, None, entities.OUTLINES.path(entities.FUSION), j, place)
         assert found == Selection(detection=int(fused.detection[j]), camera=fused.camera[j])
 
 

@@ -201,7 +201,7 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
     pick = max(inside, key=lambda one: sorted(abs(around[one][0] - u) for u in others)[1])
     left, top, _, bottom = around[pick]
     id_ = result.frame.truth.ids[Selection.parse(pick).row]
-    return id_, (left, (top + bottom) / 2), entities.image(camera.name)
+    return id_, (left, (top + bottom) / 2), entities.IMAGE.path(camera.name)
 
 
 def test_missed_objects_are_listed_and_opened(browser: Browser, address: str) -> None:
@@ -739,35 +739,39 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     weak = [row for row, is_kept in enumerate(found.kept) if not is_kept]
     aside = [row for row, is_kept in enumerate(result.clusters.kept) if not is_kept]
     assert kept and weak and aside and len(result.objects)
-    assert select_click(result, None, entities.detections(name), len(kept) - 1, ()) == Selection(
+    assert select_click(result, None, entities.DETECTIONS.path(name), len(kept) - 1, ()) == Selection(
         detection=kept[-1], camera=name
     )
-    assert select_click(result, None, entities.weak(name), 0, ()) == Selection(detection=weak[0], camera=name)
-    assert select_click(result, None, entities.FUSED, 0, (1, 2, 3)) == Selection(object=0)
-    assert select_click(result, None, entities.outlines(entities.FUSED), 0, (1, 2, 3)) == Selection(object=0)
-    assert select_click(result, None, entities.names(entities.detections(name)), 0, ()) == select_click(
-        result, None, entities.detections(name), 0, ()
+    assert select_click(result, None, entities.WEAK.path(name), 0, ()) == Selection(
+        detection=weak[0], camera=name
     )
+    assert select_click(result, None, entities.FUSED, 0, (1, 2, 3)) == Selection(object=0)
+    assert select_click(result, None, entities.OUTLINES.path(entities.FUSED), 0, (1, 2, 3)) == Selection(
+        object=0
+    )
+    assert select_click(
+        result, None, entities.NAMES.path(entities.DETECTIONS.path(name)), 0, ()
+    ) == select_click(result, None, entities.DETECTIONS.path(name), 0, ())
     assert select_click(result, None, entities.TRUTH, 2, ()) == Selection(truth=2)
     lidar = result.frame.lidar
-    assert select_click(result, None, entities.set_aside(lidar), 0, ()) == Selection(cluster=aside[0])
-    assert select_click(result, None, entities.image(name), None, (10.5, 20.5)) == Selection(
+    assert select_click(result, None, entities.SET_ASIDE.path(lidar), 0, ()) == Selection(cluster=aside[0])
+    assert select_click(result, None, entities.IMAGE.path(name), None, (10.5, 20.5)) == Selection(
         box=(10.0, 20.0), camera=name
     )
     pose, intrinsics = camera.camera.camera_from_points, camera.camera.intrinsics
     assert pose is not None and intrinsics is not None
     shown = geometry.apply(geometry.inverse(pose), np.array([[0.1, 0.05, 0.5]]))  # an image in the 3D view
     pixel = intrinsics.K @ (0.2, 0.1, 1)
-    in_image = select_click(result, None, entities.image(name), None, shown[0].tolist())
+    in_image = select_click(result, None, entities.IMAGE.path(name), None, shown[0].tolist())
     assert in_image is not None and in_image.box == pytest.approx(pixel[:2], abs=0.01)
     below = geometry.apply(geometry.inverse(pose), np.array([[0.0, 1.0, 0.5]]))  # a line of its frustum
-    assert select_click(result, None, entities.sensor(name), None, below[0].tolist()) is None
+    assert select_click(result, None, entities.SENSOR.path(name), None, below[0].tolist()) is None
     assert select_click(result, None, entities.BEV, None, (12.7, 3.2)) == Selection(cell=(3, 12))
     point = result.frame.points[5]
-    assert select_click(result, None, entities.points(lidar), 5, ()) == Selection(
+    assert select_click(result, None, entities.POINTS.path(lidar), 5, ()) == Selection(
         point=tuple(map(float, point))
     )
-    in_space = select_click(result, None, entities.obstacles(lidar), None, tuple(point.tolist()))
+    in_space = select_click(result, None, entities.OBSTACLES.path(lidar), None, tuple(point.tolist()))
     assert in_space is not None
     assert in_space.place == pytest.approx(point, abs=1e-4)
     measured = result.objects.measured
@@ -875,9 +879,15 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     assert ({"tried"}, True) in fused, "no object is left"
     assert not any("stamp" in timelines and cleared for timelines, cleared in fused)
     lidar, camera = result.frame.lidar, result.cameras[0].camera.name
-    for path_of_input in (entities.points(lidar), entities.image(camera), entities.sensor(camera)):
+    for path_of_input in (
+        entities.POINTS.path(lidar),
+        entities.IMAGE.path(camera),
+        entities.SENSOR.path(camera),
+    ):
         assert not any(cleared for _, cleared in rows[path_of_input])
-    assert sum(timelines == {"tried"} for timelines, _ in rows[entities.points(lidar)]) == 2, "it is put back"
+    assert sum(timelines == {"tried"} for timelines, _ in rows[entities.POINTS.path(lidar)]) == 2, (
+        "it is put back"
+    )
 
 
 def test_a_stopped_try_shows_nothing(bag: Path) -> None:
@@ -966,7 +976,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
         results = [drive.at(frame=number) for number in range(4)]
-        seen = entities.detections(results[0].cameras[0].camera.name)
+        seen = entities.DETECTIONS.path(results[0].cameras[0].camera.name)
         bench = RecordedDrive(drive, again.frames, first=3)
         bench.show(blind(results[3]), ())
         for result in (results[0], blind(results[1]), blind(results[2])):

@@ -23,7 +23,9 @@ from tests.support.workbench_pages import demo_bag
 FRAME = 3
 ROWS = 8  # of each entity that are clicked
 MARGIN = 0.3  # metres around the box of an answer
-SAME = {entities.MEASURED: 3.0}  # metres between a drawn box and its object; a measured box is a part of it
+SAME: dict[str, float] = {
+    entities.MEASURED: 3.0
+}  # metres between a drawn box and its object; a measured box is a part of it
 OUTSIDE = ("/world/bev", "/world/fused/names")  # a grid and texts: their positions are those of others
 
 

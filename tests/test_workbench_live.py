@@ -151,7 +151,7 @@ class Shown:
                     self.stamp = max(self.stamp, *(t.value for t in batch.column(entities.STAMP)))
                 if chunk.entity_path == entities.EXPLAIN_LOG:
                     self.texts += [text for (text,) in batch.column("TextLog:text").to_pylist()]
-                self.marked |= chunk.entity_path.startswith(entities.why(""))
+                self.marked |= chunk.entity_path.startswith(entities.WHY_PART.path(""))
 
 
 def nearest_missed(talk: Channel, frame: int) -> str:

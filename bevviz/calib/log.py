@@ -40,14 +40,14 @@ def log_calibration(
         config: quality of the images.
     """
     camera = result.camera
-    recording.log(entities.calib_result(camera), document(_page(result)), static=True)
+    recording.log(entities.CALIB_RESULT.path(camera), document(_page(result)), static=True)
     for axis in result.axes:
-        path = entities.calib_curve(camera, axis.axis.name)
+        path = entities.CALIB_CURVE.path(camera, axis.axis.name)
         width = np.full(len(axis.score), axis.abscissa[1] - axis.abscissa[0], np.float32)
         height = axis.score - min(curve.score.min() for curve in result.axes)
         bars = rr.BarChart(height, abscissa=axis.abscissa, widths=width, color=_COLORS[axis.finding])
         recording.log(path, bars, static=True)
-    for path in (entities.calib_stated(camera), entities.calib_corrected(camera)):
+    for path in (entities.CALIB_STATED.path(camera), entities.CALIB_CORRECTED.path(camera)):
         recording.log(f"{path}/points", depth_annotations(), static=True)
     correction = error_pose(result.correction)
     for shot in shots:
@@ -55,8 +55,8 @@ def log_calibration(
         recording.set_time(entities.FRAME, sequence=shot.frame.index)
         stated = shot.camera_from_points(0.0)
         corrected = correction @ shot.camera_from_points(float(result.correction[TIME]))
-        _log_pair(recording, entities.calib_stated(camera), shot, stated, config, _STATED)
-        _log_pair(recording, entities.calib_corrected(camera), shot, corrected, config, _CORRECTED)
+        _log_pair(recording, entities.CALIB_STATED.path(camera), shot, stated, config, _STATED)
+        _log_pair(recording, entities.CALIB_CORRECTED.path(camera), shot, corrected, config, _CORRECTED)
 
 
 def _log_pair(
@@ -123,14 +123,14 @@ def _page(result: Calibration) -> str:
 def alignment(camera: str) -> rrb.Tabs:
     """Return tabs with the image, the points by depth and the edges of the cloud, as stated and corrected."""
     return rrb.Tabs(
-        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.calib_stated(camera)),
-        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.calib_corrected(camera)),
+        rrb.Spatial2DView(name=f"{camera}, as stated", origin=entities.CALIB_STATED.path(camera)),
+        rrb.Spatial2DView(name=f"{camera}, corrected", origin=entities.CALIB_CORRECTED.path(camera)),
     )
 
 
 def calibration(camera: str) -> rrb.TextDocumentView:
     """Return the view of the result page of 'bevviz calib'."""
-    return rrb.TextDocumentView(name="Calibration", origin=entities.calib_result(camera))
+    return rrb.TextDocumentView(name="Calibration", origin=entities.CALIB_RESULT.path(camera))
 
 
 def score_curves(camera: str) -> rrb.Grid:
@@ -139,7 +139,7 @@ def score_curves(camera: str) -> rrb.Grid:
         *(
             rrb.BarChartView(
                 name=f"{axis.short}, {axis.unit}",
-                origin=entities.calib_curve(camera, axis.name),
+                origin=entities.CALIB_CURVE.path(camera, axis.name),
                 plot_legend=rrb.PlotLegend(visible=False),
             )
             for axis in AXES

@@ -54,18 +54,18 @@ class DifferenceLogger(Writer):
         self.static(entities.COMPARE_ABOUT, document(text))
         for change in DIFFERENT:
             self.static(
-                entities.difference(change),
+                entities.DIFFERENCE.path(change),
                 rr.Boxes3D.from_fields(
                     colors=[COLORS[change]], radii=rr.Radius.ui_points(2.5), show_labels=True
                 ),
             )
             self.static(
-                entities.difference_count(change),
+                entities.DIFFERENCE_COUNT.path(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
             )
         for outcome, state in (("broken", StateColor.BAD), ("fixed", StateColor.GOOD)):
             self.static(
-                entities.difference(outcome),
+                entities.DIFFERENCE.path(outcome),
                 rr.Boxes3D.from_fields(
                     colors=[state.value], radii=rr.Radius.ui_points(3.5), show_labels=True, fill_mode=OUTLINE
                 ),
@@ -73,7 +73,7 @@ class DifferenceLogger(Writer):
         for side, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
             for series in ("objects", "clusters"):
                 self.static(
-                    entities.difference_count(f"{series}_{side}"),
+                    entities.DIFFERENCE_COUNT.path(f"{series}_{side}"),
                     rr.SeriesLines(colors=[color], names=[f"{series} {side.upper()}"]),
                 )
 
@@ -100,14 +100,16 @@ class DifferenceLogger(Writer):
         for camera, pairs in differences.images.items():
             self._log_image(camera, pairs, differences)
         for name, value in _counts(differences).items():
-            self.scalar(entities.difference_count(name), float(value))
+            self.scalar(entities.DIFFERENCE_COUNT.path(name), float(value))
         self.put(entities.COMPARE, document(differences_page(differences)))
         changed = [d for d in differences.objects if d.change is not Change.SAME]
         self.lines(
             entities.COMPARE_LOG, [("INFO", f"{d.text} {differences.position_of(d)}") for d in changed]
         )
         worst = worst_of_each_class(differences.objects)
-        self._lanes.log(self, {entities.difference_state(name): change for name, change in worst.items()})
+        self._lanes.log(
+            self, {entities.DIFFERENCE_STATE.path(name): change for name, change in worst.items()}
+        )
         self.end()
 
     def _log_boxes(
@@ -116,7 +118,7 @@ class DifferenceLogger(Writer):
         side, rows = (differences.a, [d.row_a for d in objects])
         if change is not Change.ONLY_A:
             side, rows = (differences.b, [d.row_b for d in objects])
-        path = entities.difference(change)
+        path = entities.DIFFERENCE.path(change)
         # If the ground truth is known, only objects that one side alone finds get a name. They matter more.
         is_named = choose_named_in_3d(side.boxes.center[rows], height=HEIGHT)
         labels = [
@@ -128,7 +130,7 @@ class DifferenceLogger(Writer):
             start = differences.a.boxes.center[[d.row_a for d in objects]]
             end = differences.b.boxes.center[rows]
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
-            self.put(f"{path}/from_a", arrows)
+            self.put(entities.FROM_A, arrows)
 
     def _log_judged(self, judged: TruthComparison, world_from_points: F64) -> None:
         rows = np.array([*judged.broken, *judged.fixed], np.int64)
@@ -141,7 +143,7 @@ class DifferenceLogger(Writer):
                     for row, named in zip(rows[selected].tolist(), is_named[selected], strict=True)
                 ]
                 boxes = boxes3d(judged.boxes, rows[selected], labels)
-                self.put(entities.difference(outcome), transform(world_from_points), boxes)
+                self.put(entities.DIFFERENCE.path(outcome), transform(world_from_points), boxes)
 
     def _log_image(self, camera: str, pairs: tuple[Difference, ...], differences: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):
@@ -153,7 +155,7 @@ class DifferenceLogger(Writer):
             else:
                 boxes = differences.b.images[camera].xyxy[[d.row_b for d in selected]]
             self.put(
-                entities.image_difference(camera, change),
+                entities.IMAGE_DIFFERENCE.path(camera, change),
                 image_frame(camera),
                 boxes2d(
                     boxes,

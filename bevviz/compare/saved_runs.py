@@ -107,12 +107,12 @@ class SavedRun:
         if path == f"/__properties/{entities.PROPERTY}":
             self._property = _rows(chunk)[0]
             return
-        detections = entities.detections("*").split("*")
+        detections = entities.DETECTIONS.path("*").split("*")
         of_image = path.startswith(detections[0]) and path.endswith(detections[1])
         scalar_paths = (
             entities.FUSED,
             entities.EXPLAIN,
-            *(entities.count(c) for c in ("clusters", "detections")),
+            *(entities.COUNT.path(c) for c in ("clusters", "detections")),
         )
         if chunk.is_static or not (of_image or path in scalar_paths):
             return
@@ -124,7 +124,7 @@ class SavedRun:
                 frame.fused = row
             elif of_image:
                 frame.detections[path.removeprefix(detections[0]).removesuffix(detections[1])] = row
-            elif path == entities.count("detections"):
+            elif path == entities.COUNT.path("detections"):
                 frame.detected = True
             else:
                 frame.clusters = int(row["Scalars:scalars"][0])
@@ -214,9 +214,9 @@ class SavedPairRecorder(Observer[SavedFrames]):
 
 def _under_b(run: SavedRun) -> Iterator[Chunk]:
     """Yield the run's results, moved to ``/b``. The data of sensors and robot are those of the old run."""
-    input_paths = {entities.TRUTH, *(entities.points(lidar) for lidar in run.lidars)}
+    input_paths = {entities.TRUTH, *(entities.POINTS.path(lidar) for lidar in run.lidars)}
     for camera in run.cameras:
-        input_paths |= {entities.sensor(camera), entities.image(camera)}
+        input_paths |= {entities.SENSOR.path(camera), entities.IMAGE.path(camera)}
     property_path = f"/__properties/{entities.PROPERTY}"
     roots = (entities.WORLD, entities.EXPLAIN, entities.BEV, entities.HEALTH, entities.CONFIG)
     for chunk in run.stream():

@@ -22,14 +22,16 @@ def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
 def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
     """Return the image view with one run's detections and with those missing in the other run."""
     name, only_here = _SIDES[root]
-    image, detections = entities.image(camera_name), entities.detections(camera_name)
-    differences = [entities.image_difference(camera_name, change) for change in (only_here, Change.CLASS)]
+    image, detections = entities.IMAGE.path(camera_name), entities.DETECTIONS.path(camera_name)
+    differences = [
+        entities.IMAGE_DIFFERENCE.path(camera_name, change) for change in (only_here, Change.CLASS)
+    ]
     return rrb.Spatial2DView(
         name=f"{camera_name} {name}",
-        origin=entities.sensor(camera_name),
+        origin=entities.SENSOR.path(camera_name),
         contents=[image, f"{root}{image}/**", *differences],
         overrides=dict.fromkeys(
-            (root + entities.weak(camera_name), root + entities.names(detections)), HIDDEN
+            (root + entities.WEAK.path(camera_name), root + entities.NAMES.path(detections)), HIDDEN
         ),
     )
 
@@ -52,7 +54,7 @@ def changes(*which: Change) -> list[str]:
     Args:
         which: kinds of difference; none: all of them.
     """
-    return [f"{entities.difference(change)}/**" for change in (*(which or DIFFERENT), "broken", "fixed")]
+    return [f"{entities.DIFFERENCE.path(change)}/**" for change in (*(which or DIFFERENT), "broken", "fixed")]
 
 
 def compared() -> rrb.TextDocumentView:
@@ -72,21 +74,23 @@ def numbers() -> rrb.Tabs:
 
 def difference_counts() -> rrb.TimeSeriesView:
     """Return the plot of the number of objects that differ, by kind of difference."""
-    contents = [entities.difference_count(change) for change in DIFFERENT]
+    contents = [entities.DIFFERENCE_COUNT.path(change) for change in DIFFERENT]
     return plot("Objects that differ", entities.COMPARE, contents, linked=True)
 
 
 def side_counts() -> rrb.TimeSeriesView:
     """Return the plot of the number of objects and clusters on both sides."""
     contents = [
-        entities.difference_count(f"{what}_{side}") for what in ("objects", "clusters") for side in "ab"
+        entities.DIFFERENCE_COUNT.path(f"{what}_{side}") for what in ("objects", "clusters") for side in "ab"
     ]
     return plot("Objects and clusters", entities.COMPARE, contents, linked=True)
 
 
 def difference_states() -> rrb.StateTimelineView:
     """Return the timeline of the worst change of each class."""
-    return rrb.StateTimelineView(name="Worst of each class", origin=entities.COMPARE_STATES, time_view=LINKED)
+    return rrb.StateTimelineView(
+        name="Worst of each class", origin=entities.DIFFERENCE_STATE.above, time_view=LINKED
+    )
 
 
 def version() -> rrb.TextDocumentView:

@@ -43,10 +43,10 @@ class EvaluationRecorder(Observer[FrameResult]):
         """Log the colours and the names of the plots."""
         for outcome, color in TRUTH_COLORS.items():
             looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
-            self._writer.static(entities.judged(outcome), looks)
-            log_box_label_style(self._writer, entities.judged(outcome))
+            self._writer.static(entities.JUDGED.path(outcome), looks)
+            log_box_label_style(self._writer, entities.JUDGED.path(outcome))
             series = rr.SeriesLines(colors=[color], names=[outcome], widths=[2])
-            self._writer.static(entities.judged_count(outcome), series)
+            self._writer.static(entities.JUDGED_COUNT.path(outcome), series)
         log_mark_style(self._writer, items.scene.cameras)
 
     def observe(self, result: FrameResult) -> None:
@@ -69,7 +69,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         judged = self._evaluation.now
         texts_by_outcome = {outcome: judged[outcome] for outcome in (*_WRONG, "true")}
         for outcome, texts in texts_by_outcome.items():
-            writer.scalar(entities.judged_count(outcome), float(len(texts)))
+            writer.scalar(entities.JUDGED_COUNT.path(outcome), float(len(texts)))
         writer.put(entities.EVALUATE, document(_page(frame.index, truth, texts_by_outcome)))
         wrong = [("ERROR", f"{outcome} {text}") for outcome in _WRONG for text in texts_by_outcome[outcome]]
         writer.lines(entities.EVALUATE_LOG, wrong)
@@ -79,7 +79,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         """Log the boxes, and marks of the wrong ones. Right objects have names only under the pointer."""
         marks: list[Mark] = []
         for outcome, boxes, rows, names in groups:
-            chosen, path = boxes.chosen(rows), entities.judged(outcome)
+            chosen, path = boxes.chosen(rows), entities.JUDGED.path(outcome)
             causes = self._evaluation.causes if outcome == "false" else {}
             labels = [f"{outcome}: {names[row]}{_cause(causes, row)}" for row in rows]
             logged = boxes3d(boxes, np.asarray(rows), labels)

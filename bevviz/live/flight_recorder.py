@@ -72,10 +72,10 @@ class FlightRecorder(Closable):
     @property
     def scalars(self) -> dict[str, float]:
         """Size of the buffers, by entity path, for the health."""
-        scalars = {entities.process("flight_mb"): self.size / 1e6}
+        scalars = {entities.PROCESS.path("flight_mb"): self.size / 1e6}
         if self._raw is not None:
-            scalars[entities.process("raw_mb")] = self._raw.size / 1e6
-            scalars[entities.process("raw_s")] = self._raw.seconds
+            scalars[entities.PROCESS.path("raw_mb")] = self._raw.size / 1e6
+            scalars[entities.PROCESS.path("raw_s")] = self._raw.seconds
         return scalars
 
     def put(self, packet: Packet) -> None:

@@ -293,8 +293,8 @@ class Live:
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
-        drops = {entities.drops(where): float(count) for where, count in self._drops().items()}
-        lags = {entities.viewer_lag(name): 1e3 * lag for name, lag in self._lags.items()}
+        drops = {entities.DROPS.path(where): float(count) for where, count in self._drops().items()}
+        lags = {entities.VIEWER_LAG.path(name): 1e3 * lag for name, lag in self._lags.items()}
         health = self.health.scalars() | drops | lags | self.flight.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
@@ -356,7 +356,7 @@ class Live:
 
     def _topic_states(self) -> dict[str, str]:
         """Return the states of the topics, by entity path."""
-        return {entities.topic_state(topic): state for topic, state in self._source.states.items()}
+        return {entities.TOPIC_STATE.path(topic): state for topic, state in self._source.states.items()}
 
     def _drops(self) -> dict[str, int]:
         """Return the dropped frames and messages, by cause."""

@@ -96,10 +96,10 @@ class Health:
         """Return the values to log, by entity path. Latencies are in ms."""
         self._sample()
         return {
-            entities.latency("p50"): 1e3 * self.percentile(50),
-            entities.latency("p99"): 1e3 * self.percentile(99),
-            entities.process("cpu_percent"): self.cpu,
-            entities.process("memory_mb"): self.memory,
+            entities.LATENCY.path("p50"): 1e3 * self.percentile(50),
+            entities.LATENCY.path("p99"): 1e3 * self.percentile(99),
+            entities.PROCESS.path("cpu_percent"): self.cpu,
+            entities.PROCESS.path("memory_mb"): self.memory,
         }
 
     def clock_jump(self) -> float:

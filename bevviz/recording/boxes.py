@@ -141,7 +141,7 @@ def log_track_style(to: Writer) -> None:
     to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(TRACK_LANES)]))
     for name, radius in (("tracks", 1.0), ("trails", 1.5)):
         to.static(
-            entities.overlay(name),
+            entities.OVERLAY.path(name),
             class_annotations(),
             rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(radius), draw_order=20.0),
         )
@@ -164,10 +164,10 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
     trail, lengths = _trails(tracks, rows)
     to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
     pixels = bev_pixels(config, points_from_world, trail)
-    to.put(entities.overlay("trails"), rr.LineStrips2D(strips(pixels, lengths), class_ids=colors))
+    to.put(entities.OVERLAY.path("trails"), rr.LineStrips2D(strips(pixels, lengths), class_ids=colors))
     outlines = ground_outlines(geometry.corners(tracks.boxes)[rows])
     to.put(
-        entities.overlay("tracks"),
+        entities.OVERLAY.path("tracks"),
         rr.LineStrips2D(
             bev_pixels(config, points_from_world, outlines),
             class_ids=colors,
@@ -283,7 +283,7 @@ def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Log the ground truth boxes in 3D and over the bird's-eye image."""
     if frame.truth is not None and len(frame.truth.boxes):
         _log_labelled_boxes(to.put, entities.TRUTH, frame.truth, None)
-        path = entities.overlay("ground_truth")
+        path = entities.OVERLAY.path("ground_truth")
         _log_bev_outlines(to.put, path, frame.pose, frame.truth, config, _TRUTH_COLOR)
 
 
@@ -291,8 +291,8 @@ def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Log the robot's boxes and detections under the names of their topics."""
     for labelled in frame.robot_boxes:
         if len(labelled.boxes):
-            _log_labelled_boxes(to.put, entities.robot(labelled.topic), labelled, _ROBOT_COLOR)
-            path = entities.robot_overlay(labelled.topic)
+            _log_labelled_boxes(to.put, entities.ROBOT.path(labelled.topic), labelled, _ROBOT_COLOR)
+            path = entities.ROBOT_OVERLAY.path(labelled.topic)
             _log_bev_outlines(to.put, path, frame.pose, labelled, config, _ROBOT_COLOR)
     for detections in frame.robot_detections:
         if len(detections.xyxy):
@@ -309,15 +309,15 @@ def log_late(to: Writer, late: LateBoxes, config: BevConfig) -> None:
     if isinstance(boxes, LabelledBoxes2D):
         _log_image_boxes(to.write, boxes)
         return
-    _log_labelled_boxes(to.write, entities.robot(boxes.topic), boxes, _ROBOT_COLOR)
-    path = entities.robot_overlay(boxes.topic)
+    _log_labelled_boxes(to.write, entities.ROBOT.path(boxes.topic), boxes, _ROBOT_COLOR)
+    path = entities.ROBOT_OVERLAY.path(boxes.topic)
     if not _log_bev_outlines(to.write, path, late.pose, boxes, config, _ROBOT_COLOR):
         to.write(path, rr.Clear(recursive=False))
 
 
 def clear_late(to: Writer, topic: str) -> None:
     """Clear the boxes of a topic."""
-    for path in (entities.robot(topic), entities.robot_overlay(topic)):
+    for path in (entities.ROBOT.path(topic), entities.ROBOT_OVERLAY.path(topic)):
         to.write(path, rr.Clear(recursive=False))
 
 
@@ -337,7 +337,7 @@ def _log_labelled_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: C
 def _log_image_boxes(put: Put, detections: LabelledBoxes2D) -> None:
     """Log detections under /robot. They have the coordinate frame of the image, so that it can show them."""
     put(
-        entities.robot(detections.topic),
+        entities.ROBOT.path(detections.topic),
         *([image_frame(detections.camera)] if detections.camera else []),
         boxes2d(
             detections.xyxy,

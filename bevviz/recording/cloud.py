@@ -31,8 +31,8 @@ def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:
     """Log the static style of the points of each LiDAR."""
     for lidar in lidars:
         radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
-        to.static(entities.points(lidar), radii, quantity_annotations())
-        for path in (entities.ground(lidar), entities.obstacles(lidar)):
+        to.static(entities.POINTS.path(lidar), radii, quantity_annotations())
+        for path in (entities.GROUND.path(lidar), entities.OBSTACLES.path(lidar)):
             to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
 
 
@@ -44,7 +44,7 @@ def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -
     frame = result.frame
     log_cloud_poses(to, frame)
     heights = height_ids(result) if "height" in quantities else np.zeros(len(frame.points), np.uint8)
-    fields = {entities.points(cloud.name): cloud.fields for cloud in frame.clouds}
+    fields = {entities.POINTS.path(cloud.name): cloud.fields for cloud in frame.clouds}
     start = 0
     for path, points, class_ids in raw_clouds(result):
         end = start + len(points)
@@ -58,7 +58,7 @@ def log_cloud_poses(to: Writer, frame: Frame) -> None:
     """Log the pose of each LiDAR if there are several."""
     if len(frame.clouds) > 1:
         for cloud, points_from_cloud in zip(frame.clouds, frame.points_from_clouds, strict=True):
-            to.put(entities.sensor(cloud.name), transform(frame.pose @ points_from_cloud))
+            to.put(entities.SENSOR.path(cloud.name), transform(frame.pose @ points_from_cloud))
 
 
 def raw_clouds(result: FrameResult) -> list[RawCloud]:
@@ -69,12 +69,12 @@ def raw_clouds(result: FrameResult) -> list[RawCloud]:
         voxel_ids = np.where(result.ground.mask, ClassId.GROUND, ClassId.OBSTACLE).astype(np.uint16)
         class_ids = spread_to_points(voxel_ids, result.voxels.inverse)
     if len(frame.clouds) <= 1:
-        return [(entities.points(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
+        return [(entities.POINTS.path(frame.lidar), frame.points, class_ids)] if len(frame.points) else []
     clouds, end = [], 0
     for cloud in frame.clouds:
         start, end = end, end + len(cloud.xyz)
         if len(cloud.xyz):
-            clouds.append((entities.points(cloud.name), cloud.xyz, class_ids[start:end]))
+            clouds.append((entities.POINTS.path(cloud.name), cloud.xyz, class_ids[start:end]))
     return clouds
 
 
@@ -91,12 +91,12 @@ def log_ground(to: Writer, result: FrameResult, voxel_size: float, *, packed: bo
         return
     ground = result.voxels.points.compress(result.ground.mask, axis=0)
     ground = packed_points(ground, voxel_size) if packed else round_voxels(ground, voxel_size)
-    _log_class(to, entities.ground(result.frame.lidar), ground, ClassId.GROUND)
+    _log_class(to, entities.GROUND.path(result.frame.lidar), ground, ClassId.GROUND)
 
 
 def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
     """Log the obstacle points. ``round_voxels`` has rounded them."""
-    _log_class(to, entities.obstacles(frame.lidar), obstacles, ClassId.OBSTACLE)
+    _log_class(to, entities.OBSTACLES.path(frame.lidar), obstacles, ClassId.OBSTACLE)
 
 
 def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
@@ -320,11 +320,11 @@ def log_cluster_style(to: Writer, lidars: Iterable[str]) -> None:
     """Log the static style of the clusters of each LiDAR."""
     for lidar in lidars:
         to.static(
-            entities.clusters(lidar),
+            entities.CLUSTERS.path(lidar),
             rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
             rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
         )
-        to.static(entities.set_aside(lidar), rr.Boxes3D.from_fields(show_labels=False))
+        to.static(entities.SET_ASIDE.path(lidar), rr.Boxes3D.from_fields(show_labels=False))
 
 
 def log_clusters(
@@ -358,14 +358,14 @@ def log_clusters(
             points, labels = round_points(points.take(rows, axis=0), packed), labels.take(rows)
         point_ids, box_ids = _cluster_colors(clusters, tracked, labels, kept)
         to.put(
-            entities.clusters(frame.lidar),
+            entities.CLUSTERS.path(frame.lidar),
             rr.Points3D(points, class_ids=point_ids),
             boxes3d(boxes, kept, [f"{row}" for row in kept], class_ids=box_ids),
         )
     if len(others):
         states = [ClusterState(state) for state in clusters.state[others].tolist()]
         to.put(
-            entities.set_aside(frame.lidar),
+            entities.SET_ASIDE.path(frame.lidar),
             boxes3d(
                 boxes,
                 others,

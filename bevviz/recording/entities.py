@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from enum import IntEnum
+from typing import Self
 
-from bevviz.config import AnomalyKind
 from bevviz.model.results import ClusterState, DetectionState
 
 # --- timelines ---------------------------------------------------------------------------------
@@ -21,316 +22,50 @@ TIME_TOLERANCE = 1000  # nanoseconds of tolerance for times from a viewer, which
 
 # --- entities ----------------------------------------------------------------------------------
 
-WORLD = "/world"
-DIAGNOSTICS = "/robot/diagnostics"
-FUSED = "/world/fused"
-MEASURED = "/world/fused/measured"
-FUSION = "/world/fusion"  # result of our fusion, if the objects come from another source
-MISSED = "/world/missed"
-FALSE = "/world/false"
-UNNAMED = "/world/unnamed"
-FRUSTUMS = "/world/frustums"
-GRID = "/world/bev"
-TRUTH = "/world/ground_truth"
-BEV = "/bev"
-ROBOT = "/robot"
-ROTATION = "/motion/rotation_rad_s"
-ACCELERATION = "/motion/acceleration_m_s2"
-TRACKS = "/world/tracks"
-UNSEEN = "/world/tracks/unseen"
-TRAILS = "/world/tracks/trails"
-TRACK_STATES = "/tracks/states"
-TRACK_SPEEDS = "/tracks/speed_m_s"
-ANOMALY_COUNTS = "/anomalies/count"
-ANOMALY_LOG = "/anomalies/log"
-ANOMALY_STATES = "/anomalies/states"
-EXPLAIN = "/explain"
-EXPLAIN_LOG = "/explain/log"
-STATES = "/explain/states"
-WHY = "/explain/why"
-HEALTH = "/health"
-CONFIG = "/config"
-REPORT = "/report"
-DIGEST = "/report/digest"  # fingerprints of each frame's results
-PROPERTY = "bevviz"  # property of a recording that says how it was made
-BAG = "bag"  # property of a recording that says what it was made from
-B = "/b"  # root of the second run's tree in a comparison
-SWEEP = "/sweep"
-TUNE = "/tune"
-COMPARE = "/compare"
-COMPARE_ABOUT = "/compare/about"
-COMPARE_LOG = "/compare/log"
-COMPARE_STATES = "/compare/states"
-CALIB = "/calib"
-EVALUATE = "/evaluate"
-EVALUATE_ABOUT = "/evaluate/about"
-EVALUATE_LOG = "/evaluate/log"
 
+class Entity(str):
+    """Entity of a recording: its path, and what docs/recordings.md says of it.
 
-def sensor(name: str) -> str:
-    """Return the entity of a LiDAR or a camera. It carries the sensor's pose."""
-    return f"{WORLD}/{name}"
+    A path with braces is the template of many entities; ``path`` fills it in.
 
+    Args:
+        template: path.
+        types: Rerun types of the data.
+        content: what the data shows.
 
-def space(path: str) -> str:
-    """Return the coordinate frame that Rerun gives to an entity."""
-    return f"tf#{path}"
-
-
-def points(lidar: str) -> str:
-    """Return the entity of a LiDAR's raw points."""
-    return f"{WORLD}/{lidar}/points"
-
-
-def ground(lidar: str) -> str:
-    """Return the entity of a LiDAR's ground voxels."""
-    return f"{WORLD}/{lidar}/points/ground"
-
-
-def obstacles(lidar: str) -> str:
-    """Return the entity of a LiDAR's obstacle voxels."""
-    return f"{WORLD}/{lidar}/points/obstacles"
-
-
-def clusters(lidar: str) -> str:
-    """Return the entity of a LiDAR's kept clusters."""
-    return f"{WORLD}/{lidar}/clusters"
-
-
-def set_aside(lidar: str) -> str:
-    """Return the entity of clusters outside the size limits."""
-    return f"{WORLD}/{lidar}/clusters/set_aside"
-
-
-def image(camera: str) -> str:
-    """Return the entity of a camera's image."""
-    return f"{WORLD}/{camera}/image"
-
-
-def masks(camera: str) -> str:
-    """Return the entity of the detections' mask outlines in a camera's image."""
-    return f"{WORLD}/{camera}/image/detections/masks"
-
-
-def detections(camera: str) -> str:
-    """Return the entity of the kept detections in a camera's image."""
-    return f"{WORLD}/{camera}/image/detections"
-
-
-def weak(camera: str) -> str:
-    """Return the entity of detections below the threshold or suppressed by a better one."""
-    return f"{WORLD}/{camera}/image/detections/weak"
-
-
-def outlines(boxes: str) -> str:
-    """Return the entity of the outlines over boxes. Each has a sentence; see ``bevviz.recording.labels``."""
-    return f"{boxes}/outlines"
-
-
-def names(boxes: str) -> str:
-    """Return the entity of the names next to boxes."""
-    return f"{boxes}/names"
-
-
-def boxes_of(path: str) -> str:
-    """Return the entity of the boxes of these outlines or names. Other entities are returned unchanged."""
-    return path.removesuffix("/outlines").removesuffix("/names")
-
-
-def projected(camera: str) -> str:
-    """Return the entity of the obstacle points in a camera's image."""
-    return f"{WORLD}/{camera}/image/points"
-
-
-def image_opinion(camera: str, opinion: str) -> str:
-    """Return the entity of objects that share an opinion of the cameras, drawn over a camera's image.
-
-    The objects are external, from a 3D detector or a topic, or they are missed by it.
+    Attributes:
+        above: path above the first brace.
     """
-    return f"{image(camera)}/opinions/{_path_part(opinion)}"
 
-
-def overlay_opinion(opinion: str) -> str:
-    """Return the entity of objects that share an opinion of the cameras, drawn over the bird's-eye image."""
-    return overlay(f"opinions/{_path_part(opinion)}")
-
-
-def channel(name: str) -> str:
-    """Return the entity of a channel of the bird's-eye view."""
-    return f"{BEV}/{name}"
-
-
-def overlay(layer: str) -> str:
-    """Return the entity of an overlay on the bird's-eye image: tracks, trails, ground truth."""
-    return f"{BEV}/overlay/{layer}"
-
-
-def robot(topic: str) -> str:
-    """Return the entity of data that the robot published on a topic."""
-    return f"{ROBOT}{_topic_path(topic)}"
-
-
-def rotation(topic: str) -> str:
-    """Return the entity of an IMU's rotation rates."""
-    return f"{ROTATION}{_topic_path(topic)}"
-
-
-def acceleration(topic: str) -> str:
-    """Return the entity of an IMU's accelerations."""
-    return f"{ACCELERATION}{_topic_path(topic)}"
-
-
-def robot_overlay(topic: str) -> str:
-    """Return the entity of a topic's boxes, drawn over the bird's-eye image."""
-    return overlay(f"robot{_topic_path(topic)}")
-
-
-def diagnostic(name: str) -> str:
-    """Return the state lane of a component in the robot's diagnostics."""
-    return f"{DIAGNOSTICS}/{_path_part(name)}"
-
-
-def state(*lane: str) -> str:
-    """Return the entity of a state lane."""
-    return "/".join((STATES, *lane))
-
-
-def topic_state(topic: str) -> str:
-    """Return the lane that shows whether a topic's messages arrive and can be used."""
-    return f"{STATES}/topics{_topic_path(topic)}"
-
-
-def class_state(camera: str, class_name: str) -> str:
-    """Return the lane that shows the decision about the best detection of a class."""
-    return state(camera, _path_part(class_name))
-
-
-def why(part: str) -> str:
-    """Return the entity of a part of a ``bevviz why`` explanation: points by fate, boxes, frustums."""
-    return f"{WHY}/{part}"
-
-
-def difference(change: str) -> str:
-    """Return the entity of objects that differ in this way between two runs."""
-    return f"{COMPARE}/objects/{_change(change)}"
-
-
-def image_difference(camera: str, change: str) -> str:
-    """Return the entity of detections that differ in this way between two runs, in a camera's image."""
-    return f"{COMPARE}/{camera}/{_change(change)}"
-
-
-def difference_count(change: str) -> str:
-    """Return the entity of the number of such differences."""
-    return f"{COMPARE}/count/{_change(change)}"
-
-
-def difference_state(class_name: str) -> str:
-    """Return the lane of the differences of a class."""
-    return f"{COMPARE_STATES}/{_path_part(class_name)}"
-
-
-def judged(outcome: str) -> str:
-    """Return the entity of objects that are true, false or missed."""
-    return f"{EVALUATE}/objects/{outcome}"
-
-
-def marked(state: str) -> str:
-    """Return the entity of marked objects: missed, false or unexplained."""
-    return f"{WORLD}/{state}"
-
-
-def image_mark(camera: str, state: str) -> str:
-    """Return the entity of marked objects, drawn over a camera's image."""
-    return f"{image(camera)}/{state}"
-
-
-def judged_count(outcome: str) -> str:
-    """Return the entity of the number of true, false or missed objects."""
-    return f"{EVALUATE}/count/{outcome}"
-
-
-def sweep(metric: str) -> str:
-    """Return the entity of a metric over the parameter of a sweep."""
-    return f"{SWEEP}/{_path_part(metric)}"
-
-
-def track_state(lane: int) -> str:
-    """Return the entity of a track lane."""
-    return f"{TRACK_STATES}/{lane:02}"
-
-
-def anomaly_state(kind: AnomalyKind) -> str:
-    """Return the lane of an anomaly kind."""
-    return f"{ANOMALY_STATES}/{kind}"
-
-
-def stage_time(stage: str) -> str:
-    """Return the entity of a stage's time in milliseconds."""
-    return f"{HEALTH}/time_ms/{stage}"
-
-
-def rate(name: str) -> str:
-    """Return the entity of a rate in Hz."""
-    return f"{HEALTH}/rate_hz/{name}"
-
-
-def count(name: str) -> str:
-    """Return the entity of a count."""
-    return f"{HEALTH}/count/{name}"
-
-
-def sync_error(camera: str) -> str:
-    """Return the entity of a camera's sync error in milliseconds."""
-    return f"{HEALTH}/sync_error_ms/{camera}"
-
-
-def tf_age(sensor: str) -> str:
-    """Return the entity of the age of a sensor's transform in milliseconds."""
-    return f"{HEALTH}/tf_age_ms/{sensor}"
-
-
-def latency(percentile: str) -> str:
-    """Return the entity of a latency percentile in milliseconds.
-
-    Latency is the time from a cloud's arrival until its results are logged, over the last frames.
-    """
-    return f"{HEALTH}/latency_ms/{percentile}"
-
-
-def drops(stage: str) -> str:
-    """Return the entity of the number of frames dropped so far at one point of the pipeline."""
-    return f"{HEALTH}/drops/{stage}"
-
-
-def viewer_lag(name: str) -> str:
-    """Return the entity of a viewer's lag in milliseconds, from logging a frame until the viewer has it."""
-    return f"{HEALTH}/viewer_lag_ms/{name}"
-
-
-def process(resource: str) -> str:
-    """Return the entity of a resource that the process itself uses."""
-    return f"{HEALTH}/process/{resource}"
-
-
-def calib_result(camera: str) -> str:
-    """Return the entity of the text result of ``bevviz calib``."""
-    return f"{CALIB}/{camera}/result"
-
-
-def calib_curve(camera: str, axis: str) -> str:
-    """Return the entity of the score over the offset along one axis."""
-    return f"{CALIB}/{camera}/score/{axis}"
-
-
-def calib_stated(camera: str) -> str:
-    """Return the entity of image, points and edges with the stated calibration."""
-    return f"{CALIB}/{camera}/stated"
-
-
-def calib_corrected(camera: str) -> str:
-    """Return the entity of image, points and edges with the corrected calibration."""
-    return f"{CALIB}/{camera}/corrected"
+    types: str
+    content: str
+    above: str
+    _names: tuple[str, ...]
+
+    def __new__(cls, template: str, types: str, content: str) -> Self:
+        """Return the entity. Its path can be used like any string."""
+        entity = super().__new__(cls, template)
+        entity.types, entity.content = types, content
+        entity.above = template.partition("/{")[0]
+        entity._names = tuple(re.findall(r"{(\w+)}", template))
+        return entity
+
+    def path(self, *values: str) -> str:
+        """Return the path with these values in place of the names in braces."""
+        parts = {
+            name: SPELLINGS.get(name, str)(value) for name, value in zip(self._names, values, strict=True)
+        }
+        return self.format_map(parts)
+
+    @property
+    def row(self) -> str:
+        """Row of docs/recordings.md, in Markdown."""
+        return f"| `{self.translate({123: '<', 125: '>'})}` | {self.types} | {self.content} |"
+
+
+def table() -> Mapping[str, Entity]:
+    """Return all entities by name, in the order of the docs."""
+    return {name: entity for name, entity in globals().items() if isinstance(entity, Entity)}
 
 
 def _path_part(name: str) -> str:
@@ -338,12 +73,238 @@ def _path_part(name: str) -> str:
     return re.sub(r"[\s/\\]", "_", name) or "_"
 
 
-def _change(change: str) -> str:
-    return _path_part(change).lower()
+SPELLINGS: Mapping[str, Callable[[str], str]] = {  # names in braces whose values come from outside
+    "topic": lambda topic: "/".join(_path_part(part) for part in topic.split("/") if part),
+    "change": lambda change: _path_part(change).lower(),
+    **dict.fromkeys(("opinion", "class", "component", "chart"), _path_part),
+}
+
+# Entities without data of their own, above others.
+HEALTH = "/health"
+B = "/b"  # root of the second run's tree in a comparison
+
+# The scene
+WORLD = Entity(
+    "/world",
+    "ViewCoordinates, AnnotationContext (static)",
+    "the fixed frame, x forward, y left, z up; class ids",
+)
+SENSOR = Entity(
+    "/world/{sensor}",
+    "Transform3D; Pinhole (camera)",
+    "pose of a LiDAR, or of the base frame; pose and calibration of a camera",
+)
+POINTS = Entity(
+    "/world/{lidar}/points",
+    "Points3D, ColorBy",
+    "raw points; class id 0 unclassified, 1 ground, 2 obstacle; "
+    "[further colours](#colours-of-the-raw-points)",
+)
+GROUND = Entity(
+    "/world/{lidar}/points/ground",
+    "Points3D",
+    "voxels of the ground, rounded by at most an eighth of a voxel",
+)
+OBSTACLES = Entity(
+    "/world/{lidar}/points/obstacles", "Points3D", "voxels of obstacles, rounded in the same way"
+)
+CLUSTERS = Entity(
+    "/world/{lidar}/clusters", "Boxes3D, Points3D", "clusters with the number that `/explain` uses"
+)
+SET_ASIDE = Entity("/world/{lidar}/clusters/set_aside", "Boxes3D", "clusters outside the size limits")
+IMAGE = Entity(
+    "/world/{camera}/image",
+    "EncodedImage, VideoStream",
+    "the picture or video as it came; raw and WebP as JPEG",
+)
+DETECTIONS = Entity("/world/{camera}/image/detections", "Boxes2D", "kept detections")
+MASKS = Entity("/world/{camera}/image/detections/masks", "LineStrips2D", "outlines of masks")
+WEAK = Entity(
+    "/world/{camera}/image/detections/weak", "Boxes2D", "detections below the threshold or suppressed"
+)
+PROJECTED = Entity(
+    "/world/{camera}/image/points", "Points2D", "obstacle points by depth, 0 to 50 m, near red"
+)
+MARKED = Entity(
+    "/world/{mark}",
+    "LineStrips3D, AnyValues; Boxes3D in `bevviz open`",
+    "`missed`: dashed red; `false`: crossed out yellow; without ground truth `unexplained`: unmatched "
+    "detections and clusters of a person's size, dotted; `unnamed`: in `bevviz open`",
+)
+IMAGE_MARK = Entity(
+    "/world/{camera}/image/{mark}",
+    "LineStrips2D, AnyValues; Boxes2D in `bevviz open`",
+    "the same in an image",
+)
+IMAGE_OPINION = Entity(
+    "/world/{camera}/image/opinions/{opinion}",
+    "LineStrips2D, AnyValues",
+    "[opinions on another method's objects](stages.md#two-opinions-on-the-objects): `contradicted` yellow, "
+    "`named_otherwise` purple, `missed` red, `confirmed` blue, `unseen` grey; `says` is why",
+)
+FRUSTUMS = Entity("/world/frustums", "LineStrips3D", "detections in space; grey without a match")
+FUSED = Entity(
+    "/world/fused",
+    "Boxes3D, AnyValues",
+    "objects; `class_name`, `score`, `track`, `speed`, `cluster`, `camera`, `seen` (sides), `reason`, "
+    "`opinion`",
+)
+MEASURED = Entity("/world/fused/measured", "Boxes3D", "the part that was seen")
+FUSION = Entity("/world/fusion", "Boxes3D, AnyValues", "objects of bevviz's fusion beside another method's")
+OUTLINES = Entity(
+    "{boxes}/outlines",
+    "LineStrips3D, LineStrips2D, AnyValues",
+    "of objects, detections and evaluated objects, row for row; `says` is the tooltip",
+)
+NAMES = Entity(
+    "{boxes}/names",
+    "Points3D, Points2D, AnyValues",
+    "names of anomalies, of detections without a match, and of marks",
+)
+TRACKS = Entity("/world/tracks", "Boxes3D", "[tracks](project.md#tracking), smoothed, in the fixed frame")
+UNSEEN = Entity("/world/tracks/unseen", "Boxes3D", "expected place of tracks without a name in this frame")
+TRAILS = Entity("/world/tracks/trails", "LineStrips3D", "the last seconds")
+TRUTH = Entity("/world/ground_truth", "Boxes3D", "labels")
+GRID = Entity("/world/bev", "GridMap", "occupancy: 0 free, 100 occupied, -1 (255) unknown")
+BEV = Entity("/bev", "EncodedImage", "bird's-eye view; PNG with `bev.style=reference`, else JPEG")
+CHANNEL = Entity("/bev/{channel}", "Image", "`density`, `height`, `intensity`: those of `bev.channels`")
+OVERLAY = Entity(
+    "/bev/overlay/{layer}",
+    "LineStrips2D, AnyValues",
+    "over its pixels: `tracks`, `trails`, `ground_truth`, marks, `why`",
+)
+OVERLAY_OPINION = Entity(
+    "/bev/overlay/opinions/{opinion}", "LineStrips2D, AnyValues", "opinions, as in the images"
+)
+ROBOT_OVERLAY = Entity("/bev/overlay/robot/{topic}", "LineStrips2D", "boxes that the robot published")
+ROBOT = Entity(
+    "/robot/{topic}", "Boxes3D, Boxes2D ...", "the robot's own [messages](live.md#what-it-receives)"
+)
+MESH = Entity("/robot/{topic}/{mesh}", "Asset3D", "meshes of the robot's description, static")
+DIAGNOSTIC = Entity("/robot/diagnostics/{component}", "StateChange", "`ok`, `warning`, `error`, `stale`")
+ROTATION = Entity("/motion/rotation_rad_s/{topic}", "Scalars", "x, y, z of an Imu")
+ACCELERATION = Entity("/motion/acceleration_m_s2/{topic}", "Scalars", "x, y, z of an Imu")
+
+# Decisions
+EXPLAIN = Entity(
+    "/explain", "TextDocument", "failures, problems, and the decision on each detection and cluster"
+)
+EXPLAIN_LOG = Entity(
+    "/explain/log", "TextLog", "failures (ERROR), problems (WARN), detections without a match (INFO)"
+)
+STATE = Entity(
+    "/explain/states/{lane}",
+    "StateChange",
+    "`pipeline`: `ok`, `no detector`, `degraded` (an input is missing), `failed` (a stage failed); "
+    "a camera: `ok`, `degraded`, `not fused`; `marks`: notes (`/bevviz/mark`)",
+)
+CLASS_STATE = Entity(
+    "/explain/states/{camera}/{class}",
+    "StateChange",
+    "of the best detection: `matched`, `no cluster`, `taken` ...",
+)
+TOPIC_STATE = Entity("/explain/states/topics/{topic}", "StateChange", "problems of a robot's topics")
+ANOMALY_STATE = Entity("/anomalies/states/{kind}", "StateChange", "subject of the anomaly, `+n` for n others")
+ANOMALY_LOG = Entity("/anomalies/log", "TextLog", "beginnings of anomalies")
+ANOMALY_COUNTS = Entity("/anomalies/count", "Scalars", "number by kind")
+TRACK_STATE = Entity("/tracks/states/{lane}", "StateChange", "12 lanes; a track keeps its lane")
+TRACK_SPEEDS = Entity("/tracks/speed_m_s", "Scalars", "speed of the track of each lane")
+WHY = Entity("/explain/why", "TextDocument", "of `bevviz why`: verdicts and chains")
+WHY_PART = Entity(
+    "/explain/why/{part}",
+    "Points3D, LineStrips3D, Boxes2D",
+    "`points`: raw points, brown ground, red noise, orange set aside, yellow unnamed cluster, light blue "
+    "reported, dark blue in front; `legend`: its name and counts; `place`, `<camera>/place`: its place, "
+    "thin for further subjects",
+)
+
+# Health
+STAGE_TIME = Entity("/health/time_ms/{stage}", "Scalars", "time of each stage, and `total`")
+RATE = Entity(
+    "/health/rate_hz/{rate}",
+    "Scalars",
+    "`pipeline`: possible frames a second; `sensor`: by stamps; `received`: by arrival",
+)
+COUNT = Entity(
+    "/health/count/{count}",
+    "Scalars",
+    "`points`, `invalid_points`, `voxels`, `obstacle_points`, `clusters`, `detections`, `matches`, "
+    "`problems`, `failures`, `skipped_frames`; of opinions `confirmed`, `named_otherwise`, `contradicted`, "
+    "`unseen`, `missed`",
+)
+LATENCY = Entity(
+    "/health/latency_ms/{percentile}",
+    "Scalars",
+    "from a cloud's arrival until its results are logged, of the last frames",
+)
+DROPS = Entity("/health/drops/{place}", "Scalars", "beside a robot: frames dropped so far")
+VIEWER_LAG = Entity(
+    "/health/viewer_lag_ms/{viewer}", "Scalars", "beside a robot: until the viewer's process has a frame"
+)
+PROCESS = Entity(
+    "/health/process/{resource}", "Scalars", "beside a robot: CPU, memory, `raw_mb`, `raw_s`, `flight_mb`"
+)
+SYNC_ERROR = Entity(
+    "/health/sync_error_ms/{camera}", "Scalars", "stamp of the image minus stamp of the cloud"
+)
+TF_AGE = Entity("/health/tf_age_ms/{sensor}", "Scalars", "to the nearest transform")
+
+# Evaluate, compare, tune, sweep, calib
+EVALUATE = Entity("/evaluate", "TextDocument", "the frame")
+EVALUATE_ABOUT = Entity("/evaluate/about", "TextDocument", "the tables (static)")
+JUDGED = Entity("/evaluate/objects/{outcome}", "Boxes3D", "objects: `true`, `missed`, `false`")
+JUDGED_COUNT = Entity("/evaluate/count/{outcome}", "Scalars", "their number")
+EVALUATE_LOG = Entity("/evaluate/log", "TextLog", "each missed and false one")
+COMPARE = Entity("/compare", "TextDocument", "the frame")
+COMPARE_ABOUT = Entity("/compare/about", "TextDocument", "A, B and the parameters that differ (static)")
+DIFFERENCE = Entity(
+    "/compare/objects/{change}",
+    "Boxes3D",
+    "`only_a`, `only_b`, `moved`, `other_class`, `broken`, `fixed`, in B's place where both have one",
+)
+FROM_A = Entity("/compare/objects/moved/from_a", "Arrows3D", "from A's centre to B's")
+IMAGE_DIFFERENCE = Entity(
+    "/compare/{camera}/{change}", "Boxes2D", "detections that differ: `only_a`, `only_b`, `other_class`"
+)
+DIFFERENCE_COUNT = Entity("/compare/count/{change}", "Scalars", "differences counted")
+DIFFERENCE_STATE = Entity("/compare/states/{class}", "StateChange", "the worst difference by class")
+COMPARE_LOG = Entity("/compare/log", "TextLog", "all differences in words")
+TUNE = Entity("/tune", "TextDocument", "changes of a version")
+SWEEP = Entity("/sweep", "TextDocument", "table of the sweep")
+SWEEP_CHART = Entity("/sweep/{chart}", "LineStrips2D, Points2D; Image", "curves; heat maps")
+CALIB_RESULT = Entity(
+    "/calib/{camera}/result",
+    "TextDocument",
+    "of [`bevviz calib`](calib.md): the answer, the table and the corrected extrinsics",
+)
+CALIB_CURVE = Entity(
+    "/calib/{camera}/score/{axis}",
+    "BarChart",
+    "score over the offset; blue fine, red off, grey cannot tell, yellow no agreement",
+)
+CALIB_STATED = Entity(
+    "/calib/{camera}/stated",
+    "EncodedImage, Points2D",
+    "`image`; `points`: every point by depth; `edges`: the cloud's edges, as stated",
+)
+CALIB_CORRECTED = Entity("/calib/{camera}/corrected", "EncodedImage, Points2D", "the same, corrected")
+
+# Provenance
+CONFIG = Entity("/config", "TextDocument", "configuration and versions")
+REPORT = Entity("/report", "TextDocument", "note, files and commands of a report")
+DIGEST = Entity("/report/digest", "AnyValues", "fingerprints of each frame's results")
+PROPERTY = "bevviz"  # property of a recording that says how it was made
+BAG = "bag"  # property of a recording that says what it was made from
 
 
-def _topic_path(topic: str) -> str:
-    return "".join(f"/{_path_part(part)}" for part in topic.split("/") if part)
+def space(path: str) -> str:
+    """Return the coordinate frame that Rerun gives to an entity."""
+    return f"tf#{path}"
+
+
+def boxes_of(path: str) -> str:
+    """Return the entity of the boxes of these outlines or names. Other entities are returned unchanged."""
+    return path.removesuffix("/outlines").removesuffix("/names")
 
 
 # --- class ids ---------------------------------------------------------------------------------

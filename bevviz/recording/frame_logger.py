@@ -137,7 +137,7 @@ class FrameLogger(Writer):
         self._intrinsics: dict[str, Intrinsics] = {}
         self._static_data: dict[str, StaticData] = {}
         self._track_lanes = TrackLanes()
-        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATES)
+        self._state_lanes = StateLanes(COLORS, plain_lanes=entities.ANOMALY_STATE.above)
         self._robot_log = DiagnosticsLog()
         self._onsets = Onsets()
         self._last_frame: Frame | None = None
@@ -289,7 +289,7 @@ class FrameLogger(Writer):
         """Log the results of the stages for this frame alone."""
         frame = result.frame
         if frame.lidar:
-            self.put(entities.sensor(frame.lidar), transform(frame.pose))
+            self.put(entities.SENSOR.path(frame.lidar), transform(frame.pose))
         entities_before = set(self._frame_entities)
         if self._inputs:
             self._log_input(result)
@@ -414,8 +414,8 @@ class FrameLogger(Writer):
         Call it after anomalies and states are logged, because changes in them select the clouds.
         """
         lanes = [
-            entities.state("pipeline"),
-            *(entities.state(camera.camera.name) for camera in result.cameras),
+            entities.STATE.path("pipeline"),
+            *(entities.STATE.path(camera.camera.name) for camera in result.cameras),
         ]
         states = {lane: self._state_lanes.states.get(lane, "") for lane in lanes}
         is_requested = bool(mark_lines(result.frame)) or self._config_changed

@@ -54,7 +54,7 @@ class FrameRates:
 
 def log_health_style(to: Writer) -> None:
     """Log the static colours of the stage time and count curves."""
-    for paths in (map(entities.stage_time, STAGES), map(entities.count, COUNTS)):
+    for paths in (map(entities.STAGE_TIME.path, STAGES), map(entities.COUNT.path, COUNTS)):
         for path, color in zip(paths, SERIES_COLORS, strict=False):
             to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
 
@@ -86,18 +86,18 @@ def health(result: FrameResult, last: Frame | None, rates: FrameRates) -> Iterat
     """
     frame = result.frame
     for stage, seconds in result.timings.items():
-        yield entities.stage_time(stage), seconds * 1e3
+        yield entities.STAGE_TIME.path(stage), seconds * 1e3
     if result.timings.get("total"):
-        yield entities.rate("pipeline"), 1 / result.timings["total"]
+        yield entities.RATE.path("pipeline"), 1 / result.timings["total"]
     for name, rate in rates:
-        yield entities.rate(name), rate
+        yield entities.RATE.path(name), rate
     for name, number in count_results(result, last).items():
-        yield entities.count(name), number
+        yield entities.COUNT.path(name), number
     if frame.lidar:
-        yield entities.tf_age(frame.lidar), frame.tf_age * 1e3
+        yield entities.TF_AGE.path(frame.lidar), frame.tf_age * 1e3
     for camera in result.cameras:
-        yield entities.sync_error(camera.camera.name), camera.camera.sync_error * 1e3
-        yield entities.tf_age(camera.camera.name), camera.camera.tf_age * 1e3
+        yield entities.SYNC_ERROR.path(camera.camera.name), camera.camera.sync_error * 1e3
+        yield entities.TF_AGE.path(camera.camera.name), camera.camera.tf_age * 1e3
 
 
 # --- anomalies ---------------------------------------------------------------------------------

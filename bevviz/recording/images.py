@@ -52,16 +52,18 @@ def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
     """Log the static style of detections, labels and projected points of each camera."""
     for camera in cameras:
         to.static(
-            entities.projected(camera),
+            entities.PROJECTED.path(camera),
             depth_annotations(),
             rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
         )
-        to.static(entities.detections(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False))
-        log_image_box_label_style(to, entities.detections(camera), 31.0)
+        to.static(
+            entities.DETECTIONS.path(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False)
+        )
+        log_image_box_label_style(to, entities.DETECTIONS.path(camera), 31.0)
         if to.root:
             log_over_shared_image(to, camera)
         to.static(
-            entities.weak(camera),
+            entities.WEAK.path(camera),
             rr.Boxes2D.from_fields(
                 colors=[FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
             ),
@@ -70,15 +72,20 @@ def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
 
 def log_over_shared_image(to: Writer, camera: str) -> None:
     """Draw the results of a run under a root over the main run's image. There is only one image."""
-    boxes = entities.detections(camera)
-    paths = (entities.projected(camera), boxes, entities.outlines(boxes), entities.names(boxes))
-    for path in (*paths, entities.weak(camera)):
+    boxes = entities.DETECTIONS.path(camera)
+    paths = (
+        entities.PROJECTED.path(camera),
+        boxes,
+        entities.OUTLINES.path(boxes),
+        entities.NAMES.path(boxes),
+    )
+    for path in (*paths, entities.WEAK.path(camera)):
         to.static(path, image_frame(camera))
 
 
 def image_frame(camera: str) -> rr.CoordinateFrame:
     """Return the coordinate frame of the camera's image. An entity with it is drawn over the image."""
-    return rr.CoordinateFrame(entities.space(entities.image(camera)))
+    return rr.CoordinateFrame(entities.space(entities.IMAGE.path(camera)))
 
 
 def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
@@ -105,7 +112,7 @@ def log_camera(
     """
     camera, world_from_camera = result.camera, camera_pose(frame, result)
     if world_from_camera is not None:
-        to.put(entities.sensor(camera.name), transform(world_from_camera))
+        to.put(entities.SENSOR.path(camera.name), transform(world_from_camera))
     if camera.image is not None:
         is_stream = camera.image.clip is not None and to.streams_video
         if videos is not None and not is_stream and camera.image.media_type not in retention.LOSSY:
@@ -117,7 +124,7 @@ def log_camera(
 def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
     """Log the intrinsics as static data, so that a viewer that connects late has them."""
     to.static(
-        entities.sensor(name),
+        entities.SENSOR.path(name),
         rr.Pinhole(
             image_from_camera=intrinsics.K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]]),
             resolution=[intrinsics.width, intrinsics.height],
@@ -129,7 +136,7 @@ def log_intrinsics(to: Writer, name: str, intrinsics: Intrinsics) -> None:
 
 def log_image(to: Writer, name: str, image: Image, quality: int) -> None:
     """Log an image once. A camera may be slower than the LiDAR, so several frames may share an image."""
-    path = entities.image(name)
+    path = entities.IMAGE.path(name)
     if to.keep(path, image.stamp):
         return
     if image.clip is not None and to.streams_video:
@@ -155,7 +162,7 @@ class VideoEncoders:
         if self._recording is not to.recording:
             self._recording = to.recording
             self.restart()
-        path = entities.image(name)
+        path = entities.IMAGE.path(name)
         if to.keep(path, image.stamp):
             return
         if name not in self._encoders:
@@ -201,10 +208,10 @@ def log_detections(
         return
     kept, others = np.flatnonzero(detections.kept), np.flatnonzero(~detections.kept)
     if len(others):
-        to.put(entities.weak(name), _detection_boxes(detections, others))
+        to.put(entities.WEAK.path(name), _detection_boxes(detections, others))
     if len(kept):
         colors = [class_color(detections.names[row]) for row in kept]
-        to.put(entities.detections(name), _detection_boxes(detections, kept, colors=colors))
+        to.put(entities.DETECTIONS.path(name), _detection_boxes(detections, kept, colors=colors))
         texts = texts_by_row(explanations, "detection", name)
         if detections.masks is not None:
             _log_masks(to, name, detections, detections.masks, kept)
@@ -223,7 +230,7 @@ def log_detections(
         has_name = choose_named(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, doubtful) & doubtful
         log_image_box_labels(
             to,
-            entities.detections(name),
+            entities.DETECTIONS.path(name),
             xyxy,
             [label if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
             [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)],
@@ -258,7 +265,7 @@ def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows
             lines.append((closed + corner) / masks.grid[:2])
             colors.append(class_color(detections.names[row]))
     if lines:
-        to.put(entities.masks(name), rr.LineStrips2D(lines, colors=colors))
+        to.put(entities.MASKS.path(name), rr.LineStrips2D(lines, colors=colors))
 
 
 def _detection_boxes(detections: Detections, rows: I64, **style: Any) -> rr.Boxes2D:
@@ -290,7 +297,7 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
                 np.rint(uv[rows] * retention.PIXEL_STEPS) / np.float32(retention.PIXEL_STEPS),
                 depth[rows],
             )
-        to.put(entities.projected(result.camera.name), rr.Points2D(uv, class_ids=depth))
+        to.put(entities.PROJECTED.path(result.camera.name), rr.Points2D(uv, class_ids=depth))
 
 
 # --- frustums ----------------------------------------------------------------------------------
@@ -357,7 +364,7 @@ def log_bev(to: Writer, bev: Bev, config: Config) -> None:
     to.put(entities.BEV, png(bev.image) if is_reference else jpeg(bev.image, quality))
     for name, grid in bev.channels.items():
         if name != "occupancy":
-            to.put(entities.channel(name), rr.Image(grid, color_model="L"))
+            to.put(entities.CHANNEL.path(name), rr.Image(grid, color_model="L"))
 
 
 def log_grid(to: Writer, result: FrameResult, bev: Bev) -> None:

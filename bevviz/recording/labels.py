@@ -31,16 +31,17 @@ _INVISIBLE, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
 def log_box_label_style(to: Writer, path: str) -> None:
     """Log the static style of outlines and names of 3D boxes."""
-    to.static(entities.outlines(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
+    to.static(entities.OUTLINES.path(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
     to.static(
-        entities.names(path), rr.Points3D.from_fields(radii=_INVISIBLE, colors=[_COLOR], show_labels=True)
+        entities.NAMES.path(path),
+        rr.Points3D.from_fields(radii=_INVISIBLE, colors=[_COLOR], show_labels=True),
     )
 
 
 def log_image_box_label_style(to: Writer, path: str, draw_order: float) -> None:
     """Log the static style of outlines and names of boxes in an image."""
     lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
-    to.static(entities.outlines(path), lines)
+    to.static(entities.OUTLINES.path(path), lines)
     log_name_style(to, path, draw_order + 1)
 
 
@@ -49,7 +50,7 @@ def log_name_style(to: Writer, path: str, draw_order: float) -> None:
     points = rr.Points2D.from_fields(
         radii=_INVISIBLE, colors=[_COLOR], show_labels=True, draw_order=draw_order
     )
-    to.static(entities.names(path), points)
+    to.static(entities.NAMES.path(path), points)
 
 
 def log_box_labels(
@@ -72,10 +73,12 @@ def log_box_labels(
     """
     rows, tooltips = _logged_rows(len(boxes)), rr.AnyValues(says=_repeat_single(sentences))
     lines = edges(geometry.corners(boxes))[rows]
-    to.put(entities.outlines(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), tooltips)
+    to.put(
+        entities.OUTLINES.path(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), tooltips
+    )
     if any(names):
         tops = boxes.center + boxes.size * np.array([0, 0, 0.5], np.float32)
-        to.put(entities.names(path), rr.Points3D(tops[rows], labels=_repeat_single(names)), tooltips)
+        to.put(entities.NAMES.path(path), rr.Points3D(tops[rows], labels=_repeat_single(names)), tooltips)
 
 
 def log_image_box_labels(
@@ -84,10 +87,12 @@ def log_image_box_labels(
     """Log outlines and names over boxes in an image. ``xyxy``: (K, 4) pixels in bevviz's convention."""
     rows, tooltips = _logged_rows(len(xyxy)), rr.AnyValues(says=_repeat_single(sentences))
     corners = (xyxy + CORNER)[rows][:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
-    to.put(entities.outlines(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), tooltips)
+    to.put(
+        entities.OUTLINES.path(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), tooltips
+    )
     if any(names):
         to.put(
-            entities.names(path),
+            entities.NAMES.path(path),
             rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_repeat_single(names)),
             tooltips,
         )
@@ -101,7 +106,7 @@ def log_labelled_outlines(
     lines = [strokes[row] for row in rows]
     to.put(path, rr.LineStrips2D(strips(np.concatenate(lines), np.array([*map(len, lines)]))), tooltips)
     if any(names):
-        to.put(entities.names(path), rr.Points2D(places[rows], labels=_repeat_single(names)), tooltips)
+        to.put(entities.NAMES.path(path), rr.Points2D(places[rows], labels=_repeat_single(names)), tooltips)
 
 
 def box_row(instance: int, count: int) -> int:

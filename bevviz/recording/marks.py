@@ -79,10 +79,13 @@ def log_mark_style(to: Writer, cameras: Iterable[str]) -> None:
         radii=rr.Radius.ui_points(0.0), colors=[StateColor.SUBJECT.value], show_labels=True
     )
     for state, color in MARK_COLORS.items():
-        path = entities.marked(state)
+        path = entities.MARKED.path(state)
         to.static(path, rr.LineStrips3D.from_fields(colors=[color], radii=rr.Radius.ui_points(2.0)))
-        to.static(entities.names(path), names)
-        for flat in (entities.overlay(state), *(entities.image_mark(name, state) for name in cameras)):
+        to.static(entities.NAMES.path(path), names)
+        for flat in (
+            entities.OVERLAY.path(state),
+            *(entities.IMAGE_MARK.path(name, state) for name in cameras),
+        ):
             radius = rr.Radius.ui_points(1.75)
             lines = rr.LineStrips2D.from_fields(colors=[color], radii=radius, draw_order=36.0)
             to.static(flat, lines)
@@ -100,14 +103,16 @@ def log_marks(to: Writer, result: FrameResult, marks: Sequence[Mark]) -> None:
         rows = [row for row, mark in enumerate(marks) if mark.state == state]
         if not rows:
             continue
-        path, chosen = entities.marked(state), [marks[row] for row in rows]
+        path, chosen = entities.MARKED.path(state), [marks[row] for row in rows]
         lines = [_styled(state, mark.corners[np.array(_edges(mark))]) for mark in chosen]
         to.put(path, pose, rr.LineStrips3D(np.concatenate(lines)), _tooltips(chosen, lines))
         named = [marks[row] for row in rows if has_name[row] and marks[row].name]
         if named:
             places = np.stack([mark.center for mark in named]) + np.array([0, 0, 0.3], np.float32)
             words = rr.Points3D(places, labels=[mark.name for mark in named])
-            to.put(entities.names(path), pose, words, rr.AnyValues(says=[mark.sentence for mark in named]))
+            to.put(
+                entities.NAMES.path(path), pose, words, rr.AnyValues(says=[mark.sentence for mark in named])
+            )
         _log_above(to, state, chosen, result.config.bev)
     for camera in result.cameras:
         _log_in_image(to, camera.camera, [mark for mark in marks if mark.box is not None])
@@ -125,7 +130,7 @@ def _log_above(to: Writer, state: MarkState, marks: Sequence[Mark], config: BevC
             _styled(state, row[np.array(rim if mark.box is not None else _WEDGE)])
             for mark, row in zip(inside, pixels, strict=True)
         ]
-        to.put(entities.overlay(state), rr.LineStrips2D(np.concatenate(lines)), _tooltips(inside, lines))
+        to.put(entities.OVERLAY.path(state), rr.LineStrips2D(np.concatenate(lines)), _tooltips(inside, lines))
 
 
 def _log_in_image(to: Writer, camera: Camera, marks: Sequence[Mark]) -> None:
@@ -157,13 +162,13 @@ def _log_in_image(to: Writer, camera: Camera, marks: Sequence[Mark]) -> None:
             corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], np.float32)
             rim = (*_SIDES, *_FLAT_CROSS) if state == "false" else _SIDES
             lines.append(_styled(state, corners[np.array(rim)]))
-        path, chosen = entities.image_mark(camera.name, state), [drawn[row][0] for row in rows]
+        path, chosen = entities.IMAGE_MARK.path(camera.name, state), [drawn[row][0] for row in rows]
         to.put(path, rr.LineStrips2D(np.concatenate(lines)), _tooltips(chosen, lines))
         named = [row for row in rows if has_name[row] and drawn[row][0].name]
         if named:
             words = rr.Points2D(places[named], labels=[drawn[row][0].name for row in named])
             sentences = rr.AnyValues(says=[drawn[row][0].sentence for row in named])
-            to.put(entities.names(path), words, sentences)
+            to.put(entities.NAMES.path(path), words, sentences)
 
 
 def _edges(mark: Mark) -> Lines:

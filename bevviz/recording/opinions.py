@@ -51,22 +51,22 @@ def log_opinion_style(to: Writer, cameras: Iterable[str]) -> None:
     thin = rr.Radius.ui_points(0.5)
     to.static(entities.FUSION, rr.Boxes3D.from_fields(radii=thin, show_labels=False, fill_mode=OUTLINE))
     lines = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.0))
-    to.static(entities.outlines(entities.FUSION), lines)
+    to.static(entities.OUTLINES.path(entities.FUSION), lines)
     points = rr.Points3D.from_fields(
         radii=rr.Radius.ui_points(0.0), colors=[StateColor.DOUBTFUL.value], show_labels=True
     )
-    to.static(entities.names(entities.FUSION), points)
+    to.static(entities.NAMES.path(entities.FUSION), points)
     for camera in cameras:
         for opinion in OPINION_COLORS:
-            path = entities.image_opinion(camera, opinion)
+            path = entities.IMAGE_OPINION.path(camera, opinion)
             _log_outline_style(to, path, opinion)
             if to.root:
-                for entity in (path, entities.names(path)):
+                for entity in (path, entities.NAMES.path(path)):
                     to.static(entity, image_frame(camera))
     for opinion in OPINION_COLORS:
-        _log_outline_style(to, entities.overlay_opinion(opinion), opinion)
+        _log_outline_style(to, entities.OVERLAY_OPINION.path(opinion), opinion)
     for name, color in zip(COUNTED, SERIES_COLORS[len(COUNTS) :], strict=False):
-        to.static(entities.count(name), rr.SeriesLines(colors=[color], widths=[1.5]))
+        to.static(entities.COUNT.path(name), rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
 def log_fusion(to: Writer, result: FrameResult) -> None:
@@ -126,7 +126,7 @@ class OpinionOutlines:
 def opinion_outlines_in_image(result: FrameResult, camera: Camera) -> Mapping[str, OpinionOutlines]:
     """Return the outlines of objects in a camera's image, by the entity of their opinion."""
     return {
-        entities.image_opinion(camera.name, opinion): outlines
+        entities.IMAGE_OPINION.path(camera.name, opinion): outlines
         for opinion, boxes, rows in _by_opinion(result)
         if (outlines := _visible_outlines(opinion, rows, image_outlines(boxes.chosen(rows), camera))).rows
     }
@@ -145,7 +145,7 @@ def opinion_outlines_in_bev(result: FrameResult) -> Mapping[str, OpinionOutlines
         if len(rows):
             outlines = ground_outlines(geometry.corners(boxes.chosen(rows)))
             strokes = [*bev_pixels(config, np.eye(4), outlines)]
-            outlines_by_entity[entities.overlay_opinion(opinion)] = OpinionOutlines(
+            outlines_by_entity[entities.OVERLAY_OPINION.path(opinion)] = OpinionOutlines(
                 opinion, rows.tolist(), strokes
             )
     return outlines_by_entity

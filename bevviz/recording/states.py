@@ -77,30 +77,34 @@ def states_of(result: FrameResult) -> dict[str, str]:
     degraded = result.frame.problems or any(camera_result.camera.problems for camera_result in result.cameras)
     has_detector = not result.cameras or any(camera.detections is not None for camera in result.cameras)
     state = "ok" if has_detector else "no detector"
-    states = {entities.state("pipeline"): "failed" if result.failures else "degraded" if degraded else state}
+    states = {
+        entities.STATE.path("pipeline"): "failed" if result.failures else "degraded" if degraded else state
+    }
     if result.frame.around is not None and result.frame.around.marks:
-        states[entities.state("marks")] = "; ".join(result.frame.around.marks)
+        states[entities.STATE.path("marks")] = "; ".join(result.frame.around.marks)
     for camera in result.cameras:
         name = camera.camera.name
         is_fused = camera.detections is not None and camera.fusion is not None
-        states[entities.state(name)] = (
+        states[entities.STATE.path(name)] = (
             "degraded" if camera.camera.problems else "ok" if is_fused else ReasonKind.NOT_FUSED.value
         )
         for class_name, decision in _best_decisions(camera):
-            states[entities.class_state(name, class_name)] = decision
+            states[entities.CLASS_STATE.path(name, class_name)] = decision
     for kind in KINDS:
         # Each state of a lane needs a colour, so states have no track numbers. The log has them.
         subjects = [
             anomaly.subject.partition(" #")[0] for anomaly in result.anomalies if anomaly.kind == kind
         ]
         suffix = f" +{len(subjects) - 1}" if subjects[1:] else ""
-        states[entities.anomaly_state(kind)] = f"{subjects[0]}{suffix}" if subjects else ""
+        states[entities.ANOMALY_STATE.path(kind)] = f"{subjects[0]}{suffix}" if subjects else ""
     return states
 
 
 def track_states(tracks: Tracks, rows: Mapping[int, int]) -> dict[str, str]:
     """Return lane -> label of its track. ``rows`` is lane -> row of its track."""
-    return {entities.track_state(lane): anomalies.label(tracks, row) for lane, row in rows.items()}
+    return {
+        entities.TRACK_STATE.path(f"{lane:02}"): anomalies.label(tracks, row) for lane, row in rows.items()
+    }
 
 
 def _best_decisions(camera: CameraResult) -> Iterator[tuple[str, str]]:

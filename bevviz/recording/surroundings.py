@@ -42,7 +42,7 @@ def log_shapes(to: Writer, frame: Frame) -> None:
         if flat or shape.world_from_shape is not None:
             _log_shape(to, shape)
         elif shape.meshes:  # meshes are static and cannot be cleared: a scale of 0 hides them
-            to.put(entities.robot(shape.topic), rr.Transform3D(scale=0.0))
+            to.put(entities.ROBOT.path(shape.topic), rr.Transform3D(scale=0.0))
 
 
 def static_data_makers(frame: Frame) -> dict[str, Callable[[], StaticData | None]]:
@@ -50,9 +50,11 @@ def static_data_makers(frame: Frame) -> dict[str, Callable[[], StaticData | None
     surroundings, makers = frame.around or RobotContext(), dict[str, Callable[[], StaticData | None]]()
     for shape in surroundings.shapes:
         for number, mesh in enumerate(shape.meshes):
-            makers[f"{entities.robot(shape.topic)}/mesh_{number}"] = partial(_mesh, mesh)
+            makers[entities.MESH.path(shape.topic, f"mesh_{number}")] = partial(_mesh, mesh)
     for motion in surroundings.motions:
-        makers[entities.rotation(motion.topic)] = makers[entities.acceleration(motion.topic)] = _axes
+        makers[entities.ROTATION.path(motion.topic)] = makers[entities.ACCELERATION.path(motion.topic)] = (
+            _axes
+        )
     return makers
 
 
@@ -60,8 +62,8 @@ def log_imu_samples(to: Writer, frame: Frame) -> None:
     """Log IMU samples since the previous frame, each at its own time."""
     for motion in (frame.around or RobotContext()).motions:
         for path, values in (
-            (entities.rotation(motion.topic), motion.rotation),
-            (entities.acceleration(motion.topic), motion.acceleration),
+            (entities.ROTATION.path(motion.topic), motion.rotation),
+            (entities.ACCELERATION.path(motion.topic), motion.acceleration),
         ):
             rows = np.isfinite(values).all(axis=1)
             if rows.any():
@@ -95,7 +97,7 @@ def diagnostic_states(frame: Frame) -> dict[str, str]:
     """Return state lane -> level of the robot's worst diagnostics."""
     statuses = frame.around.statuses if frame.around else ()
     shown = sorted(statuses, key=lambda status: _WORST.index(status.level))[:DIAGNOSTIC_LANES]
-    return {entities.diagnostic(status.name): status.level for status in shown}
+    return {entities.DIAGNOSTIC.path(status.name): status.level for status in shown}
 
 
 def mark_lines(frame: Frame) -> list[tuple[str, str]]:
@@ -104,7 +106,7 @@ def mark_lines(frame: Frame) -> list[tuple[str, str]]:
 
 
 def _log_shape(to: Writer, shape: PlacedShape) -> None:
-    path = entities.robot(shape.topic)
+    path = entities.ROBOT.path(shape.topic)
     version = hash((shape.stamp, *(id(getattr(shape, part)) for part in _PARTS)))
     color = [_COLOR if shape.color is None else shape.color.tolist()]
     if shape.world_from_shape is not None and shape.picture is None:

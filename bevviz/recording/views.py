@@ -30,7 +30,7 @@ def space(
     names: bool = True,
     name: str = "3D",
     root: str = "",
-    beside: Sequence[str] = (f"{entities.ROBOT}/**",),
+    beside: Sequence[str] = (f"{entities.ROBOT.above}/**",),
     by: Quantity | None = None,
 ) -> rrb.Spatial3DView:
     """Return a 3D view of points, boxes, frustums and poses, seen from behind and above the robot.
@@ -49,18 +49,18 @@ def space(
         beside: further contents of the view.
         by: quantity that colours the raw points; None: ground or obstacle.
     """
-    hidden = [entities.set_aside(scene.lidar)]
+    hidden = [entities.SET_ASIDE.path(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show the obstacles.
-    hidden += [entities.ground(scene.lidar)] if scene.raw or why else []
-    hidden += [entities.obstacles(scene.lidar)] if raw and scene.raw else []
-    clouds = [entities.points(lidar) for lidar in scene.lidars or (scene.lidar,)]
+    hidden += [entities.GROUND.path(scene.lidar)] if scene.raw or why else []
+    hidden += [entities.OBSTACLES.path(scene.lidar)] if raw and scene.raw else []
+    clouds = [entities.POINTS.path(lidar) for lidar in scene.lidars or (scene.lidar,)]
     hidden += [] if raw else clouds
     hidden += [entities.GRID, entities.UNSEEN]
     hidden += [] if frustums else [entities.FRUSTUMS]
     # The explained points stand out by colours that differ in meaning from the colours of clusters.
-    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if why else []
-    hidden += [entities.clusters(scene.lidar), entities.FRUSTUMS] if by is not None else []
-    name_entities = entities.names(entities.FUSED), entities.names(entities.FUSION)
+    hidden += [entities.CLUSTERS.path(scene.lidar), entities.FRUSTUMS] if why else []
+    hidden += [entities.CLUSTERS.path(scene.lidar), entities.FRUSTUMS] if by is not None else []
+    name_entities = entities.NAMES.path(entities.FUSED), entities.NAMES.path(entities.FUSION)
     hidden += [*name_entities] if why or not names else []
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
@@ -70,13 +70,13 @@ def space(
         position, target = _eye_near(scene.focus), scene.focus
     return rrb.Spatial3DView(
         name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
-        origin=root + entities.sensor(scene.lidar),
+        origin=root + entities.SENSOR.path(scene.lidar),
         contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
         background=_DARK,
         line_grid=False,
         # Without this, contents outside of the origin's tree make the viewer use the fixed frame.
         spatial_information=rrb.SpatialInformation(
-            target_frame=entities.space(root + entities.sensor(scene.lidar))
+            target_frame=entities.space(root + entities.SENSOR.path(scene.lidar))
         ),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)
@@ -120,13 +120,13 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
         why: show the explanation of ``bevviz why`` instead of points and names.
         weak: show weak detections too.
     """
-    contents = ["$origin/**", *([f"{entities.ROBOT}/**"] if scene.robot else [])]
-    points_and_names = [entities.projected(name), entities.names(entities.detections(name))]
-    hidden = [*(points_and_names if why else []), *([] if weak else [entities.weak(name)])]
+    contents = ["$origin/**", *([f"{entities.ROBOT.above}/**"] if scene.robot else [])]
+    points_and_names = [entities.PROJECTED.path(name), entities.NAMES.path(entities.DETECTIONS.path(name))]
+    hidden = [*(points_and_names if why else []), *([] if weak else [entities.WEAK.path(name)])]
     return rrb.Spatial2DView(
         name=name,
-        origin=entities.sensor(name),
-        contents=[*contents, *([f"{entities.why(name)}/**"] if why else [])],
+        origin=entities.SENSOR.path(name),
+        contents=[*contents, *([f"{entities.WHY_PART.path(name)}/**"] if why else [])],
         overrides=dict.fromkeys(hidden, HIDDEN),
     )
 
@@ -143,7 +143,8 @@ def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rr
     """Return a view of the bird's-eye image with the outlines of ground truth and of the robot's boxes."""
     bev = root + entities.BEV
     channels = [
-        f"- {root}{entities.channel(name)}/**" for name in ("density", "height", "intensity", "occupancy")
+        f"- {root}{entities.CHANNEL.path(name)}/**"
+        for name in ("density", "height", "intensity", "occupancy")
     ]
     bounds = None
     if scene.above is not None:
@@ -155,7 +156,7 @@ def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rr
 
 def robots_birds_eye() -> rrb.Spatial2DView:
     """Return a view of the bird's-eye image that the robot publishes."""
-    origin = entities.robot("/visualization/bev_image")
+    origin = entities.ROBOT.path("/visualization/bev_image")
     return rrb.Spatial2DView(name="The robot's", origin=origin, background=_DARK)
 
 
@@ -187,18 +188,18 @@ def log() -> rrb.TextLogView:
 
 def states() -> rrb.StateTimelineView:
     """Return a view of the states of the pipeline, the cameras and the best detection of each class."""
-    return rrb.StateTimelineView(name="States", origin=entities.STATES)
+    return rrb.StateTimelineView(name="States", origin=entities.STATE.above)
 
 
 def diagnostics() -> rrb.StateTimelineView:
     """Return a view of the levels in the robot's diagnostics over time."""
-    return rrb.StateTimelineView(name="Diagnostics", origin=entities.DIAGNOSTICS)
+    return rrb.StateTimelineView(name="Diagnostics", origin=entities.DIAGNOSTIC.above)
 
 
 def anomalies() -> rrb.StateTimelineView:
     """Return a view of anomalies by kind over time, with the state of the pipeline, which every run has."""
-    contents = [entities.state("pipeline"), "$origin/**"]
-    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATES, contents=contents)
+    contents = [entities.STATE.path("pipeline"), "$origin/**"]
+    return rrb.StateTimelineView(name="Anomalies", origin=entities.ANOMALY_STATE.above, contents=contents)
 
 
 def anomaly_log() -> rrb.TextLogView:
@@ -208,7 +209,7 @@ def anomaly_log() -> rrb.TextLogView:
 
 def tracks() -> rrb.StateTimelineView:
     """Return a view of the tracks over time."""
-    return rrb.StateTimelineView(name="Tracks", origin=entities.TRACK_STATES)
+    return rrb.StateTimelineView(name="Tracks", origin=entities.TRACK_STATE.above)
 
 
 def speeds() -> rrb.TimeSeriesView:
@@ -238,28 +239,28 @@ def plot(
 
 def stage_times() -> rrb.TimeSeriesView:
     """Return a plot of the stage times."""
-    return plot("Stage times, ms", entities.stage_time(""))
+    return plot("Stage times, ms", entities.STAGE_TIME.path(""))
 
 
 def clocks() -> rrb.TimeSeriesView:
     """Return a plot of the time between image and cloud, and of the age of transforms."""
-    contents = [entities.sync_error("**"), entities.tf_age("**")]
+    contents = [entities.SYNC_ERROR.path("**"), entities.TF_AGE.path("**")]
     return plot("Sync error and TF age, ms", entities.HEALTH, contents)
 
 
 def counts() -> rrb.TimeSeriesView:
     """Return a plot of clusters, detections, matches and opinions, which are numbers of similar size."""
-    return plot("Counts", entities.HEALTH, [entities.count(name) for name in (*COUNTS, *OPINIONS)])
+    return plot("Counts", entities.HEALTH, [entities.COUNT.path(name) for name in (*COUNTS, *OPINIONS)])
 
 
 def rates() -> rrb.TimeSeriesView:
     """Return a plot of the rates."""
-    return plot("Rates, Hz", entities.rate(""))
+    return plot("Rates, Hz", entities.RATE.path(""))
 
 
 def latencies() -> rrb.TimeSeriesView:
     """Return a plot of the latency from a cloud's arrival to the log call, and of the viewers' lag."""
-    contents = [entities.latency("**"), entities.viewer_lag("**")]
+    contents = [entities.LATENCY.path("**"), entities.VIEWER_LAG.path("**")]
     return plot("Latency and lag of viewers, ms", entities.HEALTH, contents)
 
 
@@ -267,7 +268,10 @@ def motion(scene: Scene) -> list[rrb.View]:
     """Return plots of IMU data; empty: there is no IMU."""
     if not scene.imu:
         return []
-    return [plot("Rotation, rad/s", entities.ROTATION), plot("Acceleration, m/s²", entities.ACCELERATION)]
+    return [
+        plot("Rotation, rad/s", entities.ROTATION.above),
+        plot("Acceleration, m/s²", entities.ACCELERATION.above),
+    ]
 
 
 def health() -> rrb.Tabs:

@@ -290,7 +290,9 @@ class _ReportRecorder(Recorder):
                 lines.insert(0, f"note: {self._note}")
             subject = self._answers[0] if self._answers else None
             if subject is not None:
-                states[entities.state("report")] = f"{subject.subject.name}: {subject.verdict.kind.value}"
+                states[entities.STATE.path("report")] = (
+                    f"{subject.subject.name}: {subject.verdict.kind.value}"
+                )
 
         def mark() -> None:
             """Mark the subject in its frame alone."""

@@ -210,12 +210,12 @@ def _plots(summary: WindowSummary, facts: Facts) -> Iterator[Plot]:
     at = (summary.at - facts.start) / SECOND
     counted = ("clusters", "detections", "matches", "problems", "failures")
     for title, prefix, names in (
-        ("Stage times, ms", entities.stage_time(""), None),
-        ("Image stamp - cloud stamp, ms", entities.sync_error(""), None),
-        ("Age of the transforms, ms", entities.tf_age(""), None),
-        ("Counts", entities.count(""), counted),
-        ("Points", entities.count(""), ("points", "voxels", "obstacle_points")),
-        ("Scans left out, invalid points", entities.count(""), ("skipped_frames", "invalid_points")),
+        ("Stage times, ms", entities.STAGE_TIME.path(""), None),
+        ("Image stamp - cloud stamp, ms", entities.SYNC_ERROR.path(""), None),
+        ("Age of the transforms, ms", entities.TF_AGE.path(""), None),
+        ("Counts", entities.COUNT.path(""), counted),
+        ("Points", entities.COUNT.path(""), ("points", "voxels", "obstacle_points")),
+        ("Scans left out, invalid points", entities.COUNT.path(""), ("skipped_frames", "invalid_points")),
     ):
         if (drawn := plot(title, _series(summary, facts, prefix, names), at)) is not None:
             yield drawn

@@ -240,10 +240,10 @@ def log_sweep(recording: rr.RecordingStream, sweep: Sweep, name: str, present: M
             for metric in series
         }
         if len(sweep.parameters) == 1:
-            _log_curves(recording, entities.sweep(title), sweep, numbers, present)
+            _log_curves(recording, entities.SWEEP_CHART.path(title), sweep, numbers, present)
             continue
         for metric, values in numbers.items():
-            _log_map(recording, entities.sweep(metric), sweep, values, present)
+            _log_map(recording, entities.SWEEP_CHART.path(metric), sweep, values, present)
 
 
 def _log_map(
@@ -310,10 +310,13 @@ def layout(sweep: Sweep) -> rrb.Blueprint:
     for name, series in _plots(sweep).items():
         if len(sweep.parameters) == 2:
             plots += [
-                chart_view(metric, entities.sweep(metric), right=20.0, below=_MAP_BOTTOM) for metric in series
+                chart_view(metric, entities.SWEEP_CHART.path(metric), right=20.0, below=_MAP_BOTTOM)
+                for metric in series
             ]
         else:
-            plots.append(chart_view(f"{name}, over {sweep.parameters[0].key}", entities.sweep(name)))
+            plots.append(
+                chart_view(f"{name}, over {sweep.parameters[0].key}", entities.SWEEP_CHART.path(name))
+            )
     words = rrb.TextDocumentView(name="Table", origin=entities.SWEEP, contents=["$origin"])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Grid(*plots, grid_columns=2), words, column_shares=[5, 4]),

@@ -39,7 +39,7 @@ def select_click(
     for camera in result.cameras:
         if hit := _in_image(camera, path, row, position):
             return hit
-        if path == entities.sensor(camera.camera.name):
+        if path == entities.SENSOR.path(camera.camera.name):
             return None  # A line of its frustum is nowhere in the scene.
     if tracks is not None and row >= 0 and (hit := _drawn_track(result, tracks, path, row)):
         return hit
@@ -59,7 +59,7 @@ def _object_with_opinion(result: FrameResult, path: str, row: int) -> Selection 
     views += [
         opinion_outlines_in_image(result, camera.camera)
         for camera in result.cameras
-        if path.startswith(f"{entities.image(camera.camera.name)}/")
+        if path.startswith(f"{entities.IMAGE.path(camera.camera.name)}/")
     ]
     for view in views:
         if path in view and 0 <= (row := box_row(row, len(view[path].rows))) < len(view[path].rows):
@@ -84,12 +84,12 @@ def _in_image(camera: CameraResult, path: str, row: int, position: Sequence[floa
     name = camera.camera.name
     if camera.detections is not None and row >= 0:
         kept = camera.detections.kept
-        for where, rows in ((entities.detections(name), kept), (entities.weak(name), ~kept)):
+        for where, rows in ((entities.DETECTIONS.path(name), kept), (entities.WEAK.path(name), ~kept)):
             listed = np.flatnonzero(rows)
             if path == where and (row := box_row(row, len(listed))) < len(listed):
                 return Selection(detection=int(listed[row]), camera=name)
-    inside = path in (entities.sensor(name), entities.image(name)) or path.startswith(
-        (f"{entities.image(name)}/", entities.why(f"{name}/"))
+    inside = path in (entities.SENSOR.path(name), entities.IMAGE.path(name)) or path.startswith(
+        (f"{entities.IMAGE.path(name)}/", entities.WHY_PART.path(f"{name}/"))
     )
     if inside and len(position) == 3:  # The image also stands in front of its camera in 3D views.
         position = _pixel(camera.camera, position)
@@ -122,7 +122,7 @@ def _in_space(result: FrameResult, path: str, row: int) -> Selection | None:
     frame = result.frame
     if row < 0:
         return None
-    if path == entities.points(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
+    if path == entities.POINTS.path(frame.lidar) and len(frame.clouds) <= 1 and row < len(frame.points):
         return _point(frame.points[row])
     if path == entities.FUSED and (objects := result.objects) is not None:
         row = box_row(row, len(objects))
@@ -137,7 +137,7 @@ def _in_space(result: FrameResult, path: str, row: int) -> Selection | None:
         return _frustum(result, row)
     if path == entities.TRUTH and frame.truth is not None and row < len(frame.truth.boxes):
         return Selection(truth=row)
-    if path == entities.set_aside(frame.lidar) and result.clusters is not None:
+    if path == entities.SET_ASIDE.path(frame.lidar) and result.clusters is not None:
         aside = np.flatnonzero(~result.clusters.kept)
         return Selection(cluster=int(aside[row])) if row < len(aside) else None
     return None
@@ -165,8 +165,8 @@ def _drawn_track(result: FrameResult, tracks: Tracks, path: str, row: int) -> Se
         entities.TRACKS: rows[named],
         entities.UNSEEN: rows[~named],
         entities.TRAILS: rows,
-        entities.overlay("trails"): rows,
-        entities.overlay("tracks"): rows,
+        entities.OVERLAY.path("trails"): rows,
+        entities.OVERLAY.path("tracks"): rows,
     }.get(path, rows[:0])
     return _track(result, tracks, int(listed[row])) if row < len(listed) else None
 

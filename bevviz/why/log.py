@@ -43,7 +43,7 @@ _DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 
 def clear_answers(recording: rr.RecordingStream) -> None:
     """Clear all answers from the recording's current time on."""
-    for path in (entities.WHY, entities.overlay("why")):
+    for path in (entities.WHY, entities.OVERLAY.path("why")):
         recording.log(path, rr.Clear(recursive=True))
 
 
@@ -97,13 +97,13 @@ def _frame_of_points(frame: Frame) -> rr.AsComponents:
     """Return the coordinate frame of the points: that of the sensor, or a pose where there is none."""
     if not frame.lidar:
         return transform(frame.pose)
-    return rr.CoordinateFrame(entities.space(entities.sensor(frame.lidar)))
+    return rr.CoordinateFrame(entities.space(entities.SENSOR.path(frame.lidar)))
 
 
 def _log(recording: rr.RecordingStream, name: str, place: rr.AsComponents, data: rr.AsComponents) -> None:
     """Log data in a coordinate frame. Rerun drops a frame that is logged at the time of a recursive clear."""
-    recording.log(entities.why(name), place, static=isinstance(place, rr.CoordinateFrame))
-    recording.log(entities.why(name), data)
+    recording.log(entities.WHY_PART.path(name), place, static=isinstance(place, rr.CoordinateFrame))
+    recording.log(entities.WHY_PART.path(name), data)
 
 
 def focus_point(frame: Frame, answer: Answer) -> F32 | None:
@@ -150,7 +150,7 @@ def _log_above(
         marks = rr.Points2D(dots, radii=radii, colors=[_SUBJECT], draw_order=40.0)
     else:
         return
-    recording.log(entities.overlay("why"), marks)
+    recording.log(entities.OVERLAY.path("why"), marks)
 
 
 def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: BevConfig | None = None) -> None:

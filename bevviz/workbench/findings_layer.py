@@ -25,9 +25,9 @@ from bevviz.why.subject import projected_box, single_box
 FindingRows: TypeAlias = Mapping[str, Sequence[Finding]]  # findings of an entity, one per logged row
 
 LAYERS = {
-    "missed": (entities.MISSED, StateColor.BAD.value),
-    "false": (entities.FALSE, StateColor.DOUBTFUL.value),
-    "unnamed": (entities.UNNAMED, StateColor.UNKNOWN.value),
+    "missed": (entities.MARKED.path("missed"), StateColor.BAD.value),
+    "false": (entities.MARKED.path("false"), StateColor.DOUBTFUL.value),
+    "unnamed": (entities.MARKED.path("unnamed"), StateColor.UNKNOWN.value),
 }
 DRAWN_AS = {"doubtful": "false"}
 
@@ -74,7 +74,7 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
             ]
             visible_rows = [index for index, box in enumerate(image_boxes) if box is not None]
             if visible_rows:
-                image = f"{entities.image(camera.name)}/{kind}"
+                image = f"{entities.IMAGE.path(camera.name)}/{kind}"
                 xyxy = np.array([image_boxes[index] for index in visible_rows])
                 style = {"colors": [color], "draw_order": 35.0, "show_labels": False}
                 writer.put(
@@ -83,7 +83,7 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
                     boxes2d(xyxy, [labels[index] for index in visible_rows], **style),
                 )
                 layer[image] = [layer_findings[index] for index in visible_rows]
-        above = entities.overlay(kind)
+        above = entities.OVERLAY.path(kind)
         if inside := _log_above(writer, above, boxes, labels, color, result.config.bev):
             layer[above] = [layer_findings[index] for index in inside]
     return layer

@@ -342,7 +342,7 @@ class RunningRobot(Source):
         """Return the selection of a click in a frame, see ``select_click``."""
         result = self.look(number)
         points = None if number in self._whole else result.config.live.viewer_points
-        if instance is not None and points is not None and path == entities.points(result.frame.lidar):
+        if instance is not None and points is not None and path == entities.POINTS.path(result.frame.lidar):
             rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
         return select_click(result, result.tracks, path, instance, position)
