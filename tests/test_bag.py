@@ -6,6 +6,7 @@ import os
 import shutil
 import tracemalloc
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bevviz.bags.bag import Recording
+from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.reader import FileBytes
 from bevviz.bags.source import BagSource, iso, parse_time
 from bevviz.config import Config, load
@@ -152,6 +157,91 @@ def test_a_folder_of_split_files_is_one_recording(tmp_path: Path) -> None:
         piece = bags.write(tmp_path / f"part_{2 - part}", chosen)
         storage_file(piece).rename(bag / f"part_{2 - part}.mcap")
     assert scans(frames_of(bag)) == list(range(30))
+
+
+@dataclass(frozen=True)
+class DefinedMessages:
+    """Messages of one topic for ``write_defined``."""
+
+    msgtype: str
+    text: str
+    values: Sequence[dict[str, object]]
+
+
+STRING = DefinedMessages("std_msgs/msg/String", "string data", [{"data": f"text {i}"} for i in range(3)])
+NUMBER = DefinedMessages("std_msgs/msg/UInt32", "uint32 data", [{"data": i} for i in range(4)])
+OLD = DefinedMessages("robot/msg/Reading", "int32 code", [{"code": 7}] * 2)
+NEW = DefinedMessages("robot/msg/Reading", "float64 level\nint32 code", [{"level": 0.5, "code": 8}] * 2)
+
+
+def write_defined(path: Path, form: str, *messages: DefinedMessages, start: int = 0) -> Path:
+    """Write messages of /a one after the other, each sort on a connection of its own."""
+    writer: Any = (
+        Writer1(path)
+        if form == "ros1"
+        else Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
+    )
+    with writer:
+        time = start
+        for sort in messages:
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(sort.text, sort.msgtype))
+            serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
+            if form == "ros1":
+                text, digest = store.generate_msgdef(sort.msgtype)
+                connection = writer.add_connection("/a", sort.msgtype, msgdef=text, md5sum=digest)
+            else:
+                connection = writer.add_connection("/a", sort.msgtype, typestore=store)
+            for values in sort.values:
+                time += 1
+                writer.write(connection, time, serialize(store.types[sort.msgtype](**values), sort.msgtype))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "files"),  # A database names a topic once.
+    [("mcap", 1), ("mcap", 2), ("sqlite3", 2), ("ros1", 1), ("ros1", 2)],
+)
+def test_a_topic_of_two_types_has_the_messages_of_the_first(tmp_path: Path, form: str, files: int) -> None:
+    if files == 1:
+        paths = [write_defined(tmp_path / "0.bag", form, STRING, NUMBER)]
+    else:
+        paths = [write_defined(tmp_path / "0.bag", form, STRING)]
+        paths.append(write_defined(tmp_path / "1.bag", form, NUMBER, start=100))
+    with Recording(paths) as recording:
+        (topic,) = recording.topics
+        texts = [recording.decode(message).data for message in recording.messages(["/a"])]
+        assert texts == ["text 0", "text 1", "text 2"]
+        assert topic.type == "std_msgs/msg/String"
+        assert topic.count == len(recording.times("/a")) == recording.message_count == 3
+        assert recording.warnings[-1] == (
+            "/a is recorded both as std_msgs/msg/String and as std_msgs/msg/UInt32: only the former is used"
+        )
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_each_message_is_decoded_by_its_own_definition(tmp_path: Path, form: str) -> None:
+    paths = [write_defined(tmp_path / "0.bag", form, OLD)]
+    paths.append(write_defined(tmp_path / "1.bag", form, NEW, start=100))
+    with Recording(paths) as recording:
+        decoded = [recording.decode(message) for message in recording.messages(["/a"])]
+        assert [message.code for message in decoded] == [7, 7, 8, 8]
+        assert [getattr(message, "level", None) for message in decoded] == [None, None, 0.5, 0.5]
+        assert recording.topics[0].count == len(recording.times("/a")) == 4
+
+
+def test_ros1_and_ros2_messages_of_a_topic_keep_their_encoding(tmp_path: Path) -> None:
+    paths = [write_defined(tmp_path / "0.bag", "ros1", STRING)]
+    paths.append(write_defined(tmp_path / "1", "mcap", STRING, start=100))
+    with Recording(paths) as recording:
+        with McapWriter(tmp_path / "cut.mcap", recording.types.definition) as bag:
+            for message in recording.messages(["/a"]):
+                bag.write(message.connection, message.received, message.data)
+        with Recording([tmp_path / "cut.mcap"]) as cut:
+            assert [cut.decode(message).data for message in cut.messages(["/a"])] == [
+                *("text 0", "text 1", "text 2"),
+                *("text 0", "text 1", "text 2"),
+            ]
 
 
 def test_messages_outside_chunks_may_be_out_of_order(tmp_path: Path) -> None:

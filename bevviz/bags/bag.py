@@ -129,8 +129,8 @@ class Recording(Closable):
 
     @property
     def message_count(self) -> int:
-        """Number of messages of all files."""
-        return sum(c.msgcount for f in self.files for c in f.connections)
+        """Number of messages of all files. Those of a topic's second type do not count, see ``_typed``."""
+        return sum(c.msgcount for f in self.files for c in self._typed(f))
 
     @property
     def warnings(self) -> list[str]:
@@ -142,14 +142,16 @@ class Recording(Closable):
         """All topics by name, each with the frame_id of its first message."""
         counts: Counter[str] = Counter()
         first: dict[str, Connection] = {}
-        for connection in (c for f in self.files for c in f.connections):
-            known = first.setdefault(connection.topic, connection)
-            counts[connection.topic] += connection.msgcount
-            if known.msgtype != connection.msgtype:
-                self._notes.append(
-                    f"{connection.topic} is recorded both as {known.msgtype} and as {connection.msgtype}: "
-                    "only the former is used"
-                )
+        for file in self.files:
+            for connection in self._typed(file):
+                first.setdefault(connection.topic, connection)
+                counts[connection.topic] += connection.msgcount
+        described = {(c.topic, normalized(c.msgtype)): None for f in self.files for c in f.connections}
+        self._notes += [
+            f"{topic} is recorded both as {used} and as {msgtype}: only the former is used"
+            for topic, msgtype in described
+            if (used := self._types_by_topic.get(topic, msgtype)) != msgtype
+        ]
         duration = (self.end - self.start) / 1e9
         self._aside |= {name: why for name in first if (why := self._lacks(first[name]))}
         return tuple(
@@ -170,6 +172,29 @@ class Recording(Closable):
             for name in sorted(first)
         )
 
+    @cached_property
+    def _types_by_topic(self) -> dict[str, str]:
+        """Type by topic: that of its first messages, else the first that any file states."""
+        connections = [c for f in self.files for c in f.connections]
+        types: dict[str, str] = {}
+        for connection in sorted(connections, key=lambda c: not c.msgcount):
+            types.setdefault(connection.topic, normalized(connection.msgtype))
+        return types
+
+    def _typed(self, file: BagFile) -> list[Connection]:
+        """Return the connections of a file that have the type of their topic.
+
+        Connections of one type with different definitions are all among them: each message is decoded by the
+        definition of its own connection.
+        """
+        # A damaged file may show a topic that no index has named.
+        types = self._types_by_topic
+        return [
+            c
+            for c in file.connections
+            if (msgtype := normalized(c.msgtype)) == types.setdefault(c.topic, msgtype)
+        ]
+
     def messages(
         self,
         topics: Collection[str],
@@ -186,10 +211,25 @@ class Recording(Closable):
             stop: end of the log times; None: that of the recording.
             few: see ``ChunkReader.messages``.
         """
-        sources = [_lazy_messages(f, topics, start, stop, few) for f in self.files]
+        sources = [self._lazy_messages(f, topics, start, stop, few) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
                 yield message
+
+    def _lazy_messages(
+        self, file: BagFile, topics: Collection[str], start: int | None, stop: int | None, few: bool
+    ) -> Iterator[tuple[int, RawMessage | None]]:
+        """Yield the messages of one file after an empty item.
+
+        A merge draws the first item of every file at once. The empty item defers opening the file until its
+        time.
+        """
+        connections = [c for c in self._typed(file) if c.topic in topics]
+        if not connections:
+            return
+        yield file.span[0], None
+        for connection, time, data in file.messages(connections, start, stop, few):
+            yield time, RawMessage(connection.topic, time, data, connection)
 
     def scans(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
@@ -241,7 +281,7 @@ class Recording(Closable):
     def _sensors(self) -> Mapping[str, ouster.Sensor]:
         """Sensor metadata of the topics whose messages are single LiDAR packets."""
         found = {}
-        for connection in {c.topic: c for f in self.files for c in f.connections}.values():
+        for connection in {c.topic: c for f in self.files for c in self._typed(f)}.values():
             if (
                 ouster.is_packet(connection.msgtype)
                 and (text := self._metadata(connection.topic)) is not None
@@ -277,7 +317,7 @@ class Recording(Closable):
 
     def times(self, topic: str) -> I64:
         """Return the sorted log times in nanoseconds of all messages of a topic. Their data is not read."""
-        parts = [f.times([c for c in f.connections if c.topic == topic]) for f in self.files]
+        parts = [f.times([c for c in self._typed(f) if c.topic == topic]) for f in self.files]
         return np.sort(np.concatenate(parts))
 
     def packets(self, topic: str, received: int) -> list[VideoPacket]:
@@ -421,7 +461,7 @@ class Recording(Closable):
             )
         metadata = self._read_metadata(folder)
         failed: list[UserError] = []
-        before = self.message_count
+        before = len(self.files)
         for file in files:
             try:
                 self.files.append(open_file(file, self._scratch, self._notes.append))
@@ -437,7 +477,7 @@ class Recording(Closable):
             expected, listed = 0, set()
         if missing := sorted(listed - {f.name for f in files}):
             self._notes.append(f"{folder}: {', '.join(missing)} of {METADATA} is missing: read without")
-        found = self.message_count - before
+        found = sum(c.msgcount for f in self.files[before:] for c in f.connections)
         if found < expected:
             self._notes.append(
                 f"{folder}: {METADATA} counts {expected} messages, {found} were found: "
@@ -475,21 +515,3 @@ class Recording(Closable):
         except (UserError, KeyError, TypeError, AttributeError, ValueError):
             self._notes.append(f"{path}: not readable as {METADATA}: read without")
             return {}
-
-
-def _lazy_messages(
-    file: BagFile, topics: Collection[str], start: int | None, stop: int | None, few: bool
-) -> Iterator[tuple[int, RawMessage | None]]:
-    """Yield the messages of one file after an empty item.
-
-    A merge draws the first item of every file at once. The empty item defers opening the file until its time.
-    """
-    types: dict[str, str] = {}
-    connections = [
-        c for c in file.connections if c.topic in topics and types.setdefault(c.topic, c.msgtype) == c.msgtype
-    ]
-    if not connections:
-        return
-    yield file.span[0], None
-    for connection, time, data in file.messages(connections, start, stop, few):
-        yield time, RawMessage(connection.topic, time, data, connection)

@@ -67,8 +67,8 @@ class McapWriter:
         self._define = define
         self._header = Header("ros1" if ros1 else "ros2", f"bevviz {__version__}")
         self._compression = CompressionType.ZSTD if compress else CompressionType.NONE
-        self._schemas: dict[tuple[str, MessageDefinition], int] = {}
-        self._channels: dict[tuple[str, str, MessageDefinition], int] = {}
+        self._schemas: dict[tuple[str, MessageDefinition, str], int] = {}
+        self._channels: dict[tuple[str, str, MessageDefinition, str], int] = {}
         self._counts: Counter[int] = Counter()  # messages by channel
         self._is_full = False  # the disk
 
@@ -145,7 +145,7 @@ class McapWriter:
         """
         whole_chunks = self._output.end
         try:
-            key = connection.topic, connection.msgtype, connection.msgdef
+            key = connection.topic, connection.msgtype, connection.msgdef, _encoding(connection)
             channel = self._channels.get(key)
             if channel is None:
                 channel = self._channels[key] = self._add_channel(connection)
@@ -162,10 +162,8 @@ class McapWriter:
         return UserError(f"{self._path}: cannot write the bag: {error.strerror}{where}")
 
     def _add_channel(self, connection: Connection) -> int:
-        extra, definition = connection.ext, self._define(connection)
-        form = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "ros1"
-        form = form if form in ("ros1", *_SCHEMAS) else "cdr"
-        key = connection.msgtype, definition
+        extra, definition, form = connection.ext, self._define(connection), _encoding(connection)
+        key = connection.msgtype, definition, form
         if key not in self._schemas:
             self._schemas[key] = self._add_schema(connection.msgtype, definition, form)
         metadata = {}
@@ -187,6 +185,12 @@ class McapWriter:
         name = msgtype.replace("/msg/", "/") if form == "ros1" else msgtype
         content = definition.data.encode("latin-1" if form in _SCHEMAS else "utf-8")
         return int(self._writer.register_schema(name, kind, content))
+
+
+def _encoding(connection: Connection) -> str:
+    """Return the encoding of a channel: that of the connection, cdr unless MCAP names it otherwise."""
+    form = getattr(connection.ext, "serialization_format", "ros1")  # A connection of ROS 1 has no such field.
+    return form if form in ("ros1", *_SCHEMAS) else "cdr"
 
 
 def _profile(qos: Qos) -> dict[str, object]:
