@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 import threading
+import tracemalloc
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -193,3 +196,107 @@ def test_a_missing_package_for_object_storage_is_named() -> None:
     fsspec.register_implementation("gs", "no_such_package.System", clobber=True)
     with pytest.raises(UserError, match=r"^drive\.mcap: reading gs:// needs more packages: .* gcsfs$"):
         Recording([Path("gs://drives/drive.mcap")])
+
+
+class LyingHandler(BaseHTTPRequestHandler):
+    """Answers other than those that were asked for. The path names the kind."""
+
+    protocol_version = "HTTP/1.1"
+    sent = 0  # bytes of bodies
+
+    def do_GET(self) -> None:
+        first, last = map(int, re.findall(r"\d+", self.headers["Range"]))
+        kind, size = self.path.strip("/").partition(".")[0], last - first + 1
+        headers = {"Content-Range": f"bytes {first}-{last}/99999999", "Content-Length": f"{size}"}
+        body: Iterator[bytes] = iter([bytes(size)])
+        status = 206
+        if kind in ("endless", "whole"):
+            status = 206 if kind == "endless" else 200
+            headers["Content-Length"] = f"{1 << 40}"
+            body = (bytes(1 << 16) for _ in range(1 << 14))
+        elif kind == "packed":
+            body = iter([packed := gzip.compress(bytes(1 << 24))])
+            headers |= {"Content-Encoding": "gzip", "Content-Length": f"{len(packed)}"}
+        elif kind == "moved":
+            status, body = 302, iter(())
+            headers = {"Location": f"http://localhost:{self.server.server_port}/x", "Content-Length": "0"}  # type: ignore[attr-defined]
+        elif kind == "file":
+            status, body = 302, iter(())
+            headers = {"Location": "file:///etc/passwd", "Content-Length": "0"}
+        elif kind == "other":
+            headers["Content-Range"] = f"bytes {first + 1}-{last + 1}/99999999"
+        elif kind == "unsized":
+            headers["Content-Range"] = f"bytes {first}-{last}/{10**30}"
+        elif kind in ("silent", "trickle") and size > 1:
+            body = self.pieces(0.02 if kind == "trickle" else 5)
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        with suppress(OSError):
+            for piece in body:
+                self.wfile.write(piece)
+                type(self).sent += len(piece)
+        self.close_connection = True
+
+    def pieces(self, pause: float) -> Iterator[bytes]:
+        """Yield a byte at a time until the client or the test ends."""
+        while not self.server.ended.wait(pause):  # type: ignore[attr-defined]
+            yield b"\0"
+
+    def log_message(self, *arguments: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def liar() -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), LyingHandler)
+    server.ended = threading.Event()  # type: ignore[attr-defined]
+    LyingHandler.sent = 0
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.ended.set()  # type: ignore[attr-defined]
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("endless", "gives more bytes than were asked for"),
+        ("whole", "does not serve parts of files"),
+        ("packed", "sends compressed bytes"),
+        ("moved", "redirects to an address that is neither https:// nor its own"),
+        ("file", "redirects to an address that is neither https:// nor its own"),
+        ("other", "gives another part of the file"),
+        ("unsized", "does not state the size"),
+        ("silent", "is too slow"),
+        ("trickle", "is too slow"),
+    ],
+)
+def test_a_server_that_lies_costs_neither_time_nor_memory(
+    liar: str, kind: str, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(remote, "TIMEOUT", 0.2)
+    monkeypatch.setattr(remote, "LEAST_RATE", 1 << 20)
+    tracemalloc.start()
+    try:
+        assert main(["info", f"{liar}/{kind}.mcap"]) == 2
+        assert tracemalloc.get_traced_memory()[1] < 1 << 26
+    finally:
+        tracemalloc.stop()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"bevviz: error: {kind}.mcap: the server {text}")
+    assert LyingHandler.sent < 1 << 26  # the buffers of the sockets hold some megabytes
+
+
+def test_no_more_is_asked_for_at_once_than_the_stated_limit(
+    liar: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = remote.open_bytes(Path(f"{liar}/drive.mcap"))
+    monkeypatch.setattr(remote, "MAX_REQUEST", 1 << 20)
+    with pytest.raises(UserError, match=r"^drive\.mcap: it asks for 99,000,000 bytes at once"):
+        file.read(0, 99_000_000)
+    assert LyingHandler.sent == 1

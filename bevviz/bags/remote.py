@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import time
 from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote, urljoin, urlsplit
 
 from bevviz.bags.reader import FileBytes
 from bevviz.errors import UserError, first_line
@@ -16,6 +17,10 @@ from bevviz.errors import UserError, first_line
 _ADDRESS = re.compile(r"(https?|s3|gs|gcs|az|abfs):/+(?=[^/])")  # a Path has one slash of two
 PART = 1 << 16  # bytes loaded at least: many records of an index lie in one part
 CACHE = 1 << 26  # bytes kept in memory
+MAX_REQUEST = 1 << 28  # bytes asked for at once; an index or a chunk has at most some megabytes
+TIMEOUT = 20.0  # seconds without a byte after which a request is given up
+LEAST_RATE = 10_000  # bytes per second of a whole request, after the first ``TIMEOUT`` seconds
+MAX_REDIRECTS = 5
 TRIES = 3
 PAUSE = 0.5  # seconds before the second try; twice as long before the third
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
@@ -43,11 +48,16 @@ def open_bytes(path: Path) -> FileBytes:
     return RemoteBytes(path) if address_of(path) else FileBytes(path)
 
 
+class _RefusedError(Exception):
+    """An answer of a server that is not used. The text ends a sentence."""
+
+
 class RemoteBytes(FileBytes):
     """Bytes of a file at an address, by ranges. The latest ones are kept in memory.
 
     Raises:
-        UserError: the file cannot be reached or read by ranges, or a package for its protocol is missing.
+        UserError: the file cannot be reached or read by ranges, the server is too slow or does not give what
+            was asked for, or a package for its protocol is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,10 +66,13 @@ class RemoteBytes(FileBytes):
         self._parts: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._kept = 0
         self._lock = Lock()
+        self._is_web = self._protocol in ("http", "https")
+        # Without automatic decompression, a body has no more bytes in memory than on the wire.
+        options = {"client_kwargs": {"auto_decompress": False}} if self._is_web else {}
         try:
             import fsspec
 
-            self._system, self._inner = fsspec.core.url_to_fs(self._address)
+            self._system, self._inner = fsspec.core.url_to_fs(self._address, **options)
         except ImportError:
             also = f" {PACKAGES[self._protocol]}" if self._protocol in PACKAGES else ""
             raise UserError(
@@ -69,7 +82,10 @@ class RemoteBytes(FileBytes):
         except ValueError as error:
             raise UserError(f"{self._name}: {first_line(error)}") from None
         self._latest = 0, b""
-        size = self._request(lambda: self._system.info(self._inner))["size"]
+        if self._is_web:
+            self.size = self._request(lambda: self._web_range(0, 1))[1]
+            return
+        size = self._request(lambda: self._stored("info", 0))["size"]
         if size is None:
             raise UserError(f"{self._name}: the server does not state the size of the file: download it")
         self.size = int(size)
@@ -97,7 +113,14 @@ class RemoteBytes(FileBytes):
             if (kept := self._parts.get((start, size))) is not None:
                 self._parts.move_to_end((start, size))
                 return kept
-        data: bytes = self._request(lambda: self._system.cat_file(self._inner, start=start, end=start + size))
+        if size > MAX_REQUEST:
+            raise UserError(
+                f"{self._name}: it asks for {size:,} bytes at once, more than {MAX_REQUEST:,}: download it"
+            )
+        if self._is_web:
+            data: bytes = self._request(lambda: self._web_range(start, size))[0]
+        else:
+            data = self._request(lambda: self._stored("cat_file", size, start=start, end=start + size))
         if len(data) != size:
             raise UserError(
                 f"{self._name}: the server gave {len(data)} bytes where {size} were asked for: it does not "
@@ -111,12 +134,64 @@ class RemoteBytes(FileBytes):
                 self._kept -= len(self._parts.popitem(last=False)[1])
         return data
 
-    def _request(self, request: Any) -> Any:
+    def _stored(self, method: str, size: int, **arguments: int) -> Any:
+        """Call a method of a file system of fsspec, which ends in time if the file system is asynchronous."""
+        if not getattr(self._system, "async_impl", False):
+            return getattr(self._system, method)(self._inner, **arguments)
+        from fsspec.asyn import sync
+
+        function = getattr(self._system, f"_{method}")
+        return sync(self._system.loop, function, self._inner, timeout=_longest(size), **arguments)
+
+    def _web_range(self, start: int, size: int) -> tuple[bytes, int]:
+        """Return a range of a file on a web server, and the size of the file."""
+        from fsspec.asyn import sync
+
+        result: tuple[bytes, int] = sync(self._system.loop, self._fetch, start, size)
+        return result
+
+    async def _fetch(self, start: int, size: int) -> tuple[bytes, int]:
+        """Ask for a range, and read no more than was asked for.
+
+        Redirects are followed here, because aiohttp would follow one from a public server to a page of this
+        machine or of its network.
+
+        Raises:
+            _RefusedError: the answer is another than asked for.
+        """
+        from aiohttp import ClientTimeout
+
+        session, url = await self._system.set_session(), self._address
+        limits = ClientTimeout(total=_longest(size), sock_connect=TIMEOUT, sock_read=TIMEOUT)
+        options: dict[str, Any] = {"allow_redirects": False, "timeout": limits}
+        options["headers"] = {"Range": f"bytes={start}-{start + size - 1}", "Accept-Encoding": "identity"}
+        for _ in range(1 + MAX_REDIRECTS):
+            async with session.get(self._system.encode_url(url), **options) as answer:
+                if answer.status in (301, 302, 303, 307, 308) and "Location" in answer.headers:
+                    url = _redirected(url, answer.headers["Location"])
+                    continue
+                total = _check_answer(answer.status, answer.headers, start)
+                data = bytearray()
+                while len(data) <= size and (part := await answer.content.readany()):
+                    data += part
+                if len(data) > size:
+                    raise _RefusedError("gives more bytes than were asked for")
+                return bytes(data), total
+        raise _RefusedError(f"redirects more than {MAX_REDIRECTS} times")
+
+    def _request(self, request: Callable[[], Any]) -> Any:
         """Return what a request gives. A failure of the network is tried again."""
         tries = 1 if self._protocol in PACKAGES else TRIES  # the packages for storage try again themselves
         for number in range(1, tries + 1):
             try:
                 return request()
+            except _RefusedError as error:
+                raise UserError(f"{self._name}: the server {error}: download it") from None
+            except TimeoutError:
+                raise UserError(
+                    f"{self._name}: the server is too slow: it sent nothing for {TIMEOUT:g} s, or less than "
+                    f"{LEAST_RATE // 1000} kB per second: download it"
+                ) from None
             except FileNotFoundError:
                 raise UserError(f"{self._name}: there is no such file at this address") from None
             except PermissionError:
@@ -134,3 +209,49 @@ class RemoteBytes(FileBytes):
                     ) from error
                 time.sleep(PAUSE * number)
         raise AssertionError
+
+
+def _longest(size: int) -> float:
+    """Return the seconds in which a request for ``size`` bytes has to end."""
+    return TIMEOUT + size / LEAST_RATE
+
+
+def _redirected(url: str, location: str) -> str:
+    """Return the address that a redirect leads to.
+
+    Raises:
+        _RefusedError: the address is neither encrypted nor on the same server. It could be a page of this
+            machine or of its network, which the server itself cannot reach.
+    """
+    target = urljoin(url, location)
+    old, new = urlsplit(url), urlsplit(target)
+    if new.scheme != "https" and (new.scheme, new.netloc) != (old.scheme, old.netloc):
+        raise _RefusedError("redirects to an address that is neither https:// nor its own")
+    return target
+
+
+def _check_answer(status: int, headers: Mapping[str, str], start: int) -> int:
+    """Check the head of an answer to a request for a range. Return the size of the whole file.
+
+    Raises:
+        _RefusedError: it is no uncompressed part of a file that begins at ``start``.
+        FileNotFoundError: there is no such file.
+        PermissionError: the file may not be read.
+        ConnectionError: another failure, which may pass.
+    """
+    if status in (404, 410):
+        raise FileNotFoundError
+    if status in (401, 403):
+        raise PermissionError
+    if status == 200:
+        raise _RefusedError("does not serve parts of files")
+    if status != 206:
+        raise ConnectionError(f"status {status}")
+    if headers.get("Content-Encoding", "identity") not in ("", "identity"):
+        raise _RefusedError("sends compressed bytes where plain ones were asked for")
+    stated = re.fullmatch(r"bytes (\d{1,19})-\d{1,19}/(\d{1,19})", headers.get("Content-Range", ""))
+    if stated is None:
+        raise _RefusedError("does not state the size of the file")
+    if int(stated[1]) != start:
+        raise _RefusedError("gives another part of the file than was asked for")
+    return int(stated[2])
