@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import struct
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from bevviz.live.foxglove_server import FoxgloveServer
 from bevviz.recording.ports import free_port
 from tests.support.commands import environment
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, until
 
-pytest.importorskip("foxglove", reason="needs foxglove-sdk: pip install 'bevviz[foxglove]'")
+FIRST = "/detection/fused_3d"
 WANTED = {"/detection/fused_3d", "/lidar/points_no_ground", "/visualization/tracks", "/tf"}
 
 
@@ -47,6 +51,83 @@ def test_a_foreign_client_reads_the_results(tmp_path: Path) -> None:
     (pose,) = messages["/tf"].transforms
     assert (pose.header.frame_id, pose.child_frame_id) == ("map", "rslidar")
     assert messages["/visualization/tracks"].markers
+
+
+@pytest.fixture
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def server(told: list[str]) -> Iterator[FoxgloveServer]:
+    with FoxgloveServer(0, ["http://localhost:8080"], told.append) as server:
+        yield server
+
+
+def status(server: FoxgloveServer, *, host: str = "", origin: str | None = None) -> int:
+    """Return the status of the answer to a browser's request, written by hand."""
+    where = server.address.removeprefix("ws://")
+    name, _, port = where.partition(":")
+    lines = [f"GET / HTTP/1.1\r\nHost: {host or where}", "Upgrade: websocket", "Connection: Upgrade"]
+    lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13"]
+    lines += ["Sec-WebSocket-Protocol: foxglove.sdk.v1", *([f"Origin: {origin}"] if origin else []), "\r\n"]
+    with socket.create_connection((name, int(port)), timeout=PATIENCE) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        return int(connection.recv(4096).split()[1])
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["https://evil.example", "null", "https://app.foxglove.dev.evil.example", "http://app.foxglove.dev"],
+)
+def test_pages_of_other_sites_are_refused(server: FoxgloveServer, told: list[str], origin: str) -> None:
+    assert status(server, origin=origin) == status(server, origin=origin) == 403
+    (line,) = told
+    assert line.endswith(f"--foxglove-origin {origin}")
+
+
+def test_names_of_other_sites_for_this_machine_are_refused(server: FoxgloveServer) -> None:
+    port = server.address.rpartition(":")[2]
+    assert status(server, host=f"evil.example:{port}") == 403
+    assert status(server, host=f"evil.example:{port}", origin="https://app.foxglove.dev") == 403
+
+
+def test_foxglove_and_programs_are_answered(server: FoxgloveServer, told: list[str]) -> None:
+    for origin in (None, "https://app.foxglove.dev", "http://localhost:8080"):
+        assert status(server, origin=origin) == 101
+    assert not told
+
+
+def test_a_client_gets_what_it_subscribes_to(server: FoxgloveServer) -> None:
+    with connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as client:
+        assert json.loads(client.recv(timeout=PATIENCE))["op"] == "serverInfo"
+        channels = json.loads(client.recv(timeout=PATIENCE))["channels"]
+        (number,) = [channel["id"] for channel in channels if channel["topic"] == FIRST]
+        for wrong in ("{", "[]", '{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}'):
+            client.send(wrong)
+            assert json.loads(client.recv(timeout=PATIENCE))["op"] == "status"
+        client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 77, "channelId": number}]}))
+        until(lambda: server.wants(FIRST))
+        assert not server.wants("/tf")
+        server.send("/tf", b"other", 1)
+        server.send(FIRST, b"data", 123)
+        assert client.recv(timeout=PATIENCE) == struct.pack("<BIQ", 1, 77, 123) + b"data"
+        client.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [77]}))
+        until(lambda: not server.wants(FIRST))
+
+
+def test_a_client_that_reads_nothing_delays_neither_the_robot_nor_the_end() -> None:
+    before = threading.active_count()
+    with (
+        FoxgloveServer(0) as server,
+        connect(server.address, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_queue=1) as client,
+    ):
+        client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 5}]}))
+        until(lambda: server.wants(FIRST))
+        for _ in range(40):
+            server.send(FIRST, bytes(1 << 20), 1)
+        server.close()
+    until(lambda: threading.active_count() == before)
 
 
 def received(address: str) -> dict[str, Any]:

@@ -299,4 +299,4 @@ def test_no_more_is_asked_for_at_once_than_the_stated_limit(
     monkeypatch.setattr(remote, "MAX_REQUEST", 1 << 20)
     with pytest.raises(UserError, match=r"^drive\.mcap: it asks for 99,000,000 bytes at once"):
         file.read(0, 99_000_000)
-    assert LyingHandler.sent == 1
+    assert LyingHandler.sent <= 1  # the byte with which the size comes

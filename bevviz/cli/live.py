@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -64,6 +65,14 @@ def add(commands: Commands) -> None:
         const=8765,
         metavar="PORT",
         help="serve the results to Foxglove on this machine (default: 8765)",
+    )
+    choice.add_argument(
+        "--foxglove-origin",
+        action="append",
+        type=_web_origin,
+        default=[],
+        metavar="ORIGIN",
+        help="further web site whose pages may connect to --foxglove, as http://localhost:8080",
     )
     choice.add_argument(
         "--diagnostics",
@@ -195,13 +204,20 @@ def _run(
         return _watch_robot(robot, settings, options, notes, loader, raw, server)
 
 
+def _web_origin(text: str) -> str:
+    """Return the origin of a web site that an option names."""
+    if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no origin, such as http://localhost:8080")
+    return text
+
+
 def _foxglove(options: argparse.Namespace) -> AbstractContextManager[FoxgloveServer | None]:
     """Return the server for Foxglove, if it is requested."""
     if options.foxglove is None:
         return nullcontext()
     from bevviz.live.foxglove_server import FoxgloveServer
 
-    server = FoxgloveServer(options.foxglove)
+    server = FoxgloveServer(options.foxglove, options.foxglove_origin, say)
     say(f"Foxglove: open the connection {server.address}", always=True)
     return server
 
