@@ -6,7 +6,6 @@
 """
 
 import os
-import sys
 
 # Do not import ``typing`` or ``__future__`` here: Python prints a traceback for an interrupt during them.
 TYPE_CHECKING = False
@@ -36,24 +35,6 @@ _HOMES = {
     "open": ("bevviz.drive", "open_drive"),
     "simulate": ("bevviz.drive", "simulate"),
 }
-
-
-_FORMER = ("frame", "geometry", "logging", "results", "run")
-
-
-class _FormerNames:
-    """Import hook for former names of modules; ``bevviz.renamed`` lists them."""
-
-    @staticmethod
-    def find_spec(name: str, path: object = None, target: object = None) -> "Any":
-        if name.partition(".")[0] != "bevviz" or name.split(".")[1] not in _FORMER:
-            return None
-        from bevviz.renamed import spec_of
-
-        return spec_of(name)
-
-
-sys.meta_path.insert(0, _FormerNames)
 
 
 def __getattr__(name: str) -> "Any":

@@ -38,7 +38,7 @@ def test_every_name_on_the_page_is_in_the_code() -> None:
 
 def test_the_page_has_the_layers_of_the_contract_in_order() -> None:
     inside = [name for layer in layers_of_page() for name in layer]
-    found = [layer - {"__main__", "renamed"} for layer in contract()]
+    found = [layer - {"__main__"} for layer in contract()]
     found = [layer for layer in found if layer]
     assert set(inside) == set().union(*found)
     rank = {name: number for number, layer in enumerate(found) for name in layer}

@@ -44,7 +44,6 @@ from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
-from bevviz.renamed import present_options
 from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
@@ -108,12 +107,10 @@ def _main(arguments: Sequence[str] | None) -> int:
             return 2
         if command_line[0] not in commands and ("://" in command_line[0] or Path(command_line[0]).exists()):
             command_line = ["open", *command_line]
-        command_line, renamed = present_options(command_line)
         options = parser.parse_args(command_line)
         if options.verbose:
             _log_to_stderr()
         outputs.set_up_notes(quiet=options.quiet)
-        outputs.warn(renamed)
         follow_recording(options)
         check_outputs(options)
         run: Callable[[argparse.Namespace], int] = options.run

@@ -15,7 +15,7 @@ from bevviz.config.sections import Config, Functions
 from bevviz.config.value_types import CLUSTERING, GROUND, OBJECTS
 from bevviz.errors import UserError
 
-BUILTIN_METHODS = ("", "demo", *GROUND.ours, *GROUND.former, *CLUSTERING.ours, *OBJECTS.ours)
+BUILTIN_METHODS = ("", "demo", *GROUND.ours, *CLUSTERING.ours, *OBJECTS.ours)
 CLASS_LISTS = ("coco", "coco91")  # values of detector.names that name no file
 METHOD_KEYS = {  # section -> key that names the function
     "ground": "method",

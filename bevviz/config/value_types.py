@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, PositiveFloat
@@ -114,12 +114,10 @@ class StageMethods:
     """Allowed methods of a stage: built-in, ``module:function``, a registered name, or ``topic:NAME``."""
 
     ours: tuple[str, ...]
-    former: Mapping[str, str] = field(default_factory=dict)  # former names of built-in methods
     networks: bool = False  # whether an ONNX file is allowed
 
     def check(self, value: str) -> str:
-        """Return the current name of a method. Raise an error for pydantic if the stage does not allow it."""
-        value = self.former.get(value, value)
+        """Return the method. Raise an error for pydantic if the stage does not allow it."""
         if value in self.ours or ":" in value or value in plugins.registered():
             return value
         if self.networks and is_network_file(value):
@@ -136,6 +134,6 @@ class StageMethods:
         )
 
 
-GROUND = StageMethods(("polar", "plane"), {"ransac": "plane"})
+GROUND = StageMethods(("polar", "plane"))
 CLUSTERING = StageMethods(("dbscan",))
 OBJECTS = StageMethods(("frustum",), networks=True)
