@@ -17,7 +17,6 @@ from bevviz.datasets.kitti_files import read_labels
 from bevviz.errors import UserError
 from bevviz.export.folder import rectify
 from bevviz.export.kitti import KittiExport, label_lines
-from bevviz.export.labels import CocoExport, OpenLabelExport
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, Intrinsics
@@ -31,13 +30,7 @@ OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.arr
 def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bevviz.Drive]:
     folder = tmp_path_factory.mktemp("export") / "training"
     drive = bevviz.simulate(8)
-    others = folder.parent
-    exports = [
-        NuScenesExport(others / "scenes"),
-        CocoExport(others / "coco"),
-        OpenLabelExport(others / "open"),
-    ]
-    drive.run([KittiExport(folder), *exports])
+    drive.run([KittiExport(folder), NuScenesExport(folder.parent / "scenes")])
     return folder, drive
 
 
@@ -226,47 +219,3 @@ def test_a_scene_is_written_by_the_command(tmp_path: Path, capsys: pytest.Captur
     assert "format  nuScenes" in capsys.readouterr().out
     assert main(["export", str(made), *out]) == 2
     assert "is there already" in capsys.readouterr().err
-
-
-def test_coco_has_the_kept_detections_and_comes_back(exported: tuple[Path, bevviz.Drive]) -> None:
-    folder, drive = exported
-    tree = json.loads((folder.parent / "coco/labels.json").read_text())
-    names = {category["id"]: category["name"] for category in tree["categories"]}
-    assert [image["file_name"] for image in tree["images"]] == [f"images/zed/{n:06}.png" for n in range(8)]
-    for number in (0, 5):
-        detections = drive.at(frame=number).cameras[0].detections
-        assert detections is not None
-        rows = [row for row in tree["annotations"] if row["image_id"] == tree["images"][number]["id"]]
-        assert [names[row["category_id"]] for row in rows] == list(
-            np.array(detections.names)[detections.kept]
-        )
-        x0, y0, x1, y1 = detections.xyxy[detections.kept].T
-        np.testing.assert_allclose([row["bbox"] for row in rows], np.stack([x0, y0, x1 - x0, y1 - y0], 1))
-        image = cv2.imread(str(folder.parent / "coco" / tree["images"][number]["file_name"]))
-        shown = drive.at(frame=number).frame.cameras[0].image
-        assert shown is not None
-        np.testing.assert_array_equal(image, shown.bgr)
-    results = {"source.results": {"mine": str(folder.parent / "coco/labels.json")}}
-    settings = {**results, "detector.model": "topic:/results/mine"}
-    with bevviz.open(folder, set=settings) as again:
-        there = again.at(frame=5).cameras[0].detections
-        assert there is not None and len(there) == len(rows)
-
-
-def test_openlabel_has_the_cuboids_in_numbered_objects(exported: tuple[Path, bevviz.Drive]) -> None:
-    """The schema of ASAM asks for numbers as keys, and for the sides of a quaternion x, y, z, w."""
-    folder, drive = exported
-    tree = json.loads((folder.parent / "open/labels.json").read_text())["openlabel"]
-    assert tree["metadata"]["schema_version"] == "1.0.0"
-    assert tree["frame_intervals"] == [{"frame_start": 0, "frame_end": 7}]
-    assert all(key.removeprefix("-").isdigit() for key in tree["objects"])
-    objects, labels = drive.at(frame=5).objects, tree["frames"]["5"]["objects"]
-    assert objects is not None and len(labels) == len(objects)
-    for row, (key, label) in enumerate(labels.items()):
-        (cuboid,) = label["object_data"]["cuboid"]
-        np.testing.assert_allclose(cuboid["val"][:3], objects.boxes.center[row], atol=1e-5)
-        np.testing.assert_allclose(cuboid["val"][7:], objects.boxes.size[row], atol=1e-5)
-        assert 2 * np.arctan2(*cuboid["val"][5:7]) == pytest.approx(float(objects.boxes.yaw[row]), abs=1e-5)
-        assert tree["objects"][key]["type"] == objects.names[row]
-    with bevviz.open(folder.parent / "open/lidar") as again:
-        np.testing.assert_array_equal(again.raw(5).points, drive.at(frame=5).frame.points)

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands, add_bag, add_config, add_selection, load_config, open_bag
 from bevviz.cli.outputs import print_hints, say, warn
 from bevviz.cli.run import run_with_progress
 
-if TYPE_CHECKING:
-    from bevviz.export.folder import FolderExport
-
 DESCRIPTION = """Write a drive, or a part of it, as a data set, with the objects that were found as labels to
 be corrected: the folders of KITTI's object benchmark (velodyne, image_2, calib, label_2), or a scene with the
-tables of nuScenes, with all cameras, poses and tracks; or images with the detections as COCO, or clouds,
-images and cuboids as OpenLABEL. bevviz opens the first two."""
+tables of nuScenes, with all cameras, poses and tracks. bevviz opens both."""
 
-FORMATS = ("kitti", "nuscenes", "coco", "openlabel")
 EPILOG = """examples:
   bevviz export drive.mcap --model yolo11n.onnx -o training --start 10 --end 20 --every 5
   bevviz evaluate training --model other.onnx        another detector against the corrected labels
@@ -30,7 +23,7 @@ def add(commands: Commands) -> None:
     """Add the command ``export``."""
     export = commands.add_parser(
         "export",
-        help="write frames as KITTI, nuScenes, COCO or OpenLABEL, with what was found as labels",
+        help="write frames as KITTI or nuScenes, with what was found as labels",
         description=DESCRIPTION,
         epilog=EPILOG,
     )
@@ -39,7 +32,7 @@ def add(commands: Commands) -> None:
     add_config(export)
     output = export.add_argument_group("what to write")
     output.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="that is made")
-    output.add_argument("--format", choices=FORMATS, default="kitti", help="default: kitti")
+    output.add_argument("--format", choices=("kitti", "nuscenes"), default="kitti", help="default: kitti")
     output.add_argument(
         "--camera",
         default="",
@@ -53,17 +46,15 @@ def _export(options: argparse.Namespace) -> int:
     from bevviz.anomalies import FailureSummary
     from bevviz.drive import Drive
     from bevviz.export.kitti import KittiExport
-    from bevviz.export.labels import CocoExport, OpenLabelExport
     from bevviz.export.nuscenes import NuScenesExport
 
-    makers: tuple[Callable[[Path, str], FolderExport], ...]
-    makers = (KittiExport, NuScenesExport, CocoExport, OpenLabelExport)
-    writer = dict(zip(FORMATS, makers, strict=True))[options.format]
     config = load_config(options)
     with open_bag(options, config) as source:
         drive = Drive(source, config)
         print_hints(drive.scene, config)
-        export = writer(options.output, options.camera)
+        export = (KittiExport if options.format == "kitti" else NuScenesExport)(
+            options.output, options.camera
+        )
         failures = FailureSummary()
         end = run_with_progress(drive.frames, drive.new_session(), [export, failures])
         warn([*source.warnings, *failures.warnings])
