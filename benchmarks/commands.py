@@ -2,8 +2,8 @@
 
 Each command runs in a process of its own, on the whole drive and on its first frames, and the commands
 take turns. The difference is the time of the further frames; the rest of the shorter run is the start.
-``compare`` and ``sweep`` count for each configuration, ``tune`` for each save of the file, and ``why`` for
-each frame whose objects it explains. ``open`` runs without a page that draws.
+``compare`` and ``sweep`` count for each configuration, and ``why`` for each frame whose objects it
+explains. ``open`` runs without a page that draws.
 
 Detections come from a store that a run before has filled, unless ``--network`` is stated: the network takes
 the same time in all commands, and would hide what else they do.
@@ -47,7 +47,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.inside:
         name, bag = options.inside
-        {"why": _why, "tune": _tune, "open": _open}[name](Path(bag), options.model)
+        {"why": _why, "open": _open}[name](Path(bag), options.model)
         return 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -101,7 +101,6 @@ def _commands(folder: Path, model: str) -> dict[str, tuple[int, Callable[[Path],
         "calib": (1, command("calib", "--every", "1", model=())),
         "info --sensors": (1, command("info", "--sensors", model=())),
         "why": (1, lambda bag: [*inside, "why", str(bag)]),
-        "tune": (1, lambda bag: [*inside, "tune", str(bag)]),
         "open": (1, lambda bag: [*inside, "open", str(bag)]),
     }
 
@@ -165,29 +164,6 @@ def _why(bag: Path, model: str) -> None:
     drive = bevviz.open(bag, model=model)
     for number in range(len(drive)):
         drive.why(frame=number)
-
-
-def _tune(bag: Path, model: str) -> None:
-    """Run one frame again for as many saves as the drive has frames."""
-    import rerun as rr
-
-    from bevviz.bags.source import BagSource
-    from bevviz.config import changed_config, load
-    from bevviz.sweep.tune import ConfigSave, FrameTuner, VersionRecorder
-
-    config = load(None, [f"detector.model={model}"])
-    with BagSource([bag], config) as source:
-        frame = source.frame(0)
-        assert frame is not None
-        tuner = FrameTuner(frame)
-        recording = rr.RecordingStream("bevviz_benchmark")
-        stream = rr.binary_stream(recording)
-        recorder = VersionRecorder(recording, config, lambda version, seconds: None)
-        recorder.begin(source)
-        for number in range(len(source.scans)):
-            saved = changed_config(config, [f"clustering.eps={0.4 + 0.001 * number}"])
-            recorder.observe(tuner.finish(tuner.perceive(ConfigSave(saved, {}, 0.0))))
-            stream.read()
 
 
 def _open(bag: Path, model: str) -> None:

@@ -523,7 +523,6 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
     assert giving == {
         "cli/demo.py",
         "cli/options.py",
-        "cli/tune.py",
         "config/loading.py",
         "config/reloading.py",
         "drive.py",

@@ -84,9 +84,6 @@ COMMANDS: dict[str, Command] = {
     ),
     "batch": Command((*BATCH, "--jobs", "2"), _batch_is_whole, ("runs",)),
     "batch --dask": Command((*BATCH, "--dask", ADDRESS), _batch_is_whole, ("runs",)),
-    "tune": Command(
-        ("tune", "drive", "--save", "t.rrd"), lambda *_: True, ("t.rrd", "bevviz.yaml"), endless=6
-    ),
     "live": Command(("live", "--synthetic", "10", "--save", "l.rrd"), lambda *_: True, ("l.rrd",), endless=8),
     "open": Command(("open", "drive", "--no-browser"), lambda *_: True, endless=6),
 }

@@ -36,7 +36,6 @@ from bevviz.cli import (
     store,
     sweep,
     trust,
-    tune,
     why,
     workbench,
 )
@@ -62,7 +61,6 @@ EPILOG = """examples:
   bevviz compare drive.mcap --model yolo11n.onnx --set-b clustering.eps=0.8   what if?
   bevviz sweep drive.mcap --model yolo11n.onnx --set clustering.eps=0.3:0.9:0.1   which value?
   bevviz evaluate drive.mcap --model yolo11n.onnx --min recall=0.8                how right? a gate for CI
-  bevviz tune drive.mcap --at 12.5 --model yolo11n.onnx --config my.yaml          run at each save
   bevviz batch bags/ -o runs                  many bags, and the worst frames of all of them
   bevviz causes runs                          what the missed objects of that batch have in common
   bevviz fix runs --cause 1 -o fix.yaml       parameters that find them, tried on other drives
@@ -168,7 +166,6 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
         evaluate,
         export,
         sweep,
-        tune,
         calib,
         report,
         recover,

@@ -303,7 +303,7 @@ def add_output(
             "--blueprint",
             default=blueprint,
             metavar="NAME|FILE",
-            help=f"debug, live, explain, bug_report, compare, tune, a .py or a .rbl (default: {blueprint})",
+            help=f"debug, live, explain, bug_report, compare, a .py or a .rbl (default: {blueprint})",
         )
     return group
 

@@ -91,8 +91,3 @@ def difference_states() -> rrb.StateTimelineView:
     return rrb.StateTimelineView(
         name="Worst of each class", origin=entities.DIFFERENCE_STATE.above, time_view=LINKED
     )
-
-
-def version() -> rrb.TextDocumentView:
-    """Return the view of the parameters changed in ``bevviz tune``."""
-    return rrb.TextDocumentView(name="Version", origin=entities.TUNE)

@@ -14,7 +14,6 @@ from bevviz.model.results import ClusterState, DetectionState
 STAMP = "stamp"  # sensor time, from the header of the cloud
 TRIED = "tried"  # sensor time, for results with tried values in bevviz open
 FRAME = "frame"  # sequence number of the frame
-VERSION = "version"  # sequence number of the configuration, in bevviz tune
 REPORTED = "report"  # sequence number of the frame, up to the frame that a bug report is about
 RECEIVED = "received"  # when the cloud was received, or logged into the bag
 
@@ -249,7 +248,7 @@ SYNC_ERROR = Entity(
 )
 TF_AGE = Entity("/health/tf_age_ms/{sensor}", "Scalars", "to the nearest transform")
 
-# Evaluate, compare, tune, sweep, calib
+# Evaluate, compare, sweep, calib
 EVALUATE = Entity("/evaluate", "TextDocument", "the frame")
 EVALUATE_ABOUT = Entity("/evaluate/about", "TextDocument", "the tables (static)")
 JUDGED = Entity("/evaluate/objects/{outcome}", "Boxes3D", "objects: `true`, `missed`, `false`")
@@ -269,7 +268,6 @@ IMAGE_DIFFERENCE = Entity(
 DIFFERENCE_COUNT = Entity("/compare/count/{change}", "Scalars", "differences counted")
 DIFFERENCE_STATE = Entity("/compare/states/{class}", "StateChange", "the worst difference by class")
 COMPARE_LOG = Entity("/compare/log", "TextLog", "all differences in words")
-TUNE = Entity("/tune", "TextDocument", "changes of a version")
 SWEEP = Entity("/sweep", "TextDocument", "table of the sweep")
 SWEEP_CHART = Entity("/sweep/{chart}", "LineStrips2D, Points2D; Image", "curves; heat maps")
 CALIB_RESULT = Entity(

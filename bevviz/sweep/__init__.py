@@ -1,4 +1,4 @@
-"""Parameter sweeps, and tuning on one frame. Imports `evaluate` and below."""
+"""Parameter sweeps. Imports `evaluate` and below."""
 
 from bevviz.sweep.run import Parameter, Sweep, SweepOutcome, combine, parse
 
