@@ -269,7 +269,7 @@ DIFFERENCE_COUNT = Entity("/compare/count/{change}", "Scalars", "differences cou
 DIFFERENCE_STATE = Entity("/compare/states/{class}", "StateChange", "the worst difference by class")
 COMPARE_LOG = Entity("/compare/log", "TextLog", "all differences in words")
 SWEEP = Entity("/sweep", "TextDocument", "table of the sweep")
-SWEEP_CHART = Entity("/sweep/{chart}", "LineStrips2D, Points2D; Image", "curves; heat maps")
+SWEEP_CHART = Entity("/sweep/{chart}", "LineStrips2D, Points2D", "curves of one parameter")
 CALIB_RESULT = Entity(
     "/calib/{camera}/result",
     "TextDocument",
