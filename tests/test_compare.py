@@ -318,33 +318,6 @@ def test_two_configurations_are_compared_on_kitti(kitti: tuple[str, str], capsys
     assert recording.static["/compare/about"]["TextDocument:text"]
 
 
-def test_two_saved_runs_of_kitti_are_compared(kitti: tuple[str, str], capsys: Capture) -> None:
-    bag, model = kitti
-    assert main(["bag", bag, "--model", model, "--save", "old.rrd"]) == 0
-    changed = ["--set", "clustering.min_cluster_points=2000", "--frames", ":1"]
-    assert main(["bag", bag, "--model", model, *changed, "--save", "new.rrd"]) == 0
-    assert main(["compare", "old.rrd", "old.rrd", "--save", "same.rrd"]) == 0
-    assert "no difference in 2 frames" in capsys.readouterr().out
-    assert main(["compare", "old.rrd", "new.rrd", "--save", "c.rrd", "--json", "c.json"]) == 0
-    told = capsys.readouterr()
-    assert "clustering.min_cluster_points  10 -> 2000" in told.out
-    assert "old.rrd: 1 of 2 frames are not in the other one" in told.err
-    saved = json.loads(Path("c.json").read_text())
-    # The same as when both are run.
-    both = ["--set-b", changed[1], "--save", "both.rrd", "--json", "both.json"]
-    assert main(["compare", bag, "--model", model, *both]) == 0
-    run = json.loads(Path("both.json").read_text())
-    assert saved["frames"][0] == run["frames"][0]
-    assert saved["frames"][0]["objects"]
-    recording = Recording(Path("c.rrd"))
-    assert "Points3D:positions" in recording.at["/b/world/velodyne/points/obstacles"]
-    assert "Points3D:positions" not in recording.at["/b/world/velodyne/points"]
-    assert "person: only A" in recording.at["/compare/objects/only_a"]["Boxes3D:labels"][0]
-    assert "EncodedImage:blob" not in recording.at["/b/world/camera/image"]
-    # A comparison can itself be one of the two.
-    assert main(["compare", "both.rrd", "new.rrd", "--save", "again.rrd"]) == 0
-
-
 def test_our_results_are_compared_with_the_robots(capsys: Capture) -> None:
     """A bag in which the robot publishes one box; bevviz without a detector names none."""
     messages = bags.Messages()
@@ -388,9 +361,6 @@ def detection(messages: bags.Messages, stamp: int, label: str) -> Any:
     ("arguments", "message"),
     [
         (["a.rrd"], "a.rrd: no such file"),
-        (["drive", "a.rrd"], "compare OLD.rrd NEW.rrd"),
-        (["a.rrd", "b.rrd"], "a.rrd: no such file"),
-        (["a.rrd", "b.rrd", "--set-a", "voxel.size=0.2"], "leave the sides and the truth out"),
         (["drive", "--robot", "--set-a", "voxel.size=0.2"], "leave --a and --b out"),
         (["drive", "--robot"], "the bag has no vision_msgs/Detection3DArray"),
         (["drive", "--set-b", "sync.tolerance=0.05"], "A and B differ in sync.tolerance"),

@@ -208,11 +208,3 @@ def test_a_report_without_frames_is_not_confirmed(made: Path, capsys: Capture) -
     forge(json.dumps({**info, "interrupted": True}), config_yaml(Config()))
     assert main(["report", "--check", "bug.rrd"]) == 1
     assert "the same" not in capsys.readouterr().out
-
-
-def test_two_recordings_are_compared(capsys: Capture) -> None:
-    shutil.copy("bug.rrd", "old.rrd")
-    Path("new.rrd").write_bytes(Path("bug.rrd").read_bytes()[:9000])
-    assert "new.rrd: " in error_of(capsys, "compare", "old.rrd", "new.rrd", "--save", "c.rrd")
-    os.mkfifo("pipe.rrd")
-    assert "it is no file" in error_of(capsys, "compare", "old.rrd", "pipe.rrd", "--save", "c.rrd")

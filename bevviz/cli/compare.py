@@ -1,4 +1,4 @@
-"""Command ``bevviz compare``: two configurations, two saved runs, or bevviz and the robot."""
+"""Command ``bevviz compare``: two configurations, or bevviz and the robot."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 DESCRIPTION = """Run two configurations on the same frames and show how the results differ: objects that only
 A or only B has, that have moved, or that have another class. Without --a, --b, --set-a, --set-b, --preset
 and --config it is the reference preset (A) against the default one (B), or of a recording (.rrd) against
-its own configuration. Two .rrd files: what was saved, old (A) against new (B)."""
+its own configuration."""
 
 
 def add(commands: Commands) -> None:
     """Add the command ``compare``."""
     compare = commands.add_parser(
-        "compare", help="what if? two configurations, two saved runs, or the robot", description=DESCRIPTION
+        "compare", help="what if? two configurations, or the robot", description=DESCRIPTION
     )
     group = add_bag(compare)
     add_selection(group)
@@ -72,13 +72,6 @@ def add(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    saved = [path.suffix == ".rrd" for path in options.paths]
-    if any(saved) and not (options.robot is not None and len(saved) == 1):
-        if not all(saved) or len(saved) != 2:
-            raise UserError(
-                "compare: expected a bag, a recording, or two of these: bevviz compare OLD.rrd NEW.rrd"
-            )
-        return _saved(options)
     if options.robot is not None:
         return _robot(options)
     return _configurations(options)
@@ -136,24 +129,6 @@ def _run(
 
     outputs = Outputs.of(options).or_file(_default(options))
     return run_logged(source, processor, config, outputs, observers, finish)
-
-
-def _saved(options: argparse.Namespace) -> int:
-    from bevviz.compare.saved_runs import SavedPair, SavedPairRecorder
-    from bevviz.config import Config
-
-    has_sides = options.robot is not None or options.a or options.b or options.set_a or options.set_b
-    if has_sides or options.truth or options.kitti_labels:
-        raise UserError("compare: two .rrd files are compared as they are; leave the sides and the truth out")
-    pair = SavedPair(*options.paths)
-    return run_logged(
-        pair,
-        pair,
-        Config(),
-        Outputs.of(options).or_file(_default(options)),
-        lambda recording: [SavedPairRecorder(recording, pair), pair.summary],
-        lambda: _report(pair.summary, options),
-    )
 
 
 def _default(options: argparse.Namespace) -> Path:

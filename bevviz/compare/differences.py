@@ -42,11 +42,6 @@ class ImageBoxes:
     xyxy: F32  # (D, 4)
     names: tuple[str, ...]
 
-    @staticmethod
-    def empty() -> ImageBoxes:
-        """Return no detections."""
-        return ImageBoxes(np.zeros((0, 4), np.float32), ())
-
 
 @dataclass(frozen=True, slots=True)
 class SideResult:

@@ -61,7 +61,7 @@ def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
         )
         log_image_box_label_style(to, entities.DETECTIONS.path(camera), 31.0)
         if to.root:
-            log_over_shared_image(to, camera)
+            _log_over_shared_image(to, camera)
         to.static(
             entities.WEAK.path(camera),
             rr.Boxes2D.from_fields(
@@ -70,7 +70,7 @@ def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
         )
 
 
-def log_over_shared_image(to: Writer, camera: str) -> None:
+def _log_over_shared_image(to: Writer, camera: str) -> None:
     """Draw the results of a run under a root over the main run's image. There is only one image."""
     boxes = entities.DETECTIONS.path(camera)
     paths = (
