@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from rerun.blueprint import Blueprint
 
     from bevviz.evaluate.evaluation import Evaluation
-    from bevviz.evaluate.recall_estimate import RecallEstimate
     from bevviz.notebook import NotebookViewer, Selected
     from bevviz.why import Answer, FrameExplainer
 
@@ -324,18 +323,6 @@ class Drive(Closable, Tabular):
         evaluation = Evaluation(truth_in(self.frames, truth, _path(kitti_labels)), false_causes)
         self.run([evaluation])
         return evaluation
-
-    def estimate_recall(self) -> list[RecallEstimate]:
-        """Run the whole drive and estimate the recall without ground truth, in all, by class and range.
-
-        Example:
-            >>> drive.estimate_recall()[0].low
-        """
-        from bevviz.evaluate.recall_estimate import RecallEstimator
-
-        estimator = RecallEstimator()
-        self.run([estimator])
-        return estimator.estimates()
 
     @errors_about_arguments()
     def save(self, path: str | PathLike[str], blueprint: str | Blueprint = "debug") -> Path:

@@ -40,7 +40,7 @@ from bevviz.fleet.jobs import (
     tables,
     unfinished_jobs,
 )
-from bevviz.fleet.table import SEVERITIES, read_info, row, severity
+from bevviz.fleet.table import SEVERITIES, row, severity
 from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
 from tests.support import bags
@@ -317,21 +317,6 @@ def test_the_page_needs_no_other_files(batch: Batch) -> None:
     assert worst["remarks"][0] in page.text
     assert page.text.index(worst["remarks"][0]) > page.text.index("Worst frames")
     assert f"bevviz open {worst['recording']}.rrd --at 20" in page.text
-
-
-def test_each_bag_without_truth_has_an_estimated_recall(batch: Batch) -> None:
-    text = (batch.folder / "summary.html").read_text()
-    assert ">recall, estimated</th>" in text
-    for name in GOOD:
-        info = read_info(batch.folder / f"{name}.parquet")
-        assert info is not None and info.metrics is None and info.estimated_recall is not None
-        estimate = info.estimated_recall
-        recall = estimate["recall"]
-        shown = (
-            "unknown" if recall is None else f"{recall:.2f} ({estimate['low']:.2f}-{estimate['high']:.2f})"
-        )
-        cells = next(line for line in re.split("<tr", text) if f">{name}<" in line)
-        assert f">{shown}</td>" in cells
 
 
 def test_the_worst_frames_have_pictures(batch: Batch) -> None:

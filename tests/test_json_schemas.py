@@ -22,7 +22,6 @@ EVALUATION = {
     "metrics": {"recall": None},
     "false_causes": {},
     "worst": [],
-    "estimated_recall": {},
     "limits": [LIMIT],
 }
 

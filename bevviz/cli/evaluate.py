@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from bevviz.cli.options import (
     Commands,
@@ -33,13 +32,11 @@ if TYPE_CHECKING:
     from bevviz.model.protocols import Observer
     from bevviz.model.results import FrameResult
 
-    JudgeT = TypeVar("JudgeT", bound=Observer[FrameResult])
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
 precision as KITTI defines it, tracks (HOTA, MOTA, IDF1), image boxes, ground. PATH is a bag, or a
 labelled data set (docs/inputs.md). With --min and --max it is a
-gate: the exit status is 1 where a limit is not kept. Where no truth
-is known, the recall is estimated from tracks."""
+gate: the exit status is 1 where a limit is not kept."""
 
 EPILOG = """examples:
   bevviz evaluate drive.mcap --model yolo11n.onnx
@@ -69,107 +66,61 @@ def add(commands: Commands) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from bevviz.evaluate.evaluation import Evaluation
-    from bevviz.evaluate.ground_truth import has_truth, truth_in
-    from bevviz.evaluate.log import EvaluationRecorder
+    from bevviz.evaluate.ground_truth import truth_in
     from bevviz.evaluate.metrics import parse_limits
     from bevviz.why.false_objects import false_causes
 
     limits = parse_limits(options.min, options.max)
     config = load_config(options)
     with open_bag(options, config) as frames:
-        if not (limits or options.truth or options.kitti_labels or has_truth(frames)):
-            return _estimate(frames, config, options)
         evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels), false_causes)
         if not any(limit.metric.startswith(("ground", "object_points")) for limit in limits):
-            _check_detector(config, "; --min ground_iou=0.9 needs none")
-        status = _run(frames, config, evaluation, evaluation.table, options, EvaluationRecorder)
+            _check_detector(config)
+        status = _run(frames, config, evaluation, options)
         if not evaluation.judged:
             raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
         return _report(evaluation, limits, options) or status
 
 
-def _estimate(frames: BagSource, config: Config, options: argparse.Namespace) -> int:
-    """Estimate the recall of a drive without ground truth and return the exit status."""
-    from bevviz.evaluate.evaluation import Evaluation
-    from bevviz.evaluate.recall_estimate import RecallEstimator
-
-    _check_detector(config)
-    if config.tracking.method == "none":
-        raise UserError(
-            f"{frames.scene.name}: no ground truth in it: give --truth TOPIC (Detection3DArray) or "
-            "--kitti-labels; without it the recall is estimated from tracks: set tracking.method=kalman"
-        )
-    say("no ground truth: the recall is estimated from tracks", always=not json_on_stdout(options))
-    estimator = RecallEstimator()
-    status = _run(frames, config, estimator, estimator.table, options)
-    if not Outputs.of(options) and not json_on_stdout(options):
-        print(estimator.table())
-    tree: EvaluateForm = {
-        **Evaluation(lambda _: None).as_tree(),
-        "frames_without_truth": estimator.frames,
-        "limits": [],
-        "estimated_recall": {e.name: e.as_tree() for e in estimator.estimates() if e.objects},
-    }
-    write_json(options, "evaluate", tree)
-    return status
-
-
-def _check_detector(config: Config, remedy: str = "") -> None:
+def _check_detector(config: Config) -> None:
     """Raise an error if no object can have a class."""
     if not (config.detector.model or config.objects.method != "frustum"):
         raise UserError(
             "without a detector no object has a class, and all would be missed: give --model FILE.onnx, "
-            f"or another objects.method{remedy}"
+            "or another objects.method; --min ground_iou=0.9 needs none"
         )
 
 
-def _run(
-    frames: BagSource,
-    config: Config,
-    judge: JudgeT,
-    table: Callable[[], str],
-    options: argparse.Namespace,
-    recorder: Callable[[RecordingStream, JudgeT], Observer[FrameResult]] | None = None,
-) -> int:
-    """Run the pipeline with an observer that judges and return the exit status.
+def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: argparse.Namespace) -> int:
+    """Run the pipeline with an evaluation and return the exit status.
 
-    Args:
-        frames: of the drive.
-        config: configuration of the run.
-        judge: the observer.
-        table: returns its table, which is printed before a recording is served.
-        options: of the command.
-        recorder: makes the observer that logs its results.
+    The table is printed before a recording is served.
     """
     from bevviz.anomalies import FailureSummary
+    from bevviz.evaluate.log import EvaluationRecorder
     from bevviz.findings.run_table import list_keeper
     from bevviz.pipeline.session import Session
 
     session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
     # The workbench takes stated labels for the frames' own. This run has them apart.
     keeper = None if options.truth or options.kitti_labels else list_keeper(frames, session)
-    kept = [] if keeper is None else [keeper]
+    judges: list[Observer[FrameResult]] = [evaluation, failures, *([] if keeper is None else [keeper])]
     if not outputs:
         print_hints(frames.scene, config)
-        end = run_with_progress(frames, session, [judge, failures, *kept])
+        end = run_with_progress(frames, session, judges)
         warn([*frames.warnings, *failures.warnings])
         return table_status(end)
     from bevviz.recording.recorder import Recorder
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         print_hints(frames.scene, config)
-        log: list[Observer[FrameResult]] = [
-            Recorder(recording, config, session.stages.provider),
-            judge,
-            failures,
-            *kept,
-        ]
-        return [*log, recorder(recording, judge)] if recorder is not None else log
+        recorder = Recorder(recording, config, session.stages.provider)
+        return [recorder, *judges, EvaluationRecorder(recording, evaluation)]
 
     def finish() -> None:
         warn(failures.warnings)
         if not json_on_stdout(options):
-            print(table(), flush=True)
+            print(evaluation.table(), flush=True)
 
     return run_logged(frames, session, config, outputs, observers, finish)
 
@@ -185,7 +136,7 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Names
     gate: list[LimitForm] = [
         {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
     ]
-    tree: EvaluateForm = {**evaluation.as_tree(), "limits": gate, "estimated_recall": {}}
+    tree: EvaluateForm = {**evaluation.as_tree(), "limits": gate}
     write_json(options, "evaluate", tree)
     if options.junit is not None:
         write_junit(options.junit, {beside(options.paths[0]).stem: results})

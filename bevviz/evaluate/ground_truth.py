@@ -98,12 +98,6 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
     return of_topic
 
 
-def has_truth(frames: FrameSource) -> bool:
-    """Return whether a drive has ground truth of its own."""
-    roles: Roles | None = getattr(frames, "roles", None)
-    return bool(frames.scene.truth if roles is None else roles.truth)
-
-
 def truth_in(frames: FrameSource, topic: str | None = None, kitti: Path | None = None) -> TruthLookup:
     """Return a function that returns the ground truth of a drive's frames.
 

@@ -17,7 +17,6 @@ from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
 from bevviz.evaluate.marks import MarkRecorder
-from bevviz.evaluate.recall_estimate import RecallEstimator
 from bevviz.findings.run_table import ListKeeper, list_keeper
 from bevviz.fleet.findings import FINDINGS, FindingCollector, judged_names
 from bevviz.fleet.jobs import PARTIAL, Job, JobResult
@@ -92,7 +91,6 @@ def _fill(
     """
     config = _with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
-    estimator = RecallEstimator()
     with job.selection.source([job.bag], job.config) as source:
         session = Session(config)
         recording.parent.mkdir(parents=True, exist_ok=True)
@@ -111,7 +109,7 @@ def _fill(
                 evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
             else:
-                observers += [MarkRecorder(sinks.recording), estimator]
+                observers.append(MarkRecorder(sinks.recording))
             assert sinks.file is not None
             # The workbench takes stated labels for the frames' own.
             keeper = None if job.truth else list_keeper(source, session, job.config)
@@ -133,7 +131,6 @@ def _fill(
             None if evaluation is None else dict(evaluation.as_tree()["metrics"]),
             recording.stat().st_size,
             file_hash(recording),
-            estimator.estimates()[0].as_tree() if evaluation is None else None,
         )
 
 

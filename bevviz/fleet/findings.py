@@ -18,16 +18,15 @@ import pyarrow.parquet as pq
 
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.matching import Matches
-from bevviz.evaluate.recall_estimate import unreported_tracks
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D
-from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult
 from bevviz.recording.images import unexplained_detections
 from bevviz.support.files import atomic_write
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.subject import LINK, projected_box, single_box
+from bevviz.why.subject import projected_box, single_box
 
 FINDINGS = "findings"  # name of the table of all bags, and of the column in a table of frames
 
@@ -35,7 +34,7 @@ Finding: TypeAlias = dict[str, Any]
 
 # ``outcome`` is one of these:
 #   found, missed, false   objects, where there is ground truth
-#   found, unexplained     where there is none: objects; detections and tracks in the cloud without an object
+#   found, unexplained     where there is none: objects; detections without an object
 #   anomaly, quiet         an anomaly of the frame; a frame without any
 TEXTS = ("outcome", "reason", "text", "class", "object", "camera")
 NUMBERS = (
@@ -158,27 +157,6 @@ def _unjudged(explainer: FrameExplainer) -> Iterator[Finding]:
                 height, width = image.bgr.shape[:2]
                 lost |= {"u": (x0 + x1) / 2 / width, "v": (y0 + y1) / 2 / height}
             yield lost
-    yield from _unreported(explainer)
-
-
-def _unreported(explainer: FrameExplainer) -> Iterator[Finding]:
-    """Yield the named tracks in the cloud that no object reports, unless a detection tells of them."""
-    result = explainer.traces.result
-    tracks, objects, rows = result.tracks, result.objects, unreported_tracks(result)
-    if tracks is None or objects is None or not len(rows):
-        return
-    told = [(c.camera, c.detections.xyxy[unexplained_detections(c)]) for c in result.cameras if c.detections]
-    answers = [explainer.about(Selection(track=number)) for number in tracks.id[rows].tolist()]
-    boxes = [answer.subject.box for answer in answers if answer.subject.box is not None]
-    known = Boxes3D.joined([objects.boxes, *boxes])
-    places = _boxes(result, known, np.arange(len(objects), len(known)))
-    for answer, box, finding in zip(answers, boxes, places, strict=True):
-        shown = [(projected_box(box, camera), xyxy) for camera, xyxy in told]
-        if any(xy is not None and (geometry.iou(xy[None], xyxy) >= LINK).any() for xy, xyxy in shown):
-            continue
-        finding |= {"outcome": "unexplained", "class": answer.subject.label.lower(), **_explained(answer)}
-        if finding["reason"] != ReasonKind.REPORTED.value:  # by another track of the same object
-            yield finding | {"object": f"track {answer.subject.row}"}
 
 
 def _explained(answer: Answer) -> Finding:

@@ -70,7 +70,6 @@ def page(
         title=title,
         bags=bags,
         evaluated=any(bag.info.metrics is not None for bag in bags),
-        estimated=any(bag.info.estimated_recall is not None for bag in bags),
         frames=sum(bag.info.frames for bag in bags),
         minutes=sum(bag.duration for bag in bags) / 60,
         severities=SEVERITIES,

@@ -18,7 +18,6 @@ from bevviz.config import Config
 from bevviz.fleet.findings import FINDING, FINDINGS
 from bevviz.model.counts import count_results
 from bevviz.model.frame import Scene
-from bevviz.model.json_forms import RecallEstimateForm
 from bevviz.model.results import Decision, DetectionState, FrameResult
 from bevviz.recording.decisions import decision_log_lines
 from bevviz.support.files import file_hash
@@ -112,7 +111,6 @@ class RunInfo:
     # Hash of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than
     # a recording is made. Rerun writes the file, so it is read once more when it is complete.
     recording_sha256: str = ""  # empty: the table is of an older version
-    estimated_recall: RecallEstimateForm | None = None  # of a bag without ground truth
 
 
 _INFO = TypeAdapter(RunInfo)

@@ -495,26 +495,10 @@ class EvaluationForm(TypedDict):
 
 
 @_closed
-class RecallEstimateForm(TypedDict):
-    """Recall estimated without ground truth; null: unknown."""
-
-    objects: int
-    """tracks"""
-    sightings: int
-    """frames in which these had to be found, summed over the tracks"""
-    recall: float | None
-    low: float | None
-    """end of the interval that holds the recall with 95 %"""
-    high: float | None
-
-
-@_closed
 class EvaluateForm(EvaluationForm):
     """Metrics against ground truth, and the gate."""
 
     limits: Sequence[LimitForm]
-    estimated_recall: Mapping[str, RecallEstimateForm]
-    """by name, recall[.CLASS][@RANGE]; empty: there is ground truth"""
 
 
 # --- causes ------------------------------------------------------------------------------------
