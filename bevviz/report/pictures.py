@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I64, U8, Bool, Boxes3D
+from bevviz.model.frame import F64, U8, Bool, Boxes3D
 from bevviz.model.results import Bev, CameraResult, Decision, FrameResult
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
-from bevviz.recording.primitives import edges
-from bevviz.support.colors import CONTEXT, GROUND, Color, StateColor, class_color, color_rows, turbo
+from bevviz.support.colors import Color, StateColor, class_color, color_rows, turbo
 from bevviz.why import Answer
-from bevviz.why.log import COLORS, NAMES, focus_point
+from bevviz.why.log import focus_point
 from bevviz.why.subject import projected_box
 
 Series = Sequence[tuple[float, float]]  # (x, y) pairs
@@ -24,11 +22,7 @@ Series = Sequence[tuple[float, float]]  # (x, y) pairs
 WIDTH, HEIGHT = 560, 190
 LEFT, RIGHT, TOP, BOTTOM = 52, 18, 10, 24  # margins around the lines, pixels
 
-SIDE = 640, 480  # width and height of a picture in 3D or from above, pixels
-REACH = 15.0  # metres that a picture from above shows on each side of the sensor, at least
-BACK, UP, ASIDE = 9.0, 5.0, 2.5  # metres from the subject to the eye of the picture in 3D
-NEAR = 0.5  # metres in front of the eye below which nothing is drawn
-BACKGROUND = np.array((18, 14, 13), np.uint8)  # BGR, as in the viewer
+PLACE = 1.5  # metres, side of the square that marks a subject without a box from above
 SUBJECT: Color = StateColor.SUBJECT.value
 
 
@@ -110,151 +104,64 @@ class MarkedPicture:
 
 
 def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[MarkedPicture]:
-    """Return pictures that mark the subject: in each image that shows it, in 3D and from above.
+    """Return pictures that mark the subject: each camera image that shows it, and the bird's-eye image.
 
     Args:
         result: result of the frame.
         answer: answer about the subject.
-        width: width of the images in pixels.
+        width: largest width of a picture in pixels.
     """
     marked = []
-    for camera in result.cameras:
-        picture = _marked_image(camera, answer, width)
-        if picture is not None:
-            marked.append(MarkedPicture(picture, f"{camera.camera.name}: white is {answer.subject.name}"))
-    focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
-    if focus is None:
-        return marked
-    counts = np.bincount(answer.fate, minlength=1)
-    points = ", ".join(
-        f"{counts[fate]} {NAMES[fate]}" for fate in COLORS if len(counts) > fate and counts[fate]
-    )
-    about = f"white is {answer.subject.name}; of its points: {points}" if points else "it has no points"
-    return [
-        *marked,
-        MarkedPicture(_space(result, answer, focus), f"in 3D, seen from the sensor's side: {about}"),
-        MarkedPicture(
-            _above(result, answer, focus), "from above, the sensor's front is up; boxes are what was reported"
-        ),
-    ]
+    for result_of_camera in result.cameras:
+        camera, outline = result_of_camera.camera, _outline_in_image(result_of_camera, answer)
+        picture = None if outline is None else camera_picture(result_of_camera, width)
+        if outline is None or picture is None or camera.image is None:
+            continue
+        scale = picture.shape[1] / camera.image.bgr.shape[1]
+        _mark(picture, (outline + 0.5) * scale - 0.5, answer.subject.name)
+        marked.append(MarkedPicture(picture, f"{camera.name}: white is {answer.subject.name}"))
+    outline = None if result.bev is None else _outline_from_above(result, result.bev, answer)
+    if result.bev is not None and outline is not None:
+        picture, scale = shrink(result.bev.image, width)
+        _mark(picture, outline * scale, answer.subject.name)
+        caption = f"from above, the sensor's front is up: white is {answer.subject.name}"
+        marked.append(MarkedPicture(picture, caption))
+    return marked
 
 
-def _marked_image(result: CameraResult, answer: Answer, width: int) -> U8 | None:
-    """Return a camera's image with the subject over the kept detections. None: it does not show it."""
-    subject, camera = answer.subject, result.camera
-    xyxy = subject.xyxy if subject.camera == camera.name else None
+def _outline_in_image(result: CameraResult, answer: Answer) -> F64 | None:
+    """Return the (4, 2) corners of the subject's rectangle in an image. None: the image does not show it."""
+    subject = answer.subject
+    xyxy = subject.xyxy if subject.camera == result.camera.name else None
     if subject.box is not None:
-        xyxy = projected_box(subject.box, camera)
-    if xyxy is None or (picture := camera_picture(result, width)) is None or camera.image is None:
-        return None
-    scale = picture.shape[1] / camera.image.bgr.shape[1]
-    x0, y0, x1, y1 = np.round((xyxy + 0.5) * scale - 0.5).astype(int).tolist()
-    for color, thickness in (((0, 0, 0), 5), (SUBJECT, 2)):
-        cv2.rectangle(picture, (x0 - 2, y0 - 2), (x1 + 2, y1 + 2), color, thickness, cv2.LINE_AA)
-    _label(picture, np.zeros(picture.shape[:2], bool), subject.name, x0 - 2, y0 - 4, SUBJECT)
-    return picture
+        xyxy = projected_box(subject.box, result.camera)
+    return None if xyxy is None else np.asarray(xyxy, np.float64)[[[0, 1], [2, 1], [2, 3], [0, 3]]]
 
 
-def _space(result: FrameResult, answer: Answer, focus: F32) -> U8:
-    """Return a picture in perspective, from an eye on the sensor's side of the subject."""
-    target = np.asarray(focus, np.float64)
-    away = max(float(np.hypot(*target[:2])), 1e-6)
-    ahead = np.array([target[0] / away, target[1] / away, 0.0])
-    eye = target - BACK * ahead + ASIDE * np.array([-ahead[1], ahead[0], 0.0]) + [0.0, 0.0, UP]
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])  # rows: right, down and forward
-    width, height = SIDE
-    middle = np.array([width, height]) / 2
+def _outline_from_above(result: FrameResult, bev: Bev, answer: Answer) -> F64 | None:
+    """Return the (4, 2) corners of the subject's ground area in the bird's-eye image.
 
-    def project(points: F64) -> F64:
-        """Return (N, 3) columns, rows and depths."""
-        seen = (points - eye) @ axes.T
-        depth = np.maximum(seen[:, 2], NEAR)
-        return np.column_stack([seen[:, :2] / depth[:, None] * width * 0.8 + middle, seen[:, 2]])
-
-    return _drawn(result, answer, project, (width, height))
-
-
-def _above(result: FrameResult, answer: Answer, focus: F32) -> U8:
-    """Return a picture from above. x of the points' frame points up, and y to the left."""
-    width, height = SIDE
-    x, y = focus[:2].tolist()
-    ahead, behind, across = max(REACH, 1.25 * x), max(0.2 * REACH, -1.25 * x), max(0.6 * REACH, 1.25 * abs(y))
-    scale = min(height / (ahead + behind), width / 2 / across)
-    origin = np.array([width / 2, ahead * scale])
-
-    def project(points: F64) -> F64:
-        """Return (N, 3) columns, rows and heights; a greater height is drawn later."""
-        pixels = origin - scale * points[:, 1::-1]
-        return np.column_stack([pixels, 1000.0 - points[:, 2]])
-
-    picture = _drawn(result, answer, project, (width, height))
-    u, v = origin.astype(int).tolist()
-    cv2.drawMarker(picture, (u, v), CONTEXT, cv2.MARKER_TRIANGLE_UP, 12, 2)
-    return picture
-
-
-def _drawn(result: FrameResult, answer: Answer, project: Callable[[F64], F64], size: tuple[int, int]) -> U8:
-    """Draw points, reported boxes and the subject.
-
-    Args:
-        result: result of the frame.
-        answer: answer about the subject.
-        project: returns (N, 3) columns, rows and depths of (N, 3) points.
-        size: width and height in pixels.
+    A subject without a box has a square around its points. None: its place is unknown, or outside.
     """
-    width, height = size
-    picture = np.empty((height, width, 3), np.uint8)
-    picture[:] = BACKGROUND
-    _scatter(picture, project(result.frame.points.astype(np.float64)), GROUND)
-    if result.obstacles is not None:
-        _scatter(picture, project(result.obstacles.astype(np.float64)), CONTEXT)
-    for fate, color in COLORS.items():
-        own = result.frame.points[answer.fate == fate]
-        _scatter(picture, project(own.astype(np.float64)), color, 2)
-    occupied = np.zeros((height, width), bool)
-    objects = result.objects
-    for row in range(0 if objects is None else len(objects.names)):
-        assert objects is not None
-        box = objects.boxes.chosen(np.array([row]))
-        _outline(picture, project, box, class_color(objects.names[row]), 1)
-    if answer.subject.box is not None:
-        _outline(picture, project, answer.subject.box, SUBJECT, 2)
-        corners = project(geometry.corners(answer.subject.box)[0].astype(np.float64))
-        x, y = corners[:, 0].min(), corners[:, 1].min() - 4
-    else:
-        x, y, _ = project(np.asarray(focus_point(result.frame, answer), np.float64)[None])[0]
-        cv2.circle(picture, (int(x), int(y)), 12, SUBJECT, 2, cv2.LINE_AA)
-        y -= 16
-    _label(picture, occupied, answer.subject.name, int(x), int(y), SUBJECT)
-    return picture
+    box = answer.subject.box
+    if box is None:
+        focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
+        if focus is None:
+            return None
+        box = Boxes3D(focus[None], np.full((1, 3), PLACE, np.float32), np.zeros(1, np.float32))
+    if (np.abs(box.center[0, :2]) > (bev.range_x, bev.range_y)).any():
+        return None
+    outline = np.array([bev.range_y, bev.range_x]) - geometry.corners(box)[0, :4, 1::-1]
+    return np.asarray(outline / bev.resolution, np.float64)
 
 
-def _scatter(picture: U8, pixels: F64, color: Color, size: int = 1) -> None:
-    """Draw points as squares of ``size`` pixels."""
-    height, width = picture.shape[:2]
-    inside = (pixels[:, 2] > NEAR) & (np.abs(pixels[:, :2]) < 1e5).all(axis=1)
-    columns, rows = np.floor(pixels[inside, :2]).astype(np.int64).T
-    for right in range(size):
-        for down in range(size):
-            _set_pixels(picture, rows + down, columns + right, height, width, color)
-
-
-def _set_pixels(picture: U8, rows: I64, columns: I64, height: int, width: int, color: Color) -> None:
-    """Set the pixels that are inside the picture."""
-    seen = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    picture[rows[seen], columns[seen]] = color[::-1]
-
-
-def _outline(picture: U8, project: Callable[[F64], F64], box: Boxes3D, color: Color, thickness: int) -> None:
-    """Draw the edges of one box, but none that is behind the eye."""
-    strip = project(edges(geometry.corners(box)[0]).astype(np.float64))
-    for start, end in pairwise(strip):
-        if min(start[2], end[2]) > NEAR and np.abs(np.concatenate([start[:2], end[:2]])).max() < 1e4:
-            first, last = (tuple(np.round(end_[:2]).astype(int).tolist()) for end_ in (start, end))
-            cv2.line(picture, first, last, color[::-1], thickness, cv2.LINE_AA)
+def _mark(picture: U8, outline: F64, name: str) -> None:
+    """Draw the closed outline of the subject and its name, white on black."""
+    corners = np.round(np.clip(outline, -1e4, 1e4)).astype(np.int32)
+    for color, thickness in (((0, 0, 0), 5), (SUBJECT, 2)):
+        cv2.polylines(picture, [corners], True, color, thickness, cv2.LINE_AA)
+    x, y = corners.min(axis=0).tolist()
+    _label(picture, np.zeros(picture.shape[:2], bool), name, x, y - 4, SUBJECT)
 
 
 def _draw_points(picture: U8, result: CameraResult, scale: float) -> None:
