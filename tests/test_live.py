@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +49,7 @@ from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
-from tests.support.recordings import Recording, verify, verify_when_indexed
-from tests.support.ros_graphs import alone
+from tests.support.recordings import Recording, verify
 from tests.support.waiting import until
 
 Run = Callable[..., "Outcome"]
@@ -1019,63 +1017,6 @@ def test_jumping_stamps_end_no_run(run: Run, frames: list[Frame], drive: Synthet
     assert all(value[0] < 60_000 for value in p99)
 
 
-def test_signals_and_snap_on_a_running_process(tmp_path: Path) -> None:
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    environment |= alone(tmp_path)
-    command = [sys.executable, "-m", "bevviz.cli"]
-    run = subprocess.Popen(
-        [
-            *command,
-            "live",
-            "--synthetic",
-            "2",
-            "--flight",
-            "20 s",
-            "--save",
-            "all.rrd",
-            "--set",
-            "live.max_rate=4",
-        ],
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,
-        env=environment,
-    )
-
-    def ask(*arguments: str) -> subprocess.CompletedProcess[str]:
-        asked = [*command, "snap", *arguments]
-        return subprocess.run(
-            asked, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False
-        )
-
-    saved = tmp_path / "all.rrd"
-    try:
-        until(lambda: saved.exists() and saved.stat().st_size > 10_000_000)
-        snapped = ask("mine.rrd")
-        again = ask("mine.rrd", "--pid", str(run.pid))
-        other = ask("--pid", "1")
-        run.send_signal(signal.SIGUSR1)
-        until(lambda: list(tmp_path.glob("flight_*.rrd")))
-    finally:
-        run.send_signal(signal.SIGTERM)
-        time.sleep(0.3)
-        run.send_signal(signal.SIGTERM)  # somebody has no patience
-        _, said = run.communicate(timeout=180)
-    assert run.returncode == 0, said
-    assert "Traceback" not in said
-    assert snapped.stdout.strip() == str(tmp_path / "mine.rrd")
-    assert (again.returncode, other.returncode) == (2, 2)
-    assert "mine.rrd: is already there" in again.stderr
-    assert "no 'bevviz live' of yours with process id 1" in other.stderr
-    (signalled,) = tmp_path.glob("flight_*.rrd")
-    for path in (saved, signalled, tmp_path / "mine.rrd"):
-        verify_when_indexed(path)
-        assert len(numbers(path)) >= 2
-    assert f"flight recorder saved in {signalled.name} (SIGUSR1)" in said
-    assert " frames in all.rrd" in said
-    assert "no 'bevviz live' of yours runs" in ask().stderr
-
-
 # --- files of earlier runs ---------------------------------------------------------------------
 
 
@@ -1108,31 +1049,3 @@ def test_a_recording_is_not_written_through_a_link(drive: SyntheticSource, tmp_p
     with pytest.raises(UserError, match="is already there"):
         RecordingSaver(link, config.live, encoder, NoIndexer(), Notes(lambda text: None))
     assert bag.read_text() == "the bag"
-
-
-def is_large(path: Path) -> bool:
-    return path.exists() and path.stat().st_size > 3_000_000
-
-
-def test_a_run_killed_twice_loses_nothing(tmp_path: Path) -> None:
-    """Start the same command again after each kill, as systemd does with Restart=always."""
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    environment |= alone(tmp_path)
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "2", "--save", "drive.rrd"]
-    before: dict[str, bytes] = {}
-    said = ""
-    for number, name in enumerate(["drive.rrd", "drive-2.rrd", "drive-3.rrd"]):
-        saved = tmp_path / name
-        with subprocess.Popen(
-            command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
-        ) as run:
-            try:
-                until(partial(is_large, saved))
-            finally:
-                run.send_signal(signal.SIGKILL if number < 2 else signal.SIGTERM)
-                _, said = run.communicate(timeout=180)
-        assert {name: (tmp_path / name).read_bytes() for name in before} == before
-        before[name] = saved.read_bytes()
-        assert numbers(saved)
-    assert "an earlier run is saved in drive.rrd: this one goes to drive-3.rrd" in said
-    assert sorted(path.name for path in tmp_path.glob("*.rrd")) == ["drive-2.rrd", "drive-3.rrd", "drive.rrd"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,9 +21,6 @@ from bevviz.live.publish import FUSED, OBSTACLES, TOPICS, TRANSFORMS, RosTopics
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.source import LiveSource
 
-# A frame that waits for a silent sensor comes after 20 s, and its test fails.
-PATIENT = ["sync.max_wait=20", "sync.queue=1000"]
-
 
 @dataclass
 class Session:
@@ -39,17 +35,17 @@ class Session:
         until(lambda: all(any(text in line for line in self.said) for text in texts), f"{texts}")
         self.said.clear()
 
-    def until_frames(self, lidar: str) -> None:
-        """Wait for new frames that a LiDAR drives."""
+    def until_frames(self) -> None:
+        """Wait for new frames."""
         self.frames.clear()
-        until(lambda: sum(f.clouds[0].topic == lidar for f in self.frames) > 3, f"frames of {lidar}")
+        until(lambda: len(self.frames) > 3, "frames")
 
 
 @contextmanager
 def running() -> Iterator[Session]:
     """Run a source, and take its frames in a thread."""
     said: list[str] = []
-    config = load(settings=PATIENT)
+    config = load(settings=["sync.max_wait=20"])  # A frame that waits for a silent sensor fails its test.
     with LiveSource(config, tell=said.append, raw=RawRecorder(config.live)) as source:
         session = Session(source, said)
 
@@ -73,39 +69,21 @@ def robot() -> Iterator[FaultyRobot]:
         yield robot
 
 
-def test_a_silent_sensor_stops_no_frame_and_is_named(robot: FaultyRobot) -> None:
+def test_a_lost_sensor_stops_no_frame_and_is_named(robot: FaultyRobot) -> None:
     robot.set("/a", kind="PointCloud2", frame="a")
-    robot.set("/b", kind="PointCloud2", frame="b")  # of the same frame they would be taken for one sensor
     robot.set("/camera", kind="Image")
     with running() as session:
-        session.until_frames("/a")
-        robot.set("/a", silent=True)
-        session.until_told("/a does not deliver: the frames follow /b", "no message on /a")
-        session.until_frames("/b")
-        robot.set("/a", silent=False)
-        session.until_told("the frames follow /a again", "/a is back")
-        session.until_frames("/a")
-        robot.set("/a", kind="")
-        session.until_told("/a has no publisher any more", "the frames follow /b")
-        session.until_frames("/b")
-        robot.set("/a", kind="PointCloud2")
-        session.until_told("/a is published again")
-        session.until_frames("/a")
+        session.until_frames()
         robot.set("/camera", silent=True)
         session.until_told("no message on /camera")
-        session.until_frames("/a")
-
-
-def test_the_only_lidar_is_told_silent_within_two_seconds(robot: FaultyRobot) -> None:
-    robot.set("/a", kind="PointCloud2", frame="a")
-    with running() as session:
-        session.until_frames("/a")
+        session.until_frames()
+        robot.set("/camera", kind="")
+        session.until_told("/camera has no publisher any more")
         robot.set("/a", silent=True)
-        silent = time.monotonic()
         session.until_told("no cloud for 1.5 s on /a")
-        assert time.monotonic() - silent < 4, "2 s, and this machine may be busy"
         robot.set("/a", silent=False)
-        session.until_frames("/a")
+        session.until_told("the clouds are back")
+        session.until_frames()
 
 
 def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> None:
@@ -119,22 +97,12 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
         robot.set("/a", kind="PointCloud2", frame="a")
         clash = "/a has two types: /robot (sensor_msgs/msg/PointCloud2) is received, /stranger (std_msgs"
         session.until_told(clash)
-        session.until_frames("/a")
+        session.until_frames()
         robot.set("/a", kind="", node="stranger")
         session.until_told("/a has one type")
         robot.set("/a", kind="String", node="stranger")
         robot.set(OBSTACLES, kind="String")  # which this process publishes already
         session.until_told("/a has two types")
         until(lambda: OBSTACLES in session.source.topics, "a topic of another type than ours")
-        session.until_frames("/a")
+        session.until_frames()
         assert TOPICS.keys() - publisher.topics == {FUSED, TRANSFORMS}
-
-
-def test_a_changed_frame_and_millimetres_are_told_at_once(robot: FaultyRobot) -> None:
-    robot.set("/a", kind="PointCloud2", frame="a")
-    with running() as session:
-        session.until_frames("/a")
-        robot.set("/a", frame="odd")
-        session.until_told("/a: its frame_id changed from 'a' to 'odd'")
-        robot.set("/a", scale=1000.0)
-        session.until_told("coordinates in millimetres")

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import errno
 import re
-import signal
-import subprocess
-import sys
 import threading
 import time
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,21 +30,19 @@ from bevviz.pipeline.run import run as run_frames
 from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import read_origin
 from bevviz.report.fingerprints import compare, digest
-from bevviz.support.files import unfinished_files, write_all
+from bevviz.support.files import write_all
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
-from tests.support.commands import environment
 from tests.support.recordings import Recording, verify_when_indexed
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
-from tests.support.waiting import PATIENCE, until
+from tests.support.waiting import PATIENCE
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.files import define
-from bevviz.live.indexing import INDEX
 from bevviz.live.node import Node
 from bevviz.live.raw_recorder import LatchedMessages, RawMessage, RawRecorder, children
 from bevviz.live.runtime import Live, Outputs
@@ -266,49 +260,3 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
         room = 1_000_000  # of the chunk that did not fit
     with (tmp_path / "x.mcap").open("rb") as file:
         assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 10
-
-
-def both_are_large(recording: Path, bag: Path) -> bool:
-    waiting = sum(path.stat().st_size for path in unfinished_files(bag))
-    return waiting > 9_000_000 and recording.stat().st_size > 2_500_000
-
-
-def test_bags_of_runs_killed_twice_are_whole(tmp_path: Path) -> None:
-    """Start the same command again after each kill, as systemd does with Restart=always."""
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--save", "drive.rrd", "--save", "drive.mcap"]
-    stems = ["drive", "drive-2", "drive-3"]
-    before: dict[Path, bytes] = {}
-    said = ""
-    with own_graph() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-        with playing(Play(frames=4, points=10_000)):
-            for number, stem in enumerate(stems):
-                recording, bag = tmp_path / f"{stem}.rrd", tmp_path / f"{stem}.mcap"
-                with subprocess.Popen(
-                    command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment()
-                ) as run:
-                    try:
-                        until(partial(both_are_large, recording, bag))
-                    finally:
-                        run.send_signal(signal.SIGKILL if number < 2 else signal.SIGTERM)
-                        _, said = run.communicate(timeout=180)
-                assert {path: path.read_bytes() for path in before} == before, said
-                before |= {tmp_path / f"{name}.mcap": b"" for name in stems[:number]}
-                before[recording] = b""
-                before = {path: path.read_bytes() for path in before}
-    names = {f"{stem}.{suffix}" for stem in stems for suffix in ("rrd", "mcap")}
-    files = {path.name for path in tmp_path.iterdir() if path.is_file()}
-    assert {
-        name for name in files if INDEX not in name
-    } == names  # a process of least priority makes an index
-    assert "drive-2.mcap: " in said and "messages of a run that was killed, completed" in said
-    taken = (
-        "an earlier run is saved in drive.rrd and drive.mcap: this one goes to drive-3.rrd and drive-3.mcap"
-    )
-    assert taken in said
-    for stem in stems:
-        with (tmp_path / f"{stem}.mcap").open("rb") as file:
-            summary = make_reader(file, validate_crcs=True).get_summary()
-        assert summary is not None and summary.statistics is not None
-        assert summary.statistics.message_count > 20
-        assert len(Recording(tmp_path / f"{stem}.rrd").times["stamp"]) > 2

@@ -6,11 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-import threading
+import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -18,27 +17,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
+from bevviz.cli import main
 from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
 from bevviz.messages.clouds import decode_cloud
-from bevviz.messages.decoders import read_header
 from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
-from bevviz.messages.encode import (
-    encode_boxes_3d,
-    encode_camera_info,
-    encode_cloud,
-)
+from bevviz.messages.encode import encode_camera_info
 from bevviz.messages.images import decode_image
-from bevviz.model.frame import Boxes3D, Frame, LateBoxes
+from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.results import CameraResult, Detections, FrameResult, Objects
-from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
+from bevviz.recording.sinks import HEADER_BYTES, MESSAGE_HEADER
+from bevviz.support.files import unfinished_files
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
-from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
-from tests.support.recordings import Recording, verify_when_indexed
+from bevviz.synthetic.drive import LIDAR_TOPIC
+from tests.support.commands import Capture, environment, error_of
+from tests.support.recordings import Recording
 from tests.support.ros_graphs import alone, own_domain, own_graph, playing
 from tests.support.ros_player import Play
 from tests.support.waiting import PATIENCE, until
@@ -47,7 +45,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
-from bevviz.live.node import Node
+from bevviz.live.node import Node, middlewares
 from bevviz.live.publish import (
     BEV,
     CLUSTERS,
@@ -62,15 +60,15 @@ from bevviz.live.publish import (
 )
 from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.live.requests import RosRequests
-from bevviz.live.source import LiveSource, remedy
+from bevviz.live.source import LiveSource
 
-LIGHT = Play(frames=3, points=20_000)
+PLAY = Play(points=20_000)  # a cloud goes over the wire in several pieces
 
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[str]:
     """Yield the domain of a robot that plays for several tests."""
-    with own_graph(), playing(LIGHT):
+    with own_graph(), playing(PLAY):
         yield os.environ["ROS_DOMAIN_ID"]
 
 
@@ -115,232 +113,13 @@ def test_frames_are_those_of_the_drive(robot: str) -> None:
         assert 0 < time.time_ns() - frame.received < PATIENCE * 1e9
 
 
-def test_the_newest_frame_wins(robot: str) -> None:
-    with LiveSource(load()) as source:
-        live = frames(source)
-        before, dropped = next(live).index, source.dropped
-        until(lambda: source.dropped >= dropped + 5, "frames that nobody took")
-        least = source.dropped
-        frame = next(live)
-        assert least <= dropped + frame.index - before - 1 <= source.dropped  # it is the oldest that was not
-
-
-def test_frames_do_not_wait_for_the_robots_results(robot: str) -> None:
-    """One detector stamps its boxes a little after the scan, another one takes 0.7 s for them."""
-    kind, cloud = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
-    one = Boxes3D(np.ones((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32))
-    scans: list[int] = []
-    said: list[str] = []
-    with Node(name="perception") as robots:
-        node = robots.node
-        soon, slow = (
-            node.create_publisher(typesupport.message_type(kind), topic, 10)
-            for topic in ("/soon/boxes", "/slow/boxes")
-        )
-
-        def perceive(data: bytes) -> None:
-            scans.append(read_header(data, "<", LIDAR_TOPIC)[0])
-            for publisher, stamp in ((soon, scans[-1] + 12_000_000), (slow, scans[-8:][0])):
-                boxes = encode_boxes_3d(stamp, "rslidar", one, [[("car", 0.9)]])
-                publisher.publish(bytes(typestore().serialize_cdr(boxes, kind)))
-
-        node.create_subscription(typesupport.message_type(cloud), LIDAR_TOPIC, perceive, 5, raw=True)
-        robots.start()
-        with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
-            assert source.wait(PATIENCE)
-            until(lambda: {"/soon/boxes", "/slow/boxes"} <= set(source.received), "results")
-            source.overtaken()
-            stamps: dict[int, int] = {}
-            taken: Counter[str] = Counter()
-            late: list[LateBoxes] = []
-
-            def come(topic: str) -> int:
-                mine = [found for found in late if found.boxes.topic == topic and found.index in stamps]
-                return len(mine) + taken[topic]
-
-            # With such a wait there were a frame in 20 s, did they wait.
-            for frame in islice(source, 100):
-                stamps[frame.index] = frame.stamp
-                taken.update(box.topic for box in frame.robot_boxes)
-                late += source.overtaken()
-                if min(map(come, ("/soon/boxes", "/slow/boxes"))) > 2 and len(stamps) > 11:
-                    break
-    for topic, shift in (("/soon/boxes", 12_000_000), ("/slow/boxes", 0)):
-        assert come(topic) > 2
-        for found in late:
-            if found.boxes.topic == topic and found.index in stamps:
-                assert found.boxes.stamp - stamps[found.index] == shift
-    assert sum(found.boxes.topic == "/slow/boxes" for found in late) > 2
-    assert any(text.startswith("/slow/boxes comes when its frame has gone on") for text in said)
-
-
-def test_a_stated_topic_can_be_remapped(robot: str) -> None:
-    config = load(settings=["source.lidar_topics=[/points]"])
-    with LiveSource(config, arguments=["-r", f"/points:={LIDAR_TOPIC}"]) as source:
-        next(frames(source))
-        assert source.roles.lidars == (LIDAR_TOPIC,)
-
-
-def test_stated_topic_is_waited_for(robot: str) -> None:
-    said: list[str] = []
-    settings = ["source.lidar_topics=[/rosout]", "source.camera_topics=[/elsewhere]"]
-    with LiveSource(load(settings=settings), tell=said.append) as source:
-        absent = "nobody publishes /elsewhere, which source.camera_topics states"
-        wrong = "/rosout is a rcl_interfaces/msg/Log, but source.lidar_topics takes PointCloud2 or LaserScan"
-        until(lambda: source.missing == f"{wrong}; {absent}", "both")
-        until(lambda: {absent, wrong} <= set(said), "both are told")
-        assert not source.wait(0)
-
-
-def test_info_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first command that a user runs: no LiDAR yet, then one without messages."""
-
-    def describe(config: Config, missing: str) -> info.LiveInfo:
-        for patience in (2.0, 10.0, 60.0):  # nodes of a busy machine take their time to meet
-            made = info.describe(config, seconds=0.1, patience=patience)
-            if made.missing[0].startswith(missing):
-                break
-        return made
-
-    said: list[str] = []
-    monkeypatch.setattr("bevviz.support.progress._say", said.append)
-    with Node(name="half_a_robot") as robots:
-        robots.start()
-        made = describe(load(settings=["source.lidar_topics=[/points]"]), "nobody publishes /points")
-        assert made.missing[0] == "nobody publishes /points, which source.lidar_topics states"
-        assert any(line.startswith("waiting 2 s at most: nobody publishes /points") for line in said)
-        cloud = typesupport.message_type("sensor_msgs/msg/PointCloud2")
-        robots.node.create_publisher(cloud, "/points", 5)
-        made = describe(load(), "no message on /points yet")
-        assert made.missing == ("no message on /points yet", "no detector: --model FILE.onnx")
-
-
-def test_stopped_topics_are_reported_and_so_is_their_return() -> None:
-    said: list[str] = []
-    kind = "sensor_msgs/msg/PointCloud2"
-    with Node(name="driver") as driver, LiveSource(load(), tell=said.append) as source:
-        driver.start()
-        points = driver.node.create_publisher(typesupport.message_type(kind), "/points", 5)
-        whole = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
-        flat = replace(whole, fields=[field for field in whole.fields if field.name != "z"])
-
-        def publish(message: Any) -> bool:
-            now = time.time_ns()
-            stamp = replace(message.header.stamp, sec=now // 10**9, nanosec=now % 10**9)
-            header = replace(message.header, stamp=stamp)
-            points.publish(bytes(typestore().serialize_cdr(replace(message, header=header), kind)))
-            return True
-
-        def until_told(text: str, message: Any = None) -> None:
-            def told() -> bool:
-                if message is not None:
-                    publish(message)
-                return any(text in line for line in said)
-
-            until(told, text)
-
-        until_told("/points", flat)  # at the very first message
-        assert source.states == {"/points": "unusable"}
-        assert any("z" in line for line in said)
-        until_told("/points: its messages can be used again", whole)
-        until(lambda: publish(whole) and source.wait(0), "a scene")
-        for _ in range(6):
-            publish(whole)
-            time.sleep(0.05)
-        until_told("no cloud for 1.5 s on /points")
-        until(lambda: source.states == {"/points": "silent"}, "the state")
-        until_told("the clouds are back", whole)
-        with Node(name="second_driver") as second:
-            second.start()
-            second.node.create_publisher(typesupport.message_type(kind), "/points", 5)
-            until_told("/points has several publishers, taken for one sensor: /", whole)
-        with Node(name="bevviz") as twin:
-            twin.start()
-            until_told("another node is called /bevviz")
-
-
-def test_all_clouds_that_arrive_together_are_taken() -> None:
-    kind = "sensor_msgs/msg/PointCloud2"
-    whole = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
-    with Node(name="driver") as driver, LiveSource(load()) as source:
-        driver.start()
-        points = driver.node.create_publisher(typesupport.message_type(kind), "/points", 10)
-        sent: list[int] = []
-
-        def publish(clouds: int) -> bool:
-            now = time.time_ns()
-            sent[:] = [now + 1_000_000 * i for i in range(clouds)]
-            for at in sent:
-                stamp = replace(whole.header.stamp, sec=at // 10**9, nanosec=at % 10**9)
-                cloud = replace(whole, header=replace(whole.header, stamp=stamp))
-                points.publish(bytes(typestore().serialize_cdr(cloud, kind)))
-            return True
-
-        until(lambda: publish(1) and source.wait(0), "a scene")
-        seen: list[int] = []
-        over = threading.Event()
-
-        class Frames:
-            def perceive(self, frame: Frame, network: object = None) -> Frame:
-                return frame
-
-            def finish(self, frame: Frame) -> Frame:
-                seen.append(frame.stamp)
-                return frame
-
-        def tick() -> None:
-            """Ctrl-C, noticed when the loop has ended already."""
-            if over.is_set():
-                stop.set()
-                until(lambda: all(thread.name != "run" for thread in threading.enumerate()), "the end")
-                raise KeyboardInterrupt
-
-        def work() -> None:
-            run(source, Frames(), dropping=dropping, stop=stop, tick=tick)
-
-        dropping, stop = DropPolicy(), threading.Event()
-        thread = threading.Thread(target=work, daemon=True)
-        thread.start()
-        for clouds in (1, 2, 3, 1, 3, 2, 3):
-            publish(clouds)
-            until(lambda: seen and seen[-1] == sent[-1], "the last of those that came together")
-            assert seen[-clouds:] == sent
-        assert source.dropped == sum(dropping.dropped.values()) == 0
-        over.set()
-        until(lambda: publish(1) and not thread.is_alive(), "the end of the run")
-        before = source.received["/points"]
-        until(lambda: publish(1) and source.received["/points"] > before + 10, "clouds that nobody takes")
-        assert source.dropped == sum(dropping.dropped.values()) == 0
-
-
-def test_the_first_frame_waits_for_its_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CameraInfo and transforms of a robot that starts: the frames begin with them."""
-    monkeypatch.setattr("bevviz.live.source.PATIENCE", PATIENCE)
-    said: list[str] = []
-    late = ("/tf_static", CAMERA_INFO_TOPIC)
-    only = tuple(TOPICS.keys() - {CAMERA_INFO_TOPIC})
-    static = tuple(TOPICS.keys() - {"/tf_static"})
-    with playing(replace(LIGHT, without=late)), LiveSource(load(), tell=said.append) as source:
-        until(lambda: source.received[LIDAR_TOPIC] > 3, "clouds")
-        absent = "no transform from 'rslidar' to 'zed2_left_camera_optical_frame' yet"
-        until(lambda: source.missing.startswith(absent), "what is waited for")
-        assert not source.wait(1.5)
-        info, transforms = (
-            Play(frames=1, name=name, without=w) for name, w in (("info", only), ("tf", static))
-        )
-        with playing(info), playing(transforms):
-            frame = next(frames(source))
-        (camera,) = frame.cameras
-        assert camera.intrinsics is not None and camera.camera_from_points is not None, said
-
-
 def test_info_shows_the_graph(robot: str) -> None:
-    made = info.describe(load(), seconds=2.0)
+    made = info.describe(load(), seconds=1.0)
     topics = {topic.name: topic for topic in made.topics}
     assert topics.keys() >= TOPICS.keys() | {"/rosout"}
     cloud = topics[LIDAR_TOPIC]
     assert cloud.count and cloud.rate and cloud.frame_id == "rslidar"
-    assert made.seconds >= 2.0 and cloud.rate == pytest.approx(cloud.count / made.seconds)
+    assert made.seconds >= 1.0 and cloud.rate == pytest.approx(cloud.count / made.seconds)
     assert topics["/rosout"].count is None and topics["/rosout"].role == ""
     assert topics["/tf_static"].role == "static transforms; from /player (reliable, latched)"
     assert made.tree["rslidar"] == "base_link" and made.world_frame == "map"
@@ -348,28 +127,6 @@ def test_info_shows_the_graph(robot: str) -> None:
     text = info.render(made)
     assert text.startswith(f"graph   ROS_DOMAIN_ID {robot}, rmw_fastrtps_cpp\n")
     assert "zed: 640 x 360 uncompressed" in text
-
-
-def test_topics_that_cannot_be_received_are_reported(robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def without_vision_msgs(name: str) -> Any:
-        if name.startswith("vision_msgs"):
-            raise UserError("vision_msgs is not installed")
-        return typesupport.message_type(name)
-
-    monkeypatch.setattr("bevviz.live.graph.message_type", without_vision_msgs)
-    said: list[str] = []
-    with LiveSource(load(settings=["sync.max_wait=20"]), tell=said.append) as source:
-        heard = list(islice(frames(source), 3))
-        until(lambda: any("is not received" in text for text in said), "what is not received")
-    (unheard,) = [text for text in said if "is not received" in text]
-    assert unheard.startswith(f"{TRUTH_TOPIC} is not received: vision_msgs is not installed; /player, which")
-    assert heard[-1].truth is None and heard[-1].cameras[0].image is not None
-
-
-def test_what_helps_against_losses_depends_on_the_size() -> None:
-    assert "segment" in remedy(1.9e6, 1.9e6) and "docs/live.md" in remedy(1.9e6, 1.9e6)
-    assert "clouds or images fill the transport" in remedy(300, 1.9e6)
-    assert "segment" not in remedy(300, 300) and "queue" in remedy(300, 300)
 
 
 @pytest.mark.parametrize("domain", ["500", "one"])
@@ -389,12 +146,12 @@ def test_a_late_publisher_may_restart_with_other_qos() -> None:
     with LiveSource(load(), tell=said.append) as source:
         assert not source.wait(1.0)
         assert "nothing is published on ROS domain" in source.missing
-        with playing(LIGHT):
+        with playing(PLAY):
             live = frames(source)
             first = next(live)
         until(lambda: f"{LIDAR_TOPIC} has no publisher" in "".join(said), "the publisher's end is told")
         assert any(text.startswith("/tf_static has no publisher") for text in source.warnings)
-        with playing(replace(LIGHT, best_effort=True, focal=1.25)):
+        with playing(replace(PLAY, best_effort=True, focal=1.25)):
             until(lambda: any("calibration" in text for text in said), "the new calibration is told")
             told = time.time_ns()  # what nobody took before is still handed out
             second = next(frame for frame in live if frame.received > told)
@@ -405,12 +162,11 @@ def test_a_late_publisher_may_restart_with_other_qos() -> None:
         assert f"{LIDAR_TOPIC} is published again" in said
 
 
-def test_incompatible_publisher_is_told() -> None:
+def test_incompatible_publisher_is_told(robot: str) -> None:
     said: list[str] = []
     only_static = tuple(TOPICS.keys() - {"/tf_static"})
     with (
-        playing(LIGHT),
-        playing(Play(frames=1, name="volatile", latched=False, without=only_static)),
+        playing(replace(PLAY, name="volatile", latched=False, without=only_static)),
         LiveSource(load(), tell=said.append) as source,
     ):
         frame = next(frames(source))
@@ -528,6 +284,7 @@ def test_published_results_are_not_read_back(result: FrameResult) -> None:
     kinds = {BEV: "Image", OBSTACLES: "PointCloud2", CLUSTERS: "Detection3DArray", FUSED: "Detection3DArray"}
     kinds |= {DETECTIONS: "Detection2DArray", TRACKS: "Detection3DArray", MARKERS: "MarkerArray"}
     with LiveSource(load()) as source, Node(name="rviz") as rviz:
+        rviz.start()
         topics = RosTopics(source.node)
         publisher = Publisher(load(), [topics])
         publisher.publish(result)  # for nobody
@@ -539,16 +296,14 @@ def test_published_results_are_not_read_back(result: FrameResult) -> None:
                 heard[topic] = typestore().deserialize_cdr(data, kind)
 
             rviz.node.create_subscription(typesupport.message_type(kind), topic, receive, 10, raw=True)
-        rviz.start()
 
         def all_heard() -> bool:
             publisher.publish(result)
             return len(heard) == len(kinds)
 
         until(all_heard, f"all of {set(kinds)}")
-        until(lambda: len(rviz.node.get_publishers_info_by_topic(BEV)) == 1, "the graph")
-        until(lambda: "no LiDAR" in source.missing, "the source has looked around")
-        time.sleep(1.0)  # twice
+        rviz.node.create_publisher(typesupport.message_type("std_msgs/msg/String"), "/later", 10)
+        until(lambda: "/later" in source.topics, "a look of the source at all of these topics")
         assert source.roles.lidars == () and "no LiDAR" in source.missing
 
     frame, image = result.frame, result.cameras[0].camera.image
@@ -585,18 +340,163 @@ def test_published_results_are_not_read_back(result: FrameResult) -> None:
     np.testing.assert_allclose(seen.xyxy, [[10, 20, 110, 70]])
 
 
-# --- orders ------------------------------------------------------------------------------------
+# --- the command -------------------------------------------------------------------------------
 
 
-def call(node: Any, client: Any, request: Any) -> Any:
+def call(client: Any, request: Any) -> Any:
     assert client.wait_for_service(PATIENCE)
     answer = client.call_async(request)
     until(answer.done, "an answer")
     return answer.result()
 
 
-def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> None:
+@contextmanager
+def live(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run ``bevviz live`` in a folder. It is killed if the test fails."""
+    command = [sys.executable, "-m", "bevviz.cli", "live", *arguments]
+    run = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, cwd=folder, env=environment() | alone(folder)
+    )
+    try:
+        yield run
+    finally:
+        run.kill()
+        run.communicate()
+
+
+def test_a_run_is_killed_started_again_and_ordered(robot: str, tmp_path: Path, capsys: Capture) -> None:
+    """What a user, systemd and the robot's operator do to ``bevviz live`` in one day."""
     from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+    from std_srvs.srv import Trigger
+
+    arguments = ["--publish", "--save", "drive.rrd", "--save", "drive.mcap", "--preset", "reference"]
+    arguments += ["--set", "live.max_rate=5", "--ros-args", "-p", "range_x:=12.0", "-r", f"{BEV}:=/seen"]
+    recording, bag = tmp_path / "drive.rrd", tmp_path / "drive.mcap"
+    with live(tmp_path, *arguments) as run:
+        until(
+            lambda: run.poll() is not None or (is_large(recording) and unfinished_files(bag)), "a recording"
+        )
+        run.send_signal(signal.SIGKILL)
+    killed = recording.read_bytes()
+
+    heard: dict[str, list[Any]] = {"/seen": [], CLUSTERS: []}
+    with live(tmp_path, *arguments) as run, Node(name="operator") as operator:
+        operator.start()
+        node = operator.node
+        for topic, kind in (("/seen", TOPICS_PUBLISHED[BEV]), (CLUSTERS, TOPICS_PUBLISHED[CLUSTERS])):
+
+            def hear(data: bytes, topic: str = topic, kind: str = kind) -> None:
+                heard[topic].append(typestore().deserialize_cdr(data, kind))
+
+            node.create_subscription(typesupport.message_type(kind), topic, hear, 10, raw=True)
+        until(lambda: all(heard.values()) or run.poll() is not None, "results on the graph")
+        assert {(m.height, m.width, m.encoding) for m in heard["/seen"]} == {(480, 400, "bgr8")}
+        assert {m.header.frame_id for m in heard[CLUSTERS]} == {"rslidar"}
+
+        change = SetParameters.Request(parameters=[Parameter("range_x", value=6.0).to_parameter_msg()])
+        client = node.create_client(SetParameters, "/bevviz/set_parameters")
+        assert call(client, change).results[0].successful
+        until(lambda: heard["/seen"][-1].height == 240, "an image of the new range")
+        client = node.create_client(Trigger, "/bevviz/save_recording")
+        answer = until(lambda: (a := call(client, Trigger.Request())).success and a, "a logged frame")
+
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in alone(tmp_path).items():
+                patch.setenv(name, value)
+            patch.setattr(tempfile, "tempdir", None)
+            patch.chdir(tmp_path)
+            assert main(["snap", "mine.rrd"]) == 0
+            paths = [str(tmp_path / name) for name in ("mine.rrd", "mine.mcap")]
+            assert capsys.readouterr().out.split() == paths
+            assert "mine.rrd: is already there" in error_of(capsys, "snap", "mine.rrd", "--pid", str(run.pid))
+            assert "no 'bevviz live' of yours with process id 1" in error_of(capsys, "snap", "--pid", "1")
+            saved = set(tmp_path.glob("flight_*.rrd"))
+            run.send_signal(signal.SIGUSR1)
+            (signalled,) = until(lambda: set(tmp_path.glob("flight_*.rrd")) - saved, "a recording")
+            until(lambda: signalled.with_suffix(".mcap").exists(), "its bag")
+            run.send_signal(signal.SIGTERM)
+            run.send_signal(signal.SIGTERM)  # somebody has no patience
+            _, said = run.communicate(timeout=PATIENCE)
+            assert "no 'bevviz live' of yours runs" in error_of(capsys, "snap")
+    assert run.returncode == 0 and "Traceback" not in said, said
+    again = (
+        "an earlier run is saved in drive.rrd and drive.mcap: this one goes to drive-2.rrd and drive-2.mcap"
+    )
+    assert again in said and "configuration: bev.range_x 12.0 -> 6.0" in said
+    assert "drive.mcap: " in said and "messages of a run that was killed, completed" in said
+    assert (
+        f"flight recorder saved in {signalled.name} and {signalled.stem}.mcap" in said and "(SIGUSR1)" in said
+    )
+    assert recording.read_bytes() == killed and shown_in(without_its_end(recording, tmp_path))
+    names = ("drive-2.rrd", "mine.rrd", signalled.name, answer.message)
+    for path in (tmp_path / name for name in names):
+        assert shown_in(path)
+        static = Recording(path).static["/config"] or Recording(path).rows["/config"]
+        assert "range_x" in str(static)
+    for path in (bag, *(tmp_path / name for name in names)):
+        with path.with_suffix(".mcap").open("rb") as file:
+            summary = make_reader(file, validate_crcs=True).get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count > 20
+
+
+def is_large(path: Path) -> bool:
+    return path.exists() and path.stat().st_size > 3_000_000
+
+
+def shown_in(path: Path) -> list[int]:
+    """Return the frames of a recording."""
+    return [row["frame"] for row in Recording(path).rows["/explain"]]
+
+
+def without_its_end(recording: Path, folder: Path) -> Path:
+    """Return a copy of what a killed process wrote, without a last message that it did not finish.
+
+    The viewer reads such a file, the SDK does not.
+    """
+    data, copy, end = recording.read_bytes(), folder / "whole.rrd", HEADER_BYTES
+    while len(data) - end >= MESSAGE_HEADER.size:
+        _, size = MESSAGE_HEADER.unpack_from(data, end)
+        if end + MESSAGE_HEADER.size + size > len(data):
+            break
+        end += MESSAGE_HEADER.size + size
+    copy.write_bytes(data[:end])
+    return copy
+
+
+def test_commands_work_before_the_robot_starts(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SIGUSR1 and snap are answered, and a wrong parameter ends the command at once."""
+    monkeypatch.chdir(tmp_path)
+    wrong = error_of(capsys, "live", "--observe", "--ros-args", "-p", "voxel_size:=-1")
+    assert "voxel.size must be greater than or equal to 0" in wrong
+    with live(tmp_path, "--observe") as run:
+        assert run.stderr is not None
+        assert run.stderr.readline().startswith("bevviz: waiting: nothing is published")
+        run.send_signal(signal.SIGUSR1)
+        assert "there is nothing to save yet" in run.stderr.readline()
+        for name, value in alone(tmp_path).items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setattr(tempfile, "tempdir", None)
+        assert "there is nothing to save yet; waiting: nothing is published" in error_of(capsys, "snap")
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=PATIENCE)
+        assert (run.returncode, said) == (1, "")
+
+
+def test_another_middleware_is_refused_and_not_aborted(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "rmw_cyclonedds_cpp" in middlewares():
+        pytest.skip("rmw_cyclonedds_cpp is installed here")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    said = error_of(capsys, "info", "--live")
+    assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp is not installed for this Python" in said
+
+
+def test_parameters_set_the_configuration() -> None:
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
 
@@ -615,160 +515,61 @@ def test_parameters_and_the_saving_of_the_recording(pair: tuple[Node, Node]) -> 
             raise UserError("no space left in /tmp")
         return Path("/tmp/robot.rrd")
 
-    robot, operator = pair
-    orders = RosRequests(robot.node, config, change, save)
-    client = operator.node.create_client(SetParameters, "/one/set_parameters")
+    with Node() as session:
+        node = session.node
+        orders = RosRequests(node, config, change, save)
 
-    def set_to(name: str, value: Any) -> Any:
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        return call(operator.node, client, request).results[0]
+        def set_to(name: str, value: Any) -> Any:
+            return node.set_parameters([Parameter(name, value=value)])[0]
 
-    assert robot.node.get_parameter("range_x").value == 10.0
-    assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
-    assert set_to("max_cluster_size", 500).successful
-    assert config.clustering.max_cluster_points == 500
-    orders.show(config)
-    assert set_to("max_cluster_size", 0).successful
-    assert config.clustering.max_cluster_points is None
-    assert ordered == [
-        "bev.range_x=25",
-        "clustering.max_cluster_points=500",
-        "clustering.max_cluster_points=null",
-    ]
-    refused = set_to("voxel_size", -1.0)
-    assert not refused.successful and "voxel_size out of range" in refused.reason
-    (allowed,) = robot.node.describe_parameter("clustering.eps").floating_point_range
-    assert 0 == allowed.from_value < allowed.to_value < 1000
-    assert robot.node.get_parameter("voxel_size").value == 0.05
+        assert node.get_parameter("range_x").value == 10.0
+        assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
+        assert set_to("max_cluster_size", 500).successful
+        assert config.clustering.max_cluster_points == 500
+        orders.show(config)
+        assert set_to("max_cluster_size", 0).successful
+        assert config.clustering.max_cluster_points is None
+        assert ordered == [
+            "bev.range_x=25",
+            "clustering.max_cluster_points=500",
+            "clustering.max_cluster_points=null",
+        ]
+        refused = set_to("voxel_size", -1.0)
+        assert not refused.successful and "voxel_size out of range" in refused.reason
+        (allowed,) = node.describe_parameter("clustering.eps").floating_point_range
+        assert 0 == allowed.from_value < allowed.to_value < 1000
+        assert node.get_parameter("voxel_size").value == 0.05
 
-    orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
-    assert robot.node.get_parameter("voxel_size").value == 0.2
-    assert len(ordered) == 3, "what is shown is no order"
+        orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
+        assert node.get_parameter("voxel_size").value == 0.2
+        assert len(ordered) == 3, "what is shown is no order"
 
-    del ordered[:]
-    settings = {
-        "clustering.eps": "60 cm",
-        "live.max_rate": 5,
-        "live.triggers": ["tf", "stage"],
-        "source.lidar_topics": "[/points]",
-        "sync.motion_compensation": True,
-    }
-    assert all(set_to(name, value).successful for name, value in settings.items())
-    orders.show(config)
-    assert (config.clustering.eps, config.live.triggers) == (0.5, ()), "each order is alone in this test"
-    assert set_to("live.max_rate", 5).successful and set_to("live.max_rate", "").successful
-    assert ordered == [
-        "clustering.eps=60 cm",
-        "live.max_rate=5",
-        'live.triggers=["tf", "stage"]',
-        "source.lidar_topics=[/points]",
-        "sync.motion_compensation=true",
-        "live.max_rate=5",
-    ]
-    orders.show(load(settings=["live.max_rate=5"], preset="reference"))
-    assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
-    assert not set_to("live.triggers", ["typhoon"]).successful
-    assert {name for name in keys() if not robot.node.has_parameter(name)} == set()
+        del ordered[:]
+        settings = {
+            "clustering.eps": "60 cm",
+            "live.max_rate": 5,
+            "live.triggers": ["tf", "stage"],
+            "source.lidar_topics": "[/points]",
+            "sync.motion_compensation": True,
+        }
+        assert all(set_to(name, value).successful for name, value in settings.items())
+        assert ordered == [
+            "clustering.eps=60 cm",
+            "live.max_rate=5",
+            'live.triggers=["tf", "stage"]',
+            "source.lidar_topics=[/points]",
+            "sync.motion_compensation=true",
+        ]
+        orders.show(load(settings=["live.max_rate=5"], preset="reference"))
+        assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
+        assert not set_to("live.triggers", ["typhoon"]).successful
+        assert {name for name in keys() if not node.has_parameter(name)} == set()
 
-    trigger = operator.node.create_client(Trigger, "/one/save_recording")
-    answer = call(operator.node, trigger, Trigger.Request())
-    assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")
-    full = True
-    answer = call(operator.node, trigger, Trigger.Request())
-    assert (answer.success, answer.message) == (False, "no space left in /tmp")
-
-
-def test_the_command_runs_beside_a_robot(robot: str, tmp_path: Path) -> None:
-    from rcl_interfaces.srv import SetParameters
-    from rclpy.parameter import Parameter
-    from std_srvs.srv import Trigger
-
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    environment |= alone(tmp_path)
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--publish", "--save", "all.rrd"]
-    command += ["--preset", "reference", "--ros-args", "-p", "range_x:=12.0", "-r", f"{BEV}:=/seen"]
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
-    heard: dict[str, list[Any]] = {"/seen": [], CLUSTERS: []}
-    answer: Any = None
-    try:
-        with Node(name="operator") as operator:
-            operator.start()
-            node = operator.node
-            for topic, kind in (("/seen", TOPICS_PUBLISHED[BEV]), (CLUSTERS, TOPICS_PUBLISHED[CLUSTERS])):
-                node.create_subscription(
-                    typesupport.message_type(kind),
-                    topic,
-                    lambda data, topic=topic, kind=kind: heard[topic].append(
-                        typestore().deserialize_cdr(data, kind)
-                    ),
-                    10,
-                    raw=True,
-                )
-            until(lambda: all(heard.values()) or run.poll() is not None, "results on the graph")
-            assert {(m.height, m.width, m.encoding) for m in heard["/seen"]} == {(480, 400, "bgr8")}
-            assert {m.header.frame_id for m in heard[CLUSTERS]} == {"rslidar"}
-
-            change = SetParameters.Request(parameters=[Parameter("range_x", value=6.0).to_parameter_msg()])
-            client = node.create_client(SetParameters, "/bevviz/set_parameters")
-            assert call(node, client, change).results[0].successful
-            until(lambda: heard["/seen"][-1].height == 240, "an image of the new range")
-
-            client = node.create_client(Trigger, "/bevviz/save_recording")
-
-            def saved() -> bool:
-                nonlocal answer
-                answer = call(node, client, Trigger.Request())
-                return bool(answer.success)
-
-            until(saved, "a recording of what was published, once it is logged, too")
-    finally:
-        run.send_signal(signal.SIGTERM)
-        _, said = run.communicate(timeout=PATIENCE)
-    assert run.returncode == 0, said
-    assert "configuration: bev.range_x 12.0 -> 6.0" in said and "Traceback" not in said
-    for path in (tmp_path / "all.rrd", tmp_path / answer.message):
-        verify_when_indexed(path)
-        recording = Recording(path)
-        assert recording.rows["/bev"]  # of what was saved at once there may be one frame
-        configs = recording.static["/config"] or recording.rows["/config"]
-        assert "range_x" in str(configs)
-
-
-def test_commands_work_before_the_robot_starts(tmp_path: Path) -> None:
-    """SIGUSR1 and snap are answered, parameters are taken, and a wrong one ends the command at once."""
-    environment = os.environ | alone(tmp_path)
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--observe"]
-    wrong = [*command, "--ros-args", "-p", "voxel_size:=-1"]
-    refused = subprocess.run(wrong, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert refused.returncode == 2 and "voxel.size must be greater than or equal to 0" in refused.stderr
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
-    assert run.stderr is not None
-    try:
-        assert run.stderr.readline().startswith("bevviz: waiting: nothing is published")
-        run.send_signal(signal.SIGUSR1)
-        assert "there is nothing to save yet" in run.stderr.readline()
-        snap = [sys.executable, "-m", "bevviz.cli", "snap"]
-        asked = subprocess.run(
-            snap, capture_output=True, text=True, env=environment, timeout=PATIENCE, check=False
-        )
-        assert asked.returncode == 2
-        assert "there is nothing to save yet; waiting: nothing is published" in asked.stderr
-    finally:
-        run.send_signal(signal.SIGTERM)
-        _, said = run.communicate(timeout=PATIENCE)
-    assert run.returncode == 1 and said == ""
-
-
-def test_another_middleware_is_refused_and_not_aborted() -> None:
-    command = [sys.executable, "-m", "bevviz.cli", "info", "--live"]
-    environment = dict(os.environ) | {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=environment, timeout=PATIENCE, check=False
-    )
-    if done.returncode == 0:
-        pytest.skip("rmw_cyclonedds_cpp is installed here")
-    assert done.returncode == 2
-    assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp is not installed for this Python" in done.stderr
+        answer = orders._trigger(Trigger.Request(), Trigger.Response())
+        assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")
+        full = True
+        answer = orders._trigger(Trigger.Request(), Trigger.Response())
+        assert (answer.success, answer.message) == (False, "no space left in /tmp")
 
 
 def test_parameters_of_the_command_line() -> None:

@@ -30,7 +30,6 @@ class Publication:
     topic: str
     kind: str = ""  # PointCloud2, Image or String; empty: the publisher is destroyed
     frame: str = "lidar"
-    scale: float = 1.0  # factor on the coordinates
     silent: bool = False
     node: str = "robot"
 
@@ -120,7 +119,7 @@ def _message(publication: Publication, stamp: Any) -> Any:
     from sensor_msgs.msg import PointField
 
     ground = np.mgrid[-15:15:0.5, -15:15:0.5, -1.8:-1.7:1].reshape(3, -1).T
-    points = (publication.scale * ground).astype(np.float32)
+    points = ground.astype(np.float32)
     message.height, message.width, message.point_step = 1, len(points), 12
     message.row_step = 12 * len(points)
     message.fields = [

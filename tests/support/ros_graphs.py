@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pickle
 import random
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.played_drive import drive_of
 from tests.support.ros_player import Play
 
 ROOT = Path(__file__).parents[2]
@@ -51,9 +54,14 @@ def own_graph() -> Iterator[pytest.MonkeyPatch]:
 @contextmanager
 def playing(play: Play) -> Iterator[None]:
     """Run a robot in its own process."""
-    with subprocess.Popen(play.arguments(), cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, "-m", "tests.support.ros_player"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe) as process:
         try:
-            assert process.stdout is not None and process.stdout.readline() == "playing\n"
+            assert process.stdin is not None and process.stdout is not None
+            pickle.dump(drive_of(play), process.stdin)
+            process.stdin.close()
+            assert process.stdout.readline() == b"playing\n"
             yield
         finally:
             process.terminate()  # the graph learns of it at once, as of a node that is shut down
