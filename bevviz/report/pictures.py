@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from bevviz.config import BevConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F64, U8, Bool, Boxes3D
 from bevviz.model.results import Bev, CameraResult, Decision, FrameResult
 from bevviz.recording.entities import DEPTH_BINS, DEPTH_RANGE
+from bevviz.stages.bev import bev
+from bevviz.stages.voxel import spread_to_points
 from bevviz.support.colors import Color, StateColor, class_color, color_rows, turbo
 from bevviz.why import Answer
 from bevviz.why.log import focus_point
@@ -22,7 +25,8 @@ Series = Sequence[tuple[float, float]]  # (x, y) pairs
 WIDTH, HEIGHT = 560, 190
 LEFT, RIGHT, TOP, BOTTOM = 52, 18, 10, 24  # margins around the lines, pixels
 
-PLACE = 1.5  # metres, side of the square that marks a subject without a box from above
+PLACE = 1.5  # metres, side of the box that marks the place of a subject without one
+REACH, MOST_REACH = 15.0, 500.0  # metres that the picture from above shows on each side of the sensor
 SUBJECT: Color = StateColor.SUBJECT.value
 
 
@@ -104,7 +108,7 @@ class MarkedPicture:
 
 
 def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[MarkedPicture]:
-    """Return pictures that mark the subject: each camera image that shows it, and the bird's-eye image.
+    """Return pictures that mark the subject: each camera image that shows it, and one from above.
 
     Args:
         result: result of the frame.
@@ -120,10 +124,10 @@ def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[Mar
         scale = picture.shape[1] / camera.image.bgr.shape[1]
         _mark(picture, (outline + 0.5) * scale - 0.5, answer.subject.name)
         marked.append(MarkedPicture(picture, f"{camera.name}: white is {answer.subject.name}"))
-    outline = None if result.bev is None else _outline_from_above(result, result.bev, answer)
-    if result.bev is not None and outline is not None:
-        picture, scale = shrink(result.bev.image, width)
-        _mark(picture, outline * scale, answer.subject.name)
+    box = answer.subject.box or _box_around_points(result, answer)
+    if box is not None and result.frame.lidar:
+        picture, outline = _view_from_above(result, box, width)
+        _mark(picture, outline, answer.subject.name)
         caption = f"from above, the sensor's front is up: white is {answer.subject.name}"
         marked.append(MarkedPicture(picture, caption))
     return marked
@@ -138,21 +142,22 @@ def _outline_in_image(result: CameraResult, answer: Answer) -> F64 | None:
     return None if xyxy is None else np.asarray(xyxy, np.float64)[[[0, 1], [2, 1], [2, 3], [0, 3]]]
 
 
-def _outline_from_above(result: FrameResult, bev: Bev, answer: Answer) -> F64 | None:
-    """Return the (4, 2) corners of the subject's ground area in the bird's-eye image.
+def _box_around_points(result: FrameResult, answer: Answer) -> Boxes3D | None:
+    """Return a box at the points of a subject without one. None: it has no points."""
+    focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
+    size, yaw = np.full((1, 3), PLACE, np.float32), np.zeros(1, np.float32)
+    return None if focus is None else Boxes3D(focus[None], size, yaw)
 
-    A subject without a box has a square around its points. None: its place is unknown, or outside.
-    """
-    box = answer.subject.box
-    if box is None:
-        focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
-        if focus is None:
-            return None
-        box = Boxes3D(focus[None], np.full((1, 3), PLACE, np.float32), np.zeros(1, np.float32))
-    if (np.abs(box.center[0, :2]) > (bev.range_x, bev.range_y)).any():
-        return None
-    outline = np.array([bev.range_y, bev.range_x]) - geometry.corners(box)[0, :4, 1::-1]
-    return np.asarray(outline / bev.resolution, np.float64)
+
+def _view_from_above(result: FrameResult, box: Boxes3D, width: int) -> tuple[U8, F64]:
+    """Return a bird's-eye image that reaches beyond a box, and the (4, 2) corners of the box in it."""
+    reach = min(max(REACH, 1.25 * float(np.abs(box.center[0, :2]).max())), MOST_REACH)
+    config = BevConfig(range_x=reach, range_y=reach, resolution=2 * reach / width, channels=())
+    ground = None
+    if result.voxels is not None and result.ground is not None:
+        ground = spread_to_points(result.ground.mask, result.voxels.inverse)
+    image = bev(result.frame.points, None, ground, result.objects, result.clusters, config).image
+    return image, np.asarray((reach - geometry.corners(box)[0, :4, 1::-1]) / config.resolution, np.float64)
 
 
 def _mark(picture: U8, outline: F64, name: str) -> None:
