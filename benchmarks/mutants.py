@@ -32,7 +32,9 @@ ANNOTATIONS = "core/ReplaceBinaryOperator_BitOr_"
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="for the clone and the state of the run")
     parser.add_argument("--sample", type=int, default=100, help="mutants in all (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the draw (default: %(default)s)")
@@ -44,6 +46,9 @@ def main() -> int:
     for package in TESTS:
         session = options.folder / f"{package}.sqlite"
         if not session.exists():
+            _cosmic_ray(
+                clone, "baseline", _config(package, clone, session)
+            )  # raises if a test fails unchanged
             _draw(package, clone, session, options.sample // len(TESTS), options.seed)
         _cosmic_ray(clone, "exec", _config(package, clone, session), session)
         outcomes = _outcomes(session)
@@ -88,9 +93,9 @@ def _draw(package: str, clone: Path, session: Path, count: int, seed: int) -> No
     listed.rename(session)
 
 
-def _cosmic_ray(clone: Path, command: str, config: Path, session: Path) -> None:
+def _cosmic_ray(clone: Path, command: str, *files: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(clone), "PYTHONDONTWRITEBYTECODE": "1", "CI": "1"}
-    arguments = [command, str(config.resolve()), str(session.resolve())]
+    arguments = [command, *(str(file.resolve()) for file in files)]
     subprocess.run(
         [sys.executable, "-m", "cosmic_ray.cli", *arguments], cwd=clone, env=environment, check=True
     )

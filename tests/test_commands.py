@@ -111,16 +111,18 @@ def port_of(address: str) -> str:
 
 
 def test_demo_is_saved_where_asked(tmp_path: Path) -> None:
-    assert main(["demo", "--frames", "2", "--save", "demo.rrd"]) == 0
+    assert main(["demo", "--save", "demo.rrd"]) == 0
     recording = Recording(tmp_path / "demo.rrd")
-    assert len(recording.rows["/bev"]) == 2
+    assert len(recording.rows["/bev"]) == 16
     assert "/world/fused" in recording.at
 
 
 def test_demo_writes_a_bag_that_runs(tmp_path: Path, capsys: Capture) -> None:
-    assert main(["demo", "--frames", "3", "-o", "drive.mcap"]) == 0
-    assert main(["bag", "drive.mcap", "--model", "demo", "--save", "out.rrd"]) == 0
+    assert main(["demo", "-o", "drive.mcap"]) == 0
+    assert main(["bag", "drive.mcap", "--model", "demo", "--frames", ":3", "--save", "out.rrd"]) == 0
     assert "3 frames in out.rrd" in capsys.readouterr().err
+    assert main(["demo", "-o", "drive.mcap"]) == main(["demo", "-o", "drive.bag"]) == 2
+    assert "drive.mcap exists already" in capsys.readouterr().err
     assert len(Recording(tmp_path / "out.rrd").rows["/bev"]) == 3
 
 

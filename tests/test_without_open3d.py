@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bevviz.synthetic import SyntheticSource, write_bag
+from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE
 
 COMMAND = (
@@ -20,13 +20,6 @@ COMMAND = (
 )
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
-    write_bag(SyntheticSource(frames=2), path)
-    return path
-
-
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command without Open3D."""
     return subprocess.run(
@@ -35,23 +28,22 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_a_bag_runs(bag: Path, tmp_path: Path, preset: str) -> None:
-    done = run(
-        tmp_path, "bag", str(bag), "--model", "demo", "--preset", preset, "--save", f"{preset}.rrd", "--quiet"
-    )
+def test_a_bag_runs(tmp_path: Path, preset: str) -> None:
+    command = ["bag", str(BAG), "--model", "demo", "--frames", ":2", "--preset", preset]
+    done = run(tmp_path, *command, "--save", f"{preset}.rrd", "--quiet")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / f"{preset}.rrd").stat().st_size > 100_000
 
 
-def test_a_bag_is_described_and_explained(bag: Path, tmp_path: Path) -> None:
-    described = run(tmp_path, "info", str(bag))
+def test_a_bag_is_described_and_explained(tmp_path: Path) -> None:
+    described = run(tmp_path, "info", str(BAG))
     assert described.returncode == 0 and "/rslidar_points: LiDAR" in " ".join(described.stdout.split())
-    explained = run(tmp_path, "why", str(bag), "--model", "demo", "--at-frame", "1", "--quiet")
+    explained = run(tmp_path, "why", str(BAG), "--model", "demo", "--at-frame", "1", "--quiet")
     assert explained.returncode == 0 and "frame 1" in explained.stdout
 
 
-def test_the_workbench_opens(bag: Path, tmp_path: Path) -> None:
-    command = [*COMMAND, "open", str(bag), "--model", "demo", "--no-browser"]
+def test_the_workbench_opens(tmp_path: Path) -> None:
+    command = [*COMMAND, "open", str(BAG), "--model", "demo", "--no-browser"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as server:
         assert server.stderr is not None
         lines = list[str]()

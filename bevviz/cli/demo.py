@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,14 +12,19 @@ from bevviz.cli.outputs import Outputs, say
 from bevviz.cli.run import process
 from bevviz.errors import UserError
 from bevviz.support import progress
+from bevviz.support.files import atomic_write, write_all
 
 if TYPE_CHECKING:
     from bevviz.config import Config, Preset
+    from bevviz.synthetic import SyntheticSource
 
 FRAMES = 100
 BAG = Path("demo.mcap")  # drive of the workbench
-PLANT = "small_child"  # fault of that drive; the reference preset misses it
-FURTHER = 10  # frames after those in which the faults are seen best
+# The drive in the package, which bevviz/synthetic/sample.py made; the reference preset misses a child in it.
+SHIPPED = Path(__file__).parents[1] / "data" / "demo.mcap"
+SHIPPED_FRAMES = 16
+SHIPPED_CHILD = 5  # frame in which the child is seen best
+FURTHER = 10  # frames of a simulated drive after those in which its faults are seen best
 
 # A test compares this text with bevviz.synthetic.faults. Importing that module would slow down --help.
 PLANTS = """faults to --plant:
@@ -42,20 +46,25 @@ def add(commands: Commands) -> None:
     demo = commands.add_parser(
         "demo",
         help="a missed pedestrian in a synthetic drive, and why",
-        description="Simulate a drive past cars, pedestrians and cyclists, say why one of them is missed, "
-        "and open the workbench on it. With an output: run the pipeline on the drive instead.",
+        description="Take a simulated drive past cars, pedestrians and cyclists, say why one of them is "
+        "missed, and open the workbench on it. With an output: run the pipeline on the drive instead. The "
+        "options of the simulator make another drive, with Open3D.",
     )
-    demo.add_argument("--frames", type=positive, metavar="N", help="scans at 10 Hz (default: 100, or 15)")
-    demo.add_argument("--seed", type=int, default=0, help="another seed is another street (default: 0)")
+    demo.add_argument(
+        "--frames", type=positive, metavar="N", help="simulate a drive of N scans at 10 Hz (default: 100)"
+    )
+    demo.add_argument("--seed", type=int, default=0, help="simulate another street (default: 0)")
     demo.add_argument(
         "--plant",
         action="append",
         default=[],
         metavar="NAME",
-        help="plant a fault that perception gets wrong, see below; several times for several",
+        help="simulate a fault that perception gets wrong, see below; several times for several",
     )
     demo.add_argument(
-        "--weave", action="store_true", help="swerve, brake and speed up, as a drive to calibrate with should"
+        "--weave",
+        action="store_true",
+        help="simulate a vehicle that swerves, as it should to calibrate sensors",
     )
     demo.add_argument(
         "-o",
@@ -72,18 +81,27 @@ def add(commands: Commands) -> None:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    outputs, frames = Outputs.of(options), options.frames or FRAMES
+    outputs = Outputs.of(options)
     if options.output is not None:
-        _write(options, options.plant, frames, options.output)
+        frames = _make_bag(options, options.output)
         print(f"{options.output}: {frames} scans; 'bevviz bag {options.output} --model demo' runs on it")
         return 0
     if not outputs and find_spec("rerun_notebook") is not None:
         return _show_missed(options)
     from bevviz.drive import Drive
-    from bevviz.synthetic import SyntheticSource
 
-    source = SyntheticSource(frames, options.seed, plant=options.plant, weave=options.weave)
-    return process(Drive(source, _config(options, options.preset)), outputs, Path("demo.rrd"))
+    config = _config(options, options.preset)
+    if _is_simulated(options):
+        return process(Drive(_simulated(options, FRAMES), config), outputs, Path("demo.rrd"))
+    from bevviz.bags.source import BagSource
+
+    with BagSource([SHIPPED], config) as source:
+        return process(Drive(source, config), outputs, Path("demo.rrd"))
+
+
+def _is_simulated(options: argparse.Namespace) -> bool:
+    """Return whether a drive is asked for that does not ship with bevviz."""
+    return bool(options.plant or options.frames or options.seed or options.weave)
 
 
 def _config(options: argparse.Namespace, preset: Preset | None) -> Config:
@@ -93,12 +111,28 @@ def _config(options: argparse.Namespace, preset: Preset | None) -> Config:
     return load(options.config, options.set, preset, layers=[Layer("demo", {"detector.model": "demo"})])
 
 
-def _write(options: argparse.Namespace, plants: Sequence[str], frames: int, path: Path) -> None:
-    """Write the drive as a bag."""
-    from bevviz.synthetic import SyntheticSource, write_bag
+def _simulated(options: argparse.Namespace, frames: int) -> SyntheticSource:
+    """Return the simulated drive; ``frames`` is its length if none is stated."""
+    from bevviz.synthetic import SyntheticSource
 
-    source = SyntheticSource(frames, options.seed, plant=plants, weave=options.weave)
+    return SyntheticSource(options.frames or frames, options.seed, plant=options.plant, weave=options.weave)
+
+
+def _make_bag(options: argparse.Namespace, path: Path, frames: int = FRAMES) -> int:
+    """Copy the shipped drive, or simulate one of ``frames`` scans. Return the number of its scans."""
+    if not _is_simulated(options):
+        if path.suffix != ".mcap":
+            raise UserError(f"{path}: a bag is written as MCAP, so its name must end in .mcap")
+        if path.exists():
+            raise UserError(f"{path} exists already; remove it or give another name")
+        with atomic_write(path, "drive") as unfinished:
+            write_all(unfinished.handle, SHIPPED.read_bytes())
+        return SHIPPED_FRAMES
+    from bevviz.synthetic import write_bag
+
+    source = _simulated(options, frames)
     write_bag(source, path, progress.bar(source, total=source.total, unit="scan", desc="simulate"))
+    return source.total
 
 
 def _show_missed(options: argparse.Namespace) -> int:
@@ -106,19 +140,16 @@ def _show_missed(options: argparse.Namespace) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.cli.workbench import open_page
     from bevviz.pipeline.session import Session
-    from bevviz.synthetic.faults import FAULTS
     from bevviz.why import FrameExplainer
 
-    plants = options.plant or [PLANT]
-    seen = [round(10 * FAULTS[name].time) for name in plants if name in FAULTS] or [0]
     config = _config(options, options.preset or (None if options.config else "reference"))
-    if BAG.exists() and not (options.plant or options.frames or options.seed or options.weave):
+    number = _frame_of_interest(options)
+    if BAG.exists() and not _is_simulated(options):
         say(f"{BAG} is there already and is opened again; remove it for a new one")
     else:
-        _write(options, plants, options.frames or max(seen) + FURTHER, BAG)
+        _make_bag(options, BAG, number + FURTHER)
     with BagSource([BAG], config) as source:
-        number = min(seen[0], len(source.scans) - 1)
-        frame = source.frame(number)
+        frame = source.frame(min(number, len(source.scans) - 1))
         if frame is None:
             raise UserError(f"{BAG}: scan {number} cannot be read; remove the file for a new one")
         session = Session(config)
@@ -131,3 +162,12 @@ def _show_missed(options: argparse.Namespace) -> int:
     page = argparse.Namespace(**vars(options), paths=[BAG], at=None, at_frame=number, port=None, browser=True)
     page.truth = page.kitti_labels = None
     return open_page(page, config, where)
+
+
+def _frame_of_interest(options: argparse.Namespace) -> int:
+    """Return the frame in which the first planted fault is seen best."""
+    if not _is_simulated(options):
+        return SHIPPED_CHILD
+    from bevviz.synthetic.faults import FAULTS
+
+    return next((round(10 * FAULTS[name].time) for name in options.plant if name in FAULTS), 0)

@@ -27,6 +27,7 @@ from bevviz.messages.encode import (
     encode_boxes_3d,
     encode_camera_info,
     encode_cloud,
+    encode_compressed_image,
     encode_image,
     encode_odometry,
     encode_transforms,
@@ -39,6 +40,7 @@ from bevviz.synthetic.drive import SyntheticSource
 TOPICS = {
     drive.LIDAR_TOPIC: "sensor_msgs/msg/PointCloud2",
     drive.IMAGE_TOPIC: "sensor_msgs/msg/Image",
+    f"{drive.IMAGE_TOPIC}/compressed": "sensor_msgs/msg/CompressedImage",
     drive.CAMERA_INFO_TOPIC: "sensor_msgs/msg/CameraInfo",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -57,18 +59,19 @@ class BagWriter:
     Args:
         source: its poses and calibration are written beside the frames.
         path: the ``.mcap`` file to make.
+        compress: compress what is written.
 
     Raises:
         UserError: ``path`` does not end in .mcap, exists already, or cannot be written.
     """
 
-    def __init__(self, source: SyntheticSource, path: Path) -> None:
+    def __init__(self, source: SyntheticSource, path: Path, compress: bool = False) -> None:
         if path.suffix != ".mcap":
             raise UserError(f"{path}: a bag is written as MCAP, so its name must end in .mcap")
         if path.exists():
             raise UserError(f"{path} exists already; remove it or give another name")
         self._source = source
-        self._writer = McapWriter(path, lambda connection: connection.msgdef, compress=False)
+        self._writer = McapWriter(path, lambda connection: connection.msgdef, compress=compress)
         self._connections = {topic: _connection(topic, kind) for topic, kind in TOPICS.items()}
 
     def __enter__(self) -> BagWriter:
@@ -117,6 +120,9 @@ def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]
             (drive.CAMERA_INFO_TOPIC, received, info),
             (drive.IMAGE_TOPIC, received, encode_image(camera.image)),
         ]
+        if (jpeg := camera.image.encoded) is not None:
+            message = encode_compressed_image(camera.image.stamp, camera.image.frame_id, jpeg, "jpeg")
+            timed_messages[-1] = (f"{drive.IMAGE_TOPIC}/compressed", received, message)
     return sorted(timed_messages, key=lambda m: m[1])
 
 
@@ -130,18 +136,21 @@ def _poses(source: SyntheticSource, stamp: int) -> list[tuple[str, int, Any]]:
     return [("/tf", stamp, encode_transforms(stamp, chain)), (drive.ODOMETRY_TOPIC, stamp, odometry)]
 
 
-def write_bag(source: SyntheticSource, path: Path, frames: Iterable[Frame] | None = None) -> None:
-    """Write the whole drive to one MCAP file.
+def write_bag(
+    source: SyntheticSource, path: Path, frames: Iterable[Frame] | None = None, compress: bool = False
+) -> None:
+    """Write the whole drive to one MCAP file. An image that has the bytes of a JPEG is written as these.
 
     Args:
         source: the drive.
         path: the ``.mcap`` file to make.
         frames: the source's frames, if the caller already iterates over them, e.g. with a progress bar.
+        compress: compress what is written.
 
     Raises:
         UserError: ``path`` does not end in .mcap, exists already, or cannot be written.
     """
-    with BagWriter(source, path) as bag:
+    with BagWriter(source, path, compress) as bag:
         for frame in source if frames is None else frames:
             bag.write(frame)
 

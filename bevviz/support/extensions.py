@@ -1,0 +1,52 @@
+"""Find and load what packages register for bevviz by entry points. The extras register themselves so, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal, TypeAlias
+
+from bevviz.errors import UserError, first_line
+
+EXTRAS = "bevviz.extras."
+Kind: TypeAlias = Literal[
+    "commands", "datasets", "decoders", "exports", "rescuers", "simulators", "stages", "watches"
+]
+
+
+@cache
+def registered(kind: Kind) -> Mapping[str, EntryPoint]:
+    """Return the entry points of the group ``bevviz.KIND`` by name, those of bevviz first."""
+    points = sorted(
+        entry_points(group=f"bevviz.{kind}"), key=lambda point: not point.value.startswith(EXTRAS)
+    )
+    return {point.name: point for point in reversed(points)}
+
+
+def load(point: EntryPoint) -> Any:
+    """Import what an entry point names.
+
+    Raises:
+        UserError: it cannot be imported. Where an extra lacks a package, the error names the command that
+            installs it.
+    """
+    try:
+        return point.load()
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing == "bevviz" or not point.value.startswith(EXTRAS):
+            raise _unusable(point, error) from error
+        extra = point.value.removeprefix(EXTRAS).partition(".")[0].partition(":")[0]
+        raise UserError(f"{point.name} needs the package {missing}: pip install 'bevviz[{extra}]'") from None
+    except Exception as error:  # A package may raise anything when it is imported.
+        raise _unusable(point, error) from error
+
+
+def _unusable(point: EntryPoint, error: Exception) -> UserError:
+    """Return the error for an entry point whose package is broken."""
+    group = point.group.removeprefix("bevviz.").removesuffix("s")
+    return UserError(
+        f"the {group} '{point.name}' ({point.value}) cannot be loaded: {type(error).__name__}: "
+        f"{first_line(error)}; repair or uninstall its package"
+    )
