@@ -20,8 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = {  # package: words of the names of its tests' files
-    "stages": "ground clustering packed_cells compiled_loops voxel frustum fusion bev tracking detector_references "
-    "detector onnx_providers instance_masks odometry user_stages pillars perceive",
+    "stages": "ground clustering packed_cells compiled_loops voxel frustum fusion bev tracking detector "
+    "detector_references onnx_providers instance_masks odometry user_stages pillars perceive",
     "why": "why_sentences why_stages why_hints why explain robot_chain why_kitti",
     "evaluate": "evaluate kitti marks unusable_labels",
     "sync": "sync tf lidar_mounting video surroundings",
