@@ -1,6 +1,6 @@
 """Measure how many planted errors of the code the tests find: mutation testing by cosmic-ray.
 
-``python -m benchmarks.mutants FOLDER --sample 100`` clones the checkout to FOLDER, draws mutants of the stages,
+``python -m benchmarks.mutants FOLDER --sample 100`` clones the checkout to FOLDER, draws mutants of stages,
 explanations, evaluation and synchronisation, changes the clone by one at a time, and runs the tests that
 belong to its package until one fails. It prints the share of killed mutants with its 95 % interval (Wilson
 1927), and names the survivors. ``--seed`` draws others. Run again with the same FOLDER, it goes on.
