@@ -3,7 +3,8 @@
 ``python -m benchmarks.mutants FOLDER --sample 100`` clones the checkout to FOLDER, draws mutants of stages,
 explanations, evaluation and synchronisation, changes the clone by one at a time, and runs the tests that
 belong to its package until one fails. It prints the share of killed mutants with its 95 % interval (Wilson
-1927), and names the survivors. ``--seed`` draws others. Run again with the same FOLDER, it goes on.
+1927), and names the survivors. ``--seed`` draws others. Run again with the same FOLDER, it
+goes on. It needs ``pip install cosmic-ray``.
 """
 
 from __future__ import annotations
