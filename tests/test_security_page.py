@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import grant_trust
 from bevviz.errors import UserError
 from tests.support import bags
+from tests.support.modules import forget_modules
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "security.md"
 FUNCTION = "clustering.method=page_tools:cells"
@@ -73,8 +73,7 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def _forget() -> None:
-    plugins.load_plugin.cache_clear()
-    sys.modules.pop("page_tools", None)
+    forget_modules("page_tools")
 
 
 # --- one for each row ----------------------------------------------------------------------------
@@ -220,7 +219,8 @@ def test_the_page_is_right_about_trust(folder: Path) -> None:
     kept = folder.parent / "data" / "bevviz" / "trusted"
     assert kept.stat().st_mode & 0o777 == 0o700 and len(list(kept.iterdir())) == 1
     (folder / "page_tools.py").write_text(TOOLS + "# edited\n")
-    with pytest.raises(UserError, match="has changed since you trusted it"):
+    _forget()
+    with pytest.raises(UserError, match=r"page_tools\.py has changed since you trusted bevviz\.toml"):
         load(layers=read_project_layers(folder, {}))
 
 

@@ -18,14 +18,17 @@ import pytest
 import bevviz
 from bevviz.cli import main
 from bevviz.config import Config, Layer, changed_config, config_yaml, load, plugins
+from bevviz.config.module_folder import SourceLoader
 from bevviz.config.project import named_code, read_project_layers
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import RECEIVED, grant_trust, trust_records
 from bevviz.errors import UserError
 from bevviz.live.requests import RosRequests
 from bevviz.recording.source_lookup import Origin, RecordingSource
+from bevviz.stages.user_stages import load_user_stage
 from bevviz.why.hints import with_changes
 from tests.support import bags
+from tests.support.modules import forget_modules
 
 Capture = pytest.CaptureFixture[str]
 PACKAGE = Path(bevviz.__file__).parent
@@ -55,10 +58,11 @@ def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name in ("BEVVIZ_MODEL", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     yield folder
-    plugins.load_plugin.cache_clear()
-    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, plugins._FolderFinder)]
-    for name in [name for name in sys.modules if name.startswith(("drive_tools", "drive_parts"))]:
-        del sys.modules[name]
+    new_process()
+
+
+def new_process() -> None:
+    forget_modules("drive_tools", "drive_parts", "drive_helper")
 
 
 def write_project(folder: Path, text: str = PROJECT) -> Path:
@@ -195,7 +199,9 @@ def test_a_trusted_project_runs_until_it_is_edited(received: Path, tmp_path: Pat
     for file in (project, received / "drive_tools.py"):
         before = file.read_text()
         file.write_text(before + "\n# another line\n")
-        assert "has changed since you trusted it" in error_of(capsys, "config")
+        new_process()
+        said = error_of(capsys, "config")
+        assert f"{file.name} has changed since you trusted" in said and "'bevviz trust bevviz.toml'" in said
         file.write_text(before)
         assert main(["config"]) == 0
 
@@ -209,12 +215,15 @@ def test_an_edit_of_a_file_that_is_named_or_imported_asks_again(received: Path, 
     (parts / "limits.py").write_text("LOW = 0\n")
     (received / "drive_tools.py").write_text(f"from drive_parts.limits import LOW\n{TOOLS}")
     assert main(["trust", "."]) == 0
-    assert "drive_parts/__init__.py, drive_parts/limits.py, drive_tools.py" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "drive_tools:segment (drive_tools.py), and 2 other Python files that they may import" in said
     assert main(["config"]) == 0
     for file in (received / "robot.yaml", parts / "limits.py"):
         before = file.read_text()
         file.write_text(before + "# another line\n")
-        assert "has changed since you trusted it" in error_of(capsys, "config")
+        new_process()
+        changed = "bevviz.toml" if file.suffix == ".yaml" else "drive_parts/limits.py"
+        assert f"{changed} has changed since you trusted" in error_of(capsys, "config")
         file.write_text(before)
 
 
@@ -293,11 +302,10 @@ def test_modules_of_a_trusted_file_lie_beside_it(received: Path, monkeypatch: py
     config = load(layers=read_project_layers(below, {}))
     assert has_run(received) and not has_run(below)
     assert pickle.loads(pickle.dumps(config)).functions == {
-        ("ground", "drive_tools:segment"): str(received.resolve())
+        ("ground", "drive_tools:segment"): config.functions["ground", "drive_tools:segment"]
     }
     (received / "drive_tools.py").unlink()
-    sys.modules.pop("drive_tools")
-    plugins.load_plugin.cache_clear()
+    new_process()
     grant_trust(named_code(received / "bevviz.toml"))
     with pytest.raises(UserError, match="there is no module 'drive_tools' in "):
         load(layers=read_project_layers(below, {}))
@@ -313,10 +321,9 @@ def test_modules_beside_a_trusted_file_come_first(received: Path, monkeypatch: p
     grant_trust(named_code(write_project(received)))
     load(layers=read_project_layers(received, {}))
     assert has_run(received) and not has_run(installed)
-    del sys.modules["drive_tools"]
-    plugins.load_plugin.cache_clear()
+    new_process()
     __import__("drive_tools")
-    with pytest.raises(UserError, match="another module 'drive_tools' is in use already, of "):
+    with pytest.raises(UserError, match=r"another module 'drive_tools' .* is in use already, of "):
         load(layers=read_project_layers(received, {}))
 
 
@@ -334,6 +341,184 @@ def test_compiled_files_beside_a_trusted_source_do_not_run(received: Path) -> No
     cached.write_bytes(unchecked + marshal.dumps(sly))
     load(layers=read_project_layers(received, {}))
     assert has_run(received) and not (received / "compiled").exists()
+
+
+def test_a_module_that_is_edited_after_the_check_does_not_run_in_a_worker(received: Path) -> None:
+    """A worker gets the configuration as a pickle, and imports the module later than the command has."""
+    grant_trust(named_code(write_project(received)))
+    sent = pickle.dumps(load(layers=read_project_layers(received, {})))
+    (received / "ran").unlink()
+    source = received / "drive_tools.py"
+    for edit in (lambda: source.write_text(TOOLS + "# edited\n"), lambda: os.utime(source, (0, 0))):
+        edit()
+        new_process()
+        with pytest.raises(UserError) as caught:
+            load_user_stage(pickle.loads(sent), "ground")
+        assert str(caught.value).endswith(
+            "drive_tools.py has changed since you trusted bevviz.toml: read it, then run "
+            "'bevviz trust bevviz.toml'"
+        )
+    assert not has_run(received)
+    source.write_text(TOOLS)
+    assert load_user_stage(pickle.loads(sent), "ground") is not None and has_run(received)
+
+
+def test_the_bytes_that_are_checked_are_the_bytes_that_run(
+    received: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if the file is edited between: it is read once."""
+    grant_trust(named_code(write_project(received)))
+    reads = []
+
+    def read(self: Any, path: str) -> bytes:
+        reads.append(path)
+        content = Path(path).read_bytes()
+        Path(path).write_text("raise SystemExit('edited')\n")
+        return content
+
+    monkeypatch.setattr(SourceLoader, "get_data", read)
+    assert load(layers=read_project_layers(received, {})).functions
+    assert reads == [str(received / "drive_tools.py")]
+
+
+@pytest.mark.parametrize("way", ["new", "imported when called", "of a folder on the path", "of a namespace"])
+def test_no_import_of_a_trusted_module_leads_around_the_check(
+    received: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """Every import inside the folder is checked, and takes no compiled file."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    lines = {
+        "new": "import drive_helper\n",
+        "imported when called": "def segment(points):\n    from drive_parts import late\n    return points\n",
+        "of a folder on the path": "import sys; sys.path.insert(0, __file__.rpartition('/')[0] + '/lib')\n"
+        "import drive_helper\nsys.path.pop(0)\n",
+        "of a namespace": "import drive_parts.inner.late\n",
+    }
+    write_project(received)
+    (received / "drive_tools.py").write_text(f"import drive_parts.inner.early\n{TOOLS}{lines[way]}")
+    for file in ("lib/drive_helper.py", "drive_parts/late.py", "drive_parts/inner/early.py"):
+        (received / file).parent.mkdir(parents=True, exist_ok=True)
+        (received / file).write_text("")
+    (received / "drive_parts/inner/late.py").write_text("")
+    grant_trust(named_code(Path("bevviz.toml")))
+    edited = "from pathlib import Path\nPath('edited').touch()\n"
+    for file in (
+        "drive_helper.py",
+        "lib/drive_helper.py",
+        "drive_parts/late.py",
+        "drive_parts/inner/late.py",
+    ):
+        (received / file).write_text(edited)
+    with pytest.raises(UserError, match=r"(is new|has changed) since you trusted bevviz\.toml: read it"):
+        stage = load_user_stage(load(layers=read_project_layers(received, {})), "ground")
+        assert stage is not None
+        stage(np.zeros((1, 3)), 0, 0, "lidar")
+    assert not Path("edited").exists()
+
+
+def test_modules_of_python_and_installed_ones_are_no_data_of_the_folder(
+    received: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files named like modules of Python, folders of data, and an environment inside of the folder."""
+    site = received / "venv" / "lib" / "site"
+    (site / "drive_helper").mkdir(parents=True)
+    (site / "drive_helper" / "__init__.py").write_text("from . import deep\n")
+    (site / "drive_helper" / "deep.py").write_text("")
+    monkeypatch.syspath_prepend(site)
+    write_project(received)
+    (received / "drive_tools.py").write_text(f"import graphlib, yaml, drive_helper\n{TOOLS}")
+    (received / "graphlib.py").write_text("raise SystemExit\n")
+    (received / "yaml").mkdir()
+    (received / "yaml" / "data.txt").write_text("")
+    monkeypatch.delitem(sys.modules, "graphlib", raising=False)
+    monkeypatch.delitem(sys.modules, "yaml", raising=False)
+    grant_trust(named_code(Path("bevviz.toml")))
+    (site / "drive_helper" / "deep.py").write_text("CHANGED = True\n")
+    assert load(layers=read_project_layers(received, {})).functions and has_run(received)
+
+
+def test_a_compiled_module_of_a_trusted_folder_is_none(received: Path) -> None:
+    from importlib.machinery import EXTENSION_SUFFIXES
+
+    write_project(received)
+    (received / "drive_tools.py").write_text(f"import drive_helper\n{TOOLS}")
+    for suffix in (*EXTENSION_SUFFIXES, ".pyc"):
+        (received / f"drive_helper{suffix}").write_bytes(b"anything")
+    grant_trust(named_code(Path("bevviz.toml")))
+    with pytest.raises(UserError, match="there is no module 'drive_helper' in "):
+        load(layers=read_project_layers(received, {}))
+
+
+KERNEL = """
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def count(n):
+    return n + 1
+
+
+@numba.vectorize(["int64(int64)"], cache=True)
+def double(n):
+    return 2 * n
+
+
+def segment(points):
+    return np.zeros(count(len(points)) - 1, bool)
+"""
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+def test_compiled_functions_beside_a_module_do_not_run(
+    received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trusted: bool
+) -> None:
+    """A cache of numba is a pickle. Functions of users' modules are kept in bevviz's own folder."""
+    from bevviz.support import numba_kernel
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    numba_kernel._user_kernel_folder.cache_clear()
+    write_project(received)
+    (received / "drive_tools.py").write_text(KERNEL)
+    (received / "__pycache__").mkdir()
+    loaded = received / "pickle_was_read"
+    tag = f"py{sys.version_info[0]}{sys.version_info[1]}"
+    for line in range(12):
+        for name in ("count", "double"):
+            index = received / "__pycache__" / f"drive_tools.{name}-{line}.{tag}.nbi"
+            index.write_bytes(pickle.dumps(Payload(loaded)))
+    if trusted:
+        grant_trust(named_code(Path("bevviz.toml")))
+        config = load(layers=read_project_layers(received, {}))
+    else:
+        config = load(settings=["ground.method=drive_tools:segment"])
+    stage = load_user_stage(config, "ground")
+    assert stage is not None and len(stage(np.zeros((3, 3)), 0, 0, "lidar")) == 3
+    assert not loaded.exists()
+    kernels = tmp_path / "cache" / "bevviz" / "kernels"
+    assert (
+        len(list(kernels.glob("*/drive_tools.count-*.nbi"))) == 1 and kernels.stat().st_mode & 0o777 == 0o700
+    )
+    kernels.chmod(0o777)  # Others could write there, so that nothing is read from there.
+    numba_kernel._user_kernel_folder.cache_clear()
+    assert numba_kernel._user_kernel_folder() != kernels
+    numba_kernel._user_kernel_folder.cache_clear()
+
+
+def test_numba_takes_no_settings_from_the_folder(received: Path) -> None:
+    """Its .numba_config.yaml could name a cache, which holds pickles, for the stages of bevviz."""
+    (received / ".numba_config.yaml").write_text("cache_dir: cache\ncache_locator_classes: evil.Locator\n")
+    program = (
+        "from bevviz.support import numba_kernel\nfrom numba.core import config\n"
+        "config.reload_config()\nprint([config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES])\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment["PYTHONPATH"] = str(PACKAGE.parent)
+    ran = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment
+    )
+    assert ran.stdout == "['', '']\n"
 
 
 def test_workers_find_no_python_of_the_folder(received: Path) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bevviz.cli.options import Commands
 from bevviz.errors import UserError
 
+if TYPE_CHECKING:
+    from bevviz.config.trust import TrustRecord
 EXAMPLES = """examples:
   bevviz trust                     the bevviz.toml of this folder, or of one above
   bevviz trust robot.yaml          a file that --config takes
@@ -23,7 +26,7 @@ def add(commands: Commands) -> None:
         help="let the functions of a project file, or of a YAML file, run",
         description="A project file or a YAML file can name functions (module:function), which are code. "
         "They run once you trust the file. After an edit of the file or of a module beside it, bevviz asks "
-        "again. Read both first.",
+        "again. Read them first: a module may import each Python file of the folder.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=EXAMPLES,
     )
@@ -60,8 +63,9 @@ def _trust(options: argparse.Namespace) -> int:
         return 0
     if not code.is_regular:
         raise UserError(f"{path}: is no file that can be trusted: name the function by --set")
-    grant_trust(code)
-    print(f"{path}: trusted, with {code}")
+    others = len(grant_trust(code).modules) - len(code.modules)
+    beside = f", and {others} other Python file{'s' * (others > 1)} that they may import" if others else ""
+    print(f"{path}: trusted, with {code}{beside}")
     return 0
 
 
@@ -70,20 +74,24 @@ def _list() -> int:
 
     trusted = list(trust_records())
     for record in trusted:
-        print(f"{record.path}: {', '.join(record.functions)}{_state(record.path, record.sha256)}")
+        print(f"{record.path}: {', '.join(record.functions)}{_state(record)}")
     if not trusted:
         print("nothing is trusted")
     return 0
 
 
-def _state(path: Path, sha256: str) -> str:
+def _state(record: TrustRecord) -> str:
+    """Return what has changed since a file was trusted, as the end of a line."""
     from bevviz.config.project import named_code
 
     try:
-        same = named_code(path).digest() == sha256
+        same = named_code(record.path).digest() == record.sha256
+        modules = record.changed_modules()
     except UserError:
         return " (cannot be read any more)"
-    return "" if same else " (changed since: not trusted as it is now)"
+    if not same:
+        return " (changed since: not trusted as it is now)"
+    return f" (changed since, and not run: {', '.join(modules)})" if modules else ""
 
 
 def _file(path: Path | None) -> Path:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from bevviz.config.files import Layer, parse_yaml, read_layer
 from bevviz.config.keys import TUTORIAL_NAMES, field_of, flatten, keys, unit, unknown_key, values
 from bevviz.config.methods import METHOD_KEYS, names_function, params_model
+from bevviz.config.module_folder import ModuleFolder
 from bevviz.config.pillars import COMPLETE_SENTENCE, is_network_file
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
@@ -228,7 +229,7 @@ def _functions(
         section, _, name = key.partition(".")
         if layer.trust.granted and name == METHOD_KEYS.get(section) and isinstance(value, str):
             granted[section, value] = layer.trust.folder
-    in_force: dict[tuple[str, str], str] = {}
+    in_force: dict[tuple[str, str], ModuleFolder] = {}
     for section, name in METHOD_KEYS.items():
         key = f"{section}.{name}"
         method = stated.get(key)

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from bevviz.config import plugins
+from bevviz.config.module_folder import ModuleFolder
 from bevviz.config.pillars import PillarParams, is_network_file
 from bevviz.config.plugins import TOPIC
 from bevviz.config.sections import Config, Functions
@@ -48,7 +49,7 @@ def names_function(section: str, method: str) -> bool:
 
 def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin | None:
     """Load the user-defined function of a method, or return None."""
-    folder: str | None = None
+    folder: ModuleFolder | None = None
     name = method
     if names_function(section, method):
         if (section, method) not in functions:  # ``load`` did not build this configuration.

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
-import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.metadata import EntryPoint, entry_points, packages_distributions
 from importlib.metadata import version as installed_version
-from importlib.util import spec_from_file_location
 from inspect import Parameter, signature, unwrap
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from pydantic import BaseModel
 
+from bevviz.config.module_folder import WORKING_DIRECTORY, ModuleFolder, import_module
 from bevviz.errors import UserError, first_line
 
 GROUP = "bevviz.stages"  # group of the entry points that packages register
@@ -98,13 +93,13 @@ def is_user_function(method: str) -> bool:
 
 
 @cache
-def load_plugin(name: str, folder: str | None = "") -> Plugin:
+def load_plugin(name: str, folder: ModuleFolder | None = WORKING_DIRECTORY) -> Plugin:
     """Import the function or class ``module:name``.
 
     Args:
         name: ``module:name``.
-        folder: folder of a module that is not installed. Empty: the working directory. None: no folder, since
-            an installed package has registered the name.
+        folder: folder of a module that is not installed. None: no folder, since an installed package has
+            registered the name.
 
     Raises:
         UserError: the module or name does not exist, cannot be imported, or is no stage.
@@ -132,15 +127,14 @@ def load_plugin(name: str, folder: str | None = "") -> Plugin:
     return Plugin(name, target, params, params is not None and _accepts_params(target), _facts(target))
 
 
-def _import_module(name: str, folder: str | None) -> ModuleType:
+def _import_module(name: str, folder: ModuleFolder | None) -> ModuleType:
     """Import a module for ``load_plugin``."""
     try:
-        with _importing_from(name, folder):
-            return importlib.import_module(name)
+        return importlib.import_module(name) if folder is None else import_module(name, folder)
     except UserError:
         raise
     except ModuleNotFoundError as error:
-        where = f"in {folder}, nor installed" if folder else "here"
+        where = f"in {folder.path}, nor installed" if folder is not None and folder.path else "here"
         raise UserError(
             f"there is no module '{error.name}' {where} ('pip install' it, or run where it lies)"
         ) from None
@@ -251,172 +245,3 @@ def _is_outside_library(target: Any) -> bool:
     """Return whether a target is defined outside Python's standard library."""
     module = getattr(unwrap(target), "__module__", None) or "builtins"
     return module.partition(".")[0] not in sys.stdlib_module_names
-
-
-# --- locations of modules ----------------------------------------------------------------------
-
-
-def local_files(names: Iterable[str], folder: Path) -> tuple[Path, ...]:
-    """Find the Python files of a folder that functions need: their modules, and the modules these import.
-
-    Nothing in the folder is run.
-
-    Args:
-        names: ``module:name`` each.
-        folder: folder that may contain the modules.
-    """
-    files: dict[Path, None] = {}
-    pending = [name.partition(":")[0] for name in names]
-    known = set(pending)
-    while pending:
-        module = pending.pop()
-        parts = module.split(".")
-        for end in range(1, len(parts) + 1):
-            file = _file_of(".".join(parts[:end]), folder)
-            if file is None or file in files:
-                continue
-            files[file] = None
-            package = parts[:end] if file.name == "__init__.py" else parts[: end - 1]
-            imported = [name for name in _imports(file, package) if name not in known]
-            pending += imported
-            known.update(imported)
-    return tuple(sorted(files))
-
-
-def _file_of(module: str, folder: Path) -> Path | None:
-    """Return the source file of a module in a folder, or None."""
-    parts = module.split(".")
-    if not all(name.isidentifier() for name in parts):
-        return None
-    path = folder.joinpath(*parts)
-    choices = (path / "__init__.py", path.with_name(f"{parts[-1]}.py"))
-    return next((file for file in choices if file.is_file()), None)
-
-
-def _imports(file: Path, package: Sequence[str]) -> Iterator[str]:
-    """Yield the modules that a file may import. A file that cannot be parsed imports nothing."""
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
-        return
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (name.name for name in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            parents = list(package[: len(package) - node.level + 1]) if node.level else []
-            base = ".".join([*parents, *([node.module] if node.module else [])])
-            if base:
-                yield base
-            yield from (f"{base}.{name.name}".lstrip(".") for name in node.names)
-
-
-class _FolderFinder(MetaPathFinder):
-    """Finder of modules in a trusted folder. It finds only the sources that the user has trusted.
-
-    These sources win over installed modules of the same name. The finder ignores compiled files beside them
-    (``.pyc``, ``.so``), since the user cannot have read these.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.files: set[Path] = set()
-        self.is_importing = False  # Top-level modules are found only while this is set.
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        """Return the specification of a trusted module, or None."""
-        if not self.has(fullname):
-            return None
-        file = _file_of(fullname, self.folder)
-        if not (self.is_importing if path is None else self._is_within(path)):
-            return None
-        if file is None or file not in self.files:
-            spec = ModuleSpec(fullname, None, is_package=True)  # a folder without __init__.py
-            spec.submodule_search_locations = [str(self.folder.joinpath(*fullname.split(".")))]
-            return spec
-        places = [str(file.parent)] if file.name == "__init__.py" else None
-        loader = _SourceLoader(fullname, str(file))
-        return spec_from_file_location(fullname, file, loader=loader, submodule_search_locations=places)
-
-    def has(self, name: str) -> bool:
-        """Return whether a module or package is among the trusted files."""
-        path = self.folder.joinpath(*name.split("."))
-        return _file_of(name, self.folder) in self.files or any(path in file.parents for file in self.files)
-
-    def check(self, name: str) -> None:
-        """Raise UserError if another module of the same name has already been imported."""
-        module = sys.modules.get(name)
-        if module is None or not self.has(name):
-            return
-        file = getattr(module, "__file__", None)
-        places = [file] if file else list(getattr(module, "__path__", []))
-        if not self._is_within(places):
-            raise UserError(f"another module '{name}' is in use already, of {', '.join(places)}")
-
-    def _is_within(self, paths: Iterable[str]) -> bool:
-        """Return whether any path is in the folder."""
-        return any(Path(path).is_relative_to(self.folder) for path in paths)
-
-
-class _SourceLoader(SourceFileLoader):
-    """Loader that compiles the source itself, since a ``__pycache__`` may have come with the folder."""
-
-    def get_code(self, fullname: str) -> CodeType:
-        """Compile the source file."""
-        path = self.get_filename(fullname)
-        return self.source_to_code(self.get_data(path), path)
-
-
-@contextmanager
-def _importing_from(module: str, folder: str | None) -> Iterator[None]:
-    """Let modules be found in a folder, see ``load_plugin``."""
-    if folder is None:
-        yield
-    elif folder:
-        # The finder stays, since a function may import another module of its package when it is called.
-        finders = (f for f in sys.meta_path if isinstance(f, _FolderFinder) and f.folder == Path(folder))
-        finder = next(finders, None) or _FolderFinder(Path(folder))
-        finder.files.update(local_files([module], Path(folder)))
-        finder.check(module.partition(".")[0])
-        if finder not in sys.meta_path:
-            sys.meta_path.insert(0, finder)
-        finder.is_importing = True
-        try:
-            with _without_working_directory():
-                yield
-        finally:
-            finder.is_importing = False
-    else:
-        with _with_working_directory():
-            yield
-
-
-@contextmanager
-def _with_working_directory() -> Iterator[None]:
-    """Add the working directory to the module path. A console script has only its own folder there."""
-    directory = str(Path.cwd())
-    if directory in sys.path or "" in sys.path:
-        yield
-        return
-    sys.path.append(directory)
-    try:
-        yield
-    finally:
-        sys.path.remove(directory)
-
-
-@contextmanager
-def _without_working_directory() -> Iterator[None]:
-    """Remove the working directory, which ``python -m`` adds, from the path unless PYTHONPATH names it."""
-    from_environment = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    directories = ("", str(Path.cwd()))
-    removed = [
-        path for path in sys.path if path in directories and (not path or path not in from_environment)
-    ]
-    for path in removed:
-        sys.path.remove(path)
-    try:
-        yield
-    finally:
-        sys.path[:0] = removed

@@ -17,6 +17,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from bevviz.config.module_folder import ModuleFolder
 from bevviz.config.value_types import (
     CLASS_SIZES,
     CLUSTERING,
@@ -35,7 +36,7 @@ MAX_SIDE = 65_500  # pixels of a bird's-eye image: the JPEG encoder takes no mor
 MAX_CELLS = 300_000_000  # cells of a bird's-eye image: 0.9 GB of pixels
 
 Preset = Literal["default", "reference"]
-Functions = Mapping[tuple[str, str], str]  # (section, module:function) -> folder of the module
+Functions = Mapping[tuple[str, str], ModuleFolder]  # (section, module:function) -> folder of the module
 Keep = Literal["everything", "inspect", "report"]
 Quantity = Literal["height", "intensity", "ring", "time", "distance"]  # values of a point that can colour it
 
@@ -485,7 +486,7 @@ class Config(Section):
     def functions(self) -> Functions:
         """Functions that the user has named or trusted, with the folder of each module. ``load`` sets them.
 
-        No other function is imported. The folder is empty for the working directory.
+        No other function is imported.
         """
         return self._functions
 

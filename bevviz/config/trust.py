@@ -1,8 +1,8 @@
 """Trust in files that name functions: the user grants it once, for a path and a content.
 
 A project file or a YAML file may name ``module:function``, which is code. Such a function runs only after
-``bevviz trust FILE``. An edit of the file, of a YAML file that it names, or of a module beside it revokes the
-trust.
+``bevviz trust FILE``. An edit of the file, or of a YAML file that it names, revokes the trust. A module
+beside it is checked when it is imported.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from bevviz.config import plugins
+from bevviz.config.module_folder import WORKING_DIRECTORY, ModuleFolder, find_source, hash_sources
 from bevviz.errors import UserError
 from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save_text
 
@@ -27,12 +27,12 @@ class Trust:
 
     Attributes:
         granted: the user has named the functions, or has trusted the file that names them.
-        folder: folder of the modules that are not installed. Empty: the working directory.
+        folder: folder of the modules that are not installed.
         advice: how to run functions that may not run. ``{setting}`` stands for the setting that names one.
     """
 
     granted: bool = False
-    folder: str = ""
+    folder: ModuleFolder = WORKING_DIRECTORY
     advice: str = "if you trust it, add --set {setting}"
 
 
@@ -43,7 +43,7 @@ MESSAGE = Trust(advice="if you trust it, start bevviz with --set {setting}")  # 
 
 @dataclass(frozen=True)
 class NamedCode:
-    """Functions that a file names, and the files that decide what these functions do.
+    """Functions that a file names, and the files that hold them.
 
     Attributes:
         files: the file, then the YAML files that it names.
@@ -65,8 +65,9 @@ class NamedCode:
 
     @cached_property
     def modules(self) -> tuple[Path, ...]:
-        """Python files of the folder that the functions need."""
-        return plugins.local_files(self.functions, self.folder)
+        """Python files of the folder that hold the functions."""
+        names = dict.fromkeys(name.partition(":")[0] for name in self.functions)
+        return tuple(file for name in names if (file := find_source(name, self.folder)) is not None)
 
     @property
     def is_regular(self) -> bool:
@@ -74,13 +75,13 @@ class NamedCode:
         return all(file.is_file() for file in self.files)
 
     def digest(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all files that decide what the functions do.
+        """Return the SHA-256 (hexadecimal) of the files that name the functions.
 
         Raises:
             UserError: a file cannot be read.
         """
         content = hashlib.sha256()
-        for file in (*self.files, *self.modules):
+        for file in self.files:
             data = read_bytes(file, CONFIG_LIMIT)
             name = os.path.relpath(file.resolve(), self.folder)
             content.update(f"{name}\0{hashlib.sha256(data).hexdigest()}\n".encode(errors="surrogateescape"))
@@ -101,11 +102,18 @@ class TrustRecord:
         path: path of the file, with links resolved.
         sha256: ``NamedCode.digest`` at that time.
         functions: functions that the file named.
+        modules: name and SHA-256 of each Python file beside it that they may import.
     """
 
     path: Path
     sha256: str
     functions: tuple[str, ...]
+    modules: tuple[tuple[str, str], ...]
+
+    def changed_modules(self) -> tuple[str, ...]:
+        """Return the names of the modules whose content is another one now."""
+        hashes = hash_sources(self.path.parent)
+        return tuple(name for name, sha256 in self.modules if hashes.get(name) != sha256)
 
 
 def trust_in(code: NamedCode) -> Trust:
@@ -116,8 +124,10 @@ def trust_in(code: NamedCode) -> Trust:
     if not code.is_regular:
         return Trust(advice=f"{shown} is no file that can be trusted: add --set {{setting}}")
     record = _record(code.path)
-    if record is not None and record.sha256 == code.digest():
-        return Trust(granted=True, folder=str(code.folder))
+    # The files may have changed since their values were read, so that the functions are compared, too.
+    if record is not None and record.sha256 == code.digest() and {*code.functions} <= {*record.functions}:
+        folder = ModuleFolder(str(code.folder), record.modules, str(code.path))
+        return Trust(granted=True, folder=folder)
     state = "has changed since you trusted it" if record is not None else "is not trusted"
     return Trust(
         advice=f"{shown} {state} and would load {code}; read it, then run 'bevviz trust {shown}', or put "
@@ -125,12 +135,14 @@ def trust_in(code: NamedCode) -> Trust:
     )
 
 
-def grant_trust(code: NamedCode) -> None:
-    """Trust a file with its current content.
+def grant_trust(code: NamedCode) -> TrustRecord:
+    """Trust a file, and the modules beside it, with their current content.
 
     Raises:
         UserError: the user's data folder cannot be used.
     """
+    modules = hash_sources(code.folder)
+    record = TrustRecord(code.path, code.digest(), code.functions, tuple(modules.items()))
     folder = _folder()
     try:
         for place in (folder.parent, folder):
@@ -138,8 +150,14 @@ def grant_trust(code: NamedCode) -> None:
     except OSError as error:
         raise UserError(f"{folder}: cannot keep what is trusted: {error.strerror}") from None
     _check(folder)
-    content = {"path": str(code.path), "sha256": code.digest(), "functions": list(code.functions)}
+    content = {
+        "path": str(code.path),
+        "sha256": record.sha256,
+        "functions": list(code.functions),
+        "modules": modules,
+    }
     save_text(folder / _name(code.path), json.dumps(content, indent=1) + "\n", "trust")
+    return record
 
 
 def revoke_trust(path: Path) -> bool:
@@ -180,8 +198,9 @@ def _read(file: Path) -> TrustRecord | None:
         _check(file.parent)
         content = json.loads(file.read_text(encoding="utf-8"))
         functions = tuple(str(function) for function in content["functions"])
-        return TrustRecord(Path(content["path"]), str(content["sha256"]), functions)
-    except (OSError, ValueError, KeyError, TypeError, UserError):
+        modules = tuple((str(name), str(sha256)) for name, sha256 in content["modules"].items())
+        return TrustRecord(Path(content["path"]), str(content["sha256"]), functions, modules)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):
         return None
 
 

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import atexit
+import hashlib
+import os
 import threading
 import time
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core import config, event
+from numba.core.caching import FunctionCache, _CacheLocator
 from numba.core.runtime.nrt import rtsys
 
+from bevviz.errors import UserError
 from bevviz.support import progress
+from bevviz.support.files import check_owned
+from bevviz.support.scratch_folder import ScratchFolder
 
 F = TypeVar("F", bound=Callable[..., object])
+
+# numba reads .numba_config.yaml of the working directory, which may have come with a bag. That file can name
+# the folder of the cache, whose pickles numba loads. Variables of the environment hold as ever.
+config._config_fname = os.devnull
+config.reload_config()
 
 
 def _has_cache_folder() -> bool:
@@ -104,6 +117,58 @@ class _LazyCache(FunctionCache):  # type: ignore[misc]
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
+
+
+class _UserCodeLocator(_CacheLocator):  # type: ignore[misc]
+    """Place of the compiled functions of a user's module: a folder that only the user and bevviz write.
+
+    A cache of numba is a pickle, and one that lies beside a module may have come with it.
+    """
+
+    def __init__(self, function: Any, source: Any) -> None:
+        self._line = function.__code__.co_firstlineno
+        self._sha256 = source.source_sha256
+        place = hashlib.sha256(os.fsencode(source.path)).hexdigest()[:32]
+        self._folder = _user_kernel_folder() / place
+
+    def get_cache_path(self) -> str:
+        """Return the folder of this module."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """Return the hash of the source that runs. Functions of another content are compiled again."""
+        return str(self._sha256)
+
+    def get_disambiguator(self) -> str:
+        """Return what tells functions of one name apart."""
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> _UserCodeLocator | None:
+        """Return the place of a function, or None if it is of no user's module."""
+        loader = getattr(py_func.__globals__.get("__spec__"), "loader", None)
+        return cls(py_func, loader) if hasattr(loader, "source_sha256") else None
+
+
+@cache
+def keep_user_kernels_apart() -> None:
+    """Let numba keep and look for compiled functions of users' modules in bevviz's folder alone."""
+    FunctionCache._impl_class._locator_classes.insert(0, _UserCodeLocator)
+
+
+@cache
+def _user_kernel_folder() -> Path:
+    """Return the folder of users' compiled functions: in the user's cache, else one of this process."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bevviz" / "kernels"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for place in (folder.parent, folder):
+            check_owned(place, "XDG_CACHE_HOME")
+    except (OSError, RuntimeError, UserError):
+        scratch = ScratchFolder()
+        atexit.register(scratch.close)
+        return scratch.new()
+    return folder
 
 
 def kernel(function: F) -> F:
