@@ -1,4 +1,4 @@
-"""Boxes in Autoware's, radars' and private messages on a real graph, known by the .msg files alone."""
+"""Boxes in Autoware's, radars' and private messages beside a live run, known by the .msg files alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from bevviz.errors import UserError
 from bevviz.messages import definitions
 from bevviz.messages.definitions import store_of, typestore
 from bevviz.messages.encode import encode_cloud
-from bevviz.synthetic import SyntheticSource
+from bevviz.model.frame import Cloud
+from bevviz.synthetic.drive import PERIOD, TRUTH_TOPIC
 from tests.support import bags
 from tests.support.object_messages import (
     AUTOWARE,
@@ -43,6 +44,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 from bevviz.live.node import Node
 from bevviz.live.source import LiveSource
 from bevviz.live.typesupport import message_type
+from tests.support.fed_graph import NEEDED, Player, fed_graph, joined
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STATED = "source.boxes={topic: my/things, size: dimensions, yaw: heading, label: class_name, id: number}"
@@ -100,9 +102,8 @@ def older(m: bags.Messages) -> Any:
     return m.make("vision_msgs/msg/Detection3DArray", header=about, detections=[one])
 
 
-def now(message: Any) -> Any:
-    """With the stamp of this moment."""
-    at = time.time_ns()
+def stamped(message: Any, at: int) -> Any:
+    """Return the message with a stamp in nanoseconds, in the frame of the LiDAR."""
     stamp = replace(message.header.stamp, sec=at // 10**9, nanosec=at % 10**9)
     return replace(message, header=replace(message.header, stamp=stamp, frame_id="rslidar"))
 
@@ -123,35 +124,19 @@ def test_boxes_of_other_messages_are_received(packages: None) -> None:
         "/radar/tracks": ("radar_msgs/msg/RadarTracks", radar(stores["radar_msgs"])),
         "/robot/my/things": ("my_msgs/msg/Things", private(stores["my_msgs"])),
     }
-    cloud = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
-    with (
-        Node(name="robot") as robot,
-        LiveSource(
-            load(settings=[STATED]), arguments=["--ros-args", "-r", "my/things:=/robot/my/things"]
-        ) as source,
-    ):
-        robot.start()
-        points = robot.node.create_publisher(message_type(CLOUD), "/points", 5)
-        others = {t: robot.node.create_publisher(message_type(kind), t, 5) for t, (kind, _) in sent.items()}
-
-        def publish() -> bool:
-            for topic, (kind, message) in sent.items():
-                data = stores[kind.partition("/")[0]].store.serialize_cdr(now(message), kind)
-                others[topic].publish(bytes(data))
-            points.publish(bytes(store_of(CLOUD).serialize_cdr(now(cloud), CLOUD)))
-            return True
-
-        until(lambda: publish() and source.wait(0), "a scene")
-        frames = iter(source)
-
-        boxes: dict[str, Any] = {}
-
-        def all_came() -> bool:
-            publish()
-            boxes.update({one.topic: one for one in next(frames).robot_boxes})
-            return boxes.keys() == sent.keys()
-
-        until(all_came, "all boxes")
+    remap = ["-r", "my/things:=/robot/my/things"]
+    with fed_graph() as graph:
+        player = Player(graph, without=(TRUTH_TOPIC,))
+        publishers = {topic: graph.advertise(topic, kind) for topic, (kind, _) in sent.items()}
+        with joined(graph, STATED, arguments=remap) as session:
+            player.play(NEEDED)
+            for _ in range(10):
+                for topic, (kind, message) in sent.items():
+                    store = stores[kind.partition("/")[0]].store
+                    data = store.serialize_cdr(stamped(message, player.stamp + PERIOD), kind)
+                    graph.publish(publishers[topic], bytes(data))
+                player.play(0.1)
+    boxes = {one.topic: one for frame in session.frames for one in frame.robot_boxes}
     assert {topic: one.labels for topic, one in boxes.items()} == {
         "/perception/objects": ("pedestrian",),
         "/perception/seen": ("pedestrian",),
@@ -204,7 +189,7 @@ def test_who_publishes_a_type_is_asked_what_it_is_made_of(
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     with pytest.raises(UserError, match=f"{path} is not known without its package"):
         message_type(path)
-    cloud = encode_cloud(SyntheticSource(frames=1).snapshot(0).frame.clouds[0])
+    cloud = encode_cloud(Cloud(0, "rslidar", np.zeros((9, 3), np.float32)))
     with (
         subprocess.Popen([sys.executable, "-c", PLANNER], stdout=subprocess.PIPE, text=True) as planner,
         Node(name="robot") as robot,
@@ -216,7 +201,7 @@ def test_who_publishes_a_type_is_asked_what_it_is_made_of(
             points = robot.node.create_publisher(message_type(CLOUD), "/points", 5)
 
             def publish() -> bool:
-                points.publish(bytes(known.serialize_cdr(now(cloud), CLOUD)))
+                points.publish(bytes(known.serialize_cdr(stamped(cloud, time.time_ns()), CLOUD)))
                 return True
 
             until(lambda: publish() and source.wait(0) and source.received["/things"], "a scene with things")
@@ -237,16 +222,14 @@ def test_who_publishes_a_type_is_asked_what_it_is_made_of(
 
 
 def test_an_unknown_type_is_reported(packages: None, tmp_path: Path) -> None:
-    said: list[str] = []
-    with Node(name="robot") as robot:
-        robot.start()
-        robot.node.create_publisher(message_type("my_msgs/msg/Things"), "/my/things", 5)
-        store_of.cache_clear()
-        (tmp_path / "share" / "my_msgs" / "msg" / "Thing.msg").unlink()
-        with LiveSource(load(settings=["source.boxes={topic: /my/things}"]), tell=said.append):
-            until(lambda: any("is not received" in line for line in said), "what is not received")
+    (tmp_path / "share" / "my_msgs" / "msg" / "Thing.msg").unlink()
+    with fed_graph() as graph:
+        graph.advertise("/my/things", "my_msgs/msg/Things").topic_type_hash = "RIHS01_00"
+        with joined(graph, "source.boxes={topic: /my/things}") as session:
+            graph.advance(5.0)
     expected = "/my/things is not received: my_msgs/msg/Things is not known without its package, and no"
-    assert any(line.startswith(f"{expected} my_msgs/msg/Thing.msg is in AMENT_PREFIX_PATH") for line in said)
-    assert any("; /robot, which publishes it, was asked" in line for line in said)
+    asked = "; /robot, which publishes it, was asked and does not answer"
+    (unheard,) = [line for line in session.said if line.startswith(expected) and line.endswith(asked)]
+    assert f"{expected} my_msgs/msg/Thing.msg is in AMENT_PREFIX_PATH" in unheard
     with pytest.raises(UserError, match=r"no your_msgs/msg/Box\.msg is in AMENT_PREFIX_PATH"):
         message_type("your_msgs/msg/Box")

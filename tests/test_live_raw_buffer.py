@@ -1,12 +1,12 @@
-"""The raw seconds: what is kept of the messages beside the frames, and that it gives the same again."""
+"""The raw seconds: what is kept of the messages beside the frames, and that it gives the same again.
+
+The messages are handed over inside this process. tests/test_live_ros.py saves those of a robot over DDS.
+"""
 
 from __future__ import annotations
 
 import errno
 import re
-import threading
-import time
-from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,28 +31,26 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import read_origin
 from bevviz.report.fingerprints import compare, digest
 from bevviz.support.files import write_all
-from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.support.recordings import Recording, verify_when_indexed
-from tests.support.ros_graphs import own_graph, playing
-from tests.support.ros_player import Play
-from tests.support.waiting import PATIENCE
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.files import define
-from bevviz.live.node import Node
 from bevviz.live.raw_recorder import LatchedMessages, RawMessage, RawRecorder, children
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.source import LiveSource
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_transforms
+from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
+from tests.support.live_sessions import run_beside
 
-WAIT = ["sync.max_wait=10 s", "sync.queue=100"]  # on a busy machine messages come late: they are waited for
-SECONDS = 3.0  # that the flight recorder holds: less than the run takes
+SECONDS = 1.0  # that the flight recorder holds: with three seconds before them less than the run takes
+POINTS = 3000
+STRING = "std_msgs/msg/String"
 
 
 @dataclass
@@ -68,59 +66,48 @@ class Flight:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     folder = tmp_path_factory.mktemp("flight")
-    with own_graph() as patch:
+    with fed_graph() as graph, pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         patch.chdir(folder)
-        with playing(Play(frames=4, points=10_000)):
-            yield fly(folder)
+        yield fly(folder, graph)
 
 
-def fly(folder: Path) -> Flight:
+def fly(folder: Path, graph: FedGraph) -> Flight:
     from rclpy.qos import DurabilityPolicy, QoSProfile
-    from sensor_msgs.msg import Image
-    from std_msgs.msg import Float32MultiArray, String
 
     said: list[str] = []
     results: dict[int, Any] = {}
     sizes: list[tuple[int, float]] = []
-    settings = ReloadableConfig(None, [f"live.flight_time={SECONDS} s", *WAIT])
-    Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
+    settings = ReloadableConfig(None, [f"live.flight_time={SECONDS} s"])
     raw = RawRecorder(settings.config.live)
-    with Node(name="robot") as robot:
-        robot.start()
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        description = robot.node.create_publisher(String, "/robot_description", latched)
-        description.publish(String(data="<robot name='r'/>"))
-        others = {"/depth/image": Image, "/heightmap": Float32MultiArray}  # one is bulky by type, one by size
-        bulky = {name: robot.node.create_publisher(kind, name, 1) for name, kind in others.items()}
-        wide = Float32MultiArray(data=array("f", bytes(1_000_000)))
-        robot.node.create_timer(
-            0.2, lambda: (bulky["/depth/image"].publish(Image()), bulky["/heightmap"].publish(wide))
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    description = graph.advertise("/robot_description", STRING, qos=latched)
+    graph.publish(description, typestore().types[STRING](data="<robot name='r'/>"))
+    graph.advertise("/depth/image", "sensor_msgs/msg/Image")  # bulky by its type, the next one by its size
+    heights = graph.advertise("/heightmap", STRING)
+    wide = bytes(typestore().serialize_cdr(typestore().types[STRING](data=500_000 * "x"), STRING))
+    player = Player(graph, frames=3, points=POINTS)
+    with LiveSource(settings.config, tell=said.append, raw=raw) as source:
+        player.play(2.0)
+        assert source.wait(0), source.missing
+        live = Live(
+            source,
+            settings,
+            Outputs(save=Path("all.rrd"), raw=Path("all.mcap")),
+            Notes(said.append),
+            on_result=lambda result: results.update({result.frame.stamp: digest(result)}),
+            raw=raw,
         )
-        with LiveSource(settings.config, tell=said.append, raw=raw) as source:
-            assert source.wait(PATIENCE), source.missing
-            live = Live(
-                source,
-                settings,
-                Outputs(save=Path("all.rrd"), raw=Path("all.mcap")),
-                Notes(said.append),
-                on_result=lambda result: results.update({result.frame.stamp: digest(result)}),
-                raw=raw,
-            )
+        live.encoder.clock = lambda: graph.now
 
-            def during() -> None:
-                # Longer than what is held, and as long as it takes until there is something to compare.
-                end, latest = time.monotonic() + 2.5 * SECONDS, time.monotonic() + PATIENCE
-                while time.monotonic() < end or (len(results) < 20 and time.monotonic() < latest):
-                    time.sleep(0.25)
-                    sizes.append((raw.size, raw.seconds))
-                live.save(Path("snap.rrd"))
-                live.stop()
+        def feed() -> None:
+            for _ in range(50):
+                graph.publish(heights, wide)
+                play_in_step(player, live, source)
+                sizes.append((raw.size, raw.seconds))
+            live.save(Path("snap.rrd"))
 
-            thread = threading.Thread(target=during)
-            thread.start()
-            live.run()
-            thread.join()
+        run_beside(live, feed)
     return Flight(folder, results, said, sizes)
 
 
@@ -136,7 +123,7 @@ class Digests(Observer[FrameResult]):
 
 @pytest.mark.parametrize("bag", ["snap.mcap", "all.mcap"])
 def test_the_saved_messages_give_identical_results(flight: Flight, bag: str) -> None:
-    config = load(settings=WAIT)
+    config = load()
     again = Digests()
     with BagSource([flight.folder / bag], config) as source:
         run_frames(source, Session(config), [again])
@@ -176,7 +163,7 @@ def test_other_libraries_read_it(flight: Flight) -> None:
         clouds = [c for c in other.connections if c.topic == LIDAR_TOPIC]
         for connection, _, data in other.messages(clouds):
             cloud: Any = other.deserialize(data, connection.msgtype)
-            assert cloud.width == 10_000
+            assert cloud.width == POINTS
     assert counts["/tf_static"] == counts["/robot_description"] == 1
     assert counts[LIDAR_TOPIC] >= len(Recording(path.with_suffix(".rrd")).times["stamp"]) > 5
 

@@ -28,11 +28,10 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
 from bevviz.live.source import LiveSource, remedy
-from tests.support.fed_graph import FedGraph, Player, fed_graph, joined
+from tests.support.fed_graph import NEEDED, FedGraph, Player, fed_graph, joined
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 PATIENT = "sync.max_wait=20"  # seconds: a frame that waits for a sensor in vain does not come in a test
-NEEDED = 3.0  # seconds of the graph after which the frames have begun
 
 
 @pytest.fixture

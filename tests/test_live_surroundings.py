@@ -1,9 +1,8 @@
-"""Around perception, on a real graph: marks, diagnostics of both sides, shapes; the bag tells the same."""
+"""Around perception, beside a robot: marks, diagnostics of both sides, shapes; the bag tells the same."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,25 +15,22 @@ from bevviz.config import load
 from bevviz.messages.definitions import typestore
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.session import Session
-from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.drive import TRUTH_TOPIC
 from tests.support.recordings import Recording
-from tests.support.ros_graphs import own_graph, playing
-from tests.support.ros_player import Play
-from tests.support.waiting import PATIENCE, until
+from tests.support.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.node import Node
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.source import LiveSource
 from bevviz.live.status import TYPE, Diagnostics, Notes
 from bevviz.live.typesupport import message_type
+from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
+from tests.support.live_sessions import run_beside
 
-BOXES = "vision_msgs/msg/Detection3DArray"
+BOXES, STRING = "vision_msgs/msg/Detection3DArray", "std_msgs/msg/String"
 MARK = "the person behind the van"
 PAGE_MARK = "odd (frame 7)"
 
@@ -67,14 +63,14 @@ def pose(x: float) -> Any:
 class Robot:
     """What it publishes beside what the player does."""
 
-    def __init__(self, node: Any) -> None:
-        self.node = node
+    def __init__(self, graph: FedGraph) -> None:
+        self.graph = graph
         self.publishers: dict[str, Any] = {}
 
     def say(self, topic: str, kind: str, message: Any) -> None:
         if topic not in self.publishers:
-            self.publishers[topic] = self.node.create_publisher(message_type(kind), topic, 10)
-        self.publishers[topic].publish(bytes(typestore().serialize_cdr(message, kind)))
+            self.publishers[topic] = self.graph.advertise(topic, kind)
+        self.graph.publish(self.publishers[topic], message)
 
     def status(self, level: int, text: str) -> None:
         status = make(
@@ -87,7 +83,7 @@ class Robot:
         )
         self.say("/diagnostics", TYPE, make(TYPE, header=header(""), status=[status]))
 
-    def objects(self, data: bytes) -> None:
+    def objects(self, data: bytes, info: object) -> None:
         """Publish the ground truth as our objects, and one metre further as the robot's own."""
         message: Any = typestore().deserialize_cdr(data, BOXES)
         self.say("/ours/objects", BOXES, message)
@@ -146,89 +142,49 @@ class Robot:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
     folder = tmp_path_factory.mktemp("around")
-    with own_graph() as patch:
+    with fed_graph() as graph, pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         patch.chdir(folder)
-        with playing(Play(frames=3, points=5_000, rate=4)):
-            yield fly(folder)
+        yield fly(folder, graph)
 
 
-def fly(folder: Path) -> Flight:
+def fly(folder: Path, graph: FedGraph) -> Flight:
+    from rclpy.qos import QoSProfile
+
     frames: list[Frame] = []
-    heard: list[Any] = []
     said: list[str] = []
     asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
-    asked += ["live.flight_size=2000 MB", "live.raw_size=2000 MB"]  # A slow machine needs minutes for it all.
-    asked.append("live.log_queue=100")  # no frame is left out, least of all the one with the mark
     settings = ReloadableConfig(None, ["live.flight_time=600 s", *asked])
-    Session(settings.config).run(SyntheticSource(frames=1).snapshot(0).frame)  # what is compiled, is
     raw = RawRecorder(settings.config.live)
-    with Node(name="robot") as node:
-        node.start()
-        robot = Robot(node.node)
+    player, robot = Player(graph, frames=3), Robot(graph)
+    graph.subscribe(message_type(BOXES), TRUTH_TOPIC, robot.objects, QoSProfile(depth=10))
+    with LiveSource(settings.config, raw=raw) as source:
+        player.play(2.0)
+        assert source.wait(0), source.missing
+        diagnostics = Diagnostics(source.node)
 
-        def hear(data: bytes) -> None:
-            told: Any = typestore().deserialize_cdr(data, TYPE)
-            heard.extend(status for status in told.status if status.name.startswith("bevviz"))
+        def on_result(result: FrameResult) -> None:
+            frames.append(result.frame)
+            diagnostics.observe(result)
 
-        node.node.create_subscription(message_type(TYPE), "/diagnostics", hear, 10, raw=True)
-        node.node.create_subscription(message_type(BOXES), TRUTH_TOPIC, robot.objects, 10, raw=True)
-        with LiveSource(settings.config, raw=raw) as source:
-            assert source.wait(PATIENCE), source.missing
-            diagnostics = Diagnostics(source.node)
+        live = Live(source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot="")
+        diagnostics.every_second(lambda: diagnostics.publish(live.numbers, ["two LiDARs are one"]))
 
-            def on_result(result: FrameResult) -> None:
-                frames.append(result.frame)
-                diagnostics.observe(result)
+        def feed() -> None:
+            for level, text in ((0, "spins"), (1, "is slow")):
+                for _ in range(10):  # the first ones come before their topics are found
+                    robot.status(level, text)
+                    robot.path()
+                    play_in_step(player, live, source)
+            robot.say("/bevviz/mark", STRING, make(STRING, data=MARK))
+            assert live.mark(PAGE_MARK)
+            for _ in range(10):
+                play_in_step(player, live, source)
+            until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
+            live.save(Path("snap.rrd"))
 
-            live = Live(
-                source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot=""
-            )
-            diagnostics.every_second(lambda: diagnostics.publish(live.numbers, ["two LiDARs are one"]))
-
-            def latest(condition: Callable[[Any], object]) -> Callable[[], bool]:
-                return lambda: bool(frames and frames[-1].around and condition(frames[-1].around))
-
-            def during() -> None:
-                try:
-                    until(lambda: live.frames > 2, "frames")
-                    for text, level in (("spins", 0), ("is slow", 1)):
-                        robot.status(level, text)
-                        robot.path()
-
-                        def told(around: Any, text: str = text, level: int = level) -> bool:
-                            robot.status(level, text)
-                            robot.path()
-                            seen = {shape.topic for shape in around.shapes}  # each is found at its own time
-                            return seen == SHAPES and any(s.text == text for s in around.statuses)
-
-                        until(latest(told), text)
-                    mark = node.node.create_publisher(message_type("std_msgs/msg/String"), "/bevviz/mark", 10)
-                    until(mark.get_subscription_count, "somebody who hears marks")
-                    text = make("std_msgs/msg/String", data=MARK)
-                    mark.publish(bytes(typestore().serialize_cdr(text, "std_msgs/msg/String")))
-                    until(lambda: source.received["/bevviz/mark"], "the mark")
-                    assert live.mark(PAGE_MARK)
-                    marks = (MARK, PAGE_MARK)
-                    until(
-                        lambda: all(any(m in str(f.around) for f in list(frames)) for m in marks),
-                        "frames with both",
-                    )
-                    until(
-                        lambda: {s.name for s in heard} >= {f"bevviz: {p}" for p in PARTS}, "our diagnostics"
-                    )
-                    until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
-                    # What was seen in results is logged in a thread of its own, a slow one may be far behind.
-                    newest = frames[-1].index
-                    until(lambda: live.encoder.context.clock[0] > newest + 6, "the log")
-                    live.save(Path("snap.rrd"))
-                finally:
-                    live.stop()
-
-            thread = threading.Thread(target=during)
-            thread.start()
-            live.run()
-            thread.join()
+        run_beside(live, feed)
+    heard = [one for message in graph.sent["/diagnostics"] for one in message.status]
     return Flight(folder, frames, heard, said, live)
 
 

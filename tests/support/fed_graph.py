@@ -19,6 +19,7 @@ import pytest
 from bevviz.config import load
 from bevviz.live import graph, graph_info, inputs, raw_recorder, source
 from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
 from bevviz.live.typesupport import message_type
 from bevviz.messages.decoders import read_header
@@ -27,7 +28,9 @@ from bevviz.model.frame import Frame
 from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.support.played_drive import drive_of
 from tests.support.ros_player import Play
+from tests.support.waiting import until
 
+NEEDED = 3.0  # seconds of the graph after which the frames have begun
 TIMED = (graph, graph_info, inputs, raw_recorder, source)  # modules whose clock is that of the graph
 
 
@@ -253,6 +256,17 @@ class Player:
 
     def stop(self) -> None:
         self._graph.withdraw(*self._publishers.values())
+
+
+def play_in_step(player: Player, live: Live, live_source: LiveSource, seconds: float = 0.1) -> None:
+    """Play on, and wait until the run has logged the newest frame."""
+    player.play(seconds)
+
+    def is_logged() -> bool:
+        newest = live_source._frames - 1
+        return newest < 0 or (live.frames > 0 and live.encoder.context.clock[0] == newest)
+
+    until(is_logged, "the newest frame", every=0.002)
 
 
 @dataclass

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from bevviz.bags.message import RawMessage
@@ -15,6 +16,27 @@ from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.running_robot import RunningRobot
+
+
+def run_beside(live: Live, during: Callable[[], object]) -> None:
+    """Run ``live`` until ``during`` ends, which runs in a thread beside it."""
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            during()
+        except BaseException as error:
+            failed.append(error)
+        live.stop()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        live.run()
+    finally:
+        thread.join()
+    if failed:
+        raise failed[0]
 
 
 @contextmanager
