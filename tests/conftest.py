@@ -25,13 +25,12 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# They run a robot, a viewer or a browser beside the clock on the wall.
-REAL_TIME = ("test_live", "test_workbench", "test_robot_examples", "test_snap")
+# They run a robot or a viewer beside the clock on the wall.
+REAL_TIME = ("test_live", "test_workbench_live", "test_robot_examples", "test_snap")
 
-# The longest files first, so that no worker is left alone with one at the end. The first and the third go to
-# the same worker: two browsers without a graphics card slow each other down, and a browser slows a robot.
+# The longest files first, so that no worker is left alone with one at the end.
 FIRST = (
-    *("test_workbench", "test_calib", "test_workbench_triage", "test_example_notebooks"),
+    *("test_workbench_journeys", "test_calib", "test_workbench", "test_example_notebooks"),
     *("test_torture_benchmark", "test_damaged_bags", "test_benchmarks", "test_batch", "test_why"),
     *("test_live_ros", "test_live", "test_workbench_live"),
 )

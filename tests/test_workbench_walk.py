@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.support.page_walk import Oracle, Walk
 from tests.support.workbench_pages import chromium, demo_bag, serving
 
+pytestmark = pytest.mark.long
 SEED, STEPS = 4, 12
 SECONDS = 25.0  # a slower machine takes fewer steps
 

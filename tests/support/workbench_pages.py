@@ -9,9 +9,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
@@ -20,21 +21,25 @@ import psutil
 import pytest
 
 from bevviz.cli import main
-from tests.support import waiting
-from tests.support.waiting import PATIENCE
+from bevviz.config import load
+from bevviz.drive import Drive
+from bevviz.evaluate import truth_source
+from tests.support.waiting import PATIENCE, until
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
+    from websockets.sync.client import ClientConnection
 
+    from bevviz.workbench.session import WorkbenchSession
 
 FRAMES = 6
-POLL = 0.5  # seconds: a page that draws without a graphics card has little time to be asked
 SOFTWARE_GL = [
     "--no-sandbox",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 ]
+EMPTY_WASM = b"\0asm\1\0\0\0"  # a module without content: the stand-in for the viewer's 64 MB
 
 
 def demo_bag(folder: Path) -> Path:
@@ -42,6 +47,9 @@ def demo_bag(folder: Path) -> Path:
     path = folder / "demo.mcap"
     assert main(["demo", "--frames", str(FRAMES), "-o", str(path)]) == 0
     return path
+
+
+# --- servers ------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -63,6 +71,45 @@ def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subproc
             server.send_signal(signal.SIGINT)
             said = server.communicate(timeout=PATIENCE)[1]
         assert "Traceback" not in said
+
+
+@contextmanager
+def served(bag: Path, *settings: str) -> Iterator[str]:
+    """Serve the workbench of a bag from a thread of this process. Yield its address."""
+    pytest.importorskip("starlette", reason="needs pip install 'bevviz[workbench]'")
+    from bevviz.workbench.access import persistent_token
+    from bevviz.workbench.recorded_drive import recorded_session
+    from bevviz.workbench.routes import Site
+    from bevviz.workbench.server import Server, bound_socket, viewer_folder
+    from bevviz.workbench.startup import LabelledSource, SessionStartup
+
+    config = load(None, ["detector.model=demo", *settings])
+    with LabelledSource([bag], config) as source, LabelledSource([bag], config) as again:
+
+        def make() -> WorkbenchSession:
+            truth_of = truth_source(source.roles, None, None, len(source.scans))
+            return recorded_session(Drive(source, config), again, [bag], truth_of)
+
+        with (
+            bound_socket(0) as listening,
+            persistent_token(port := listening.getsockname()[1], str(bag)) as token,
+            SessionStartup(make, lambda: None) as startup,
+        ):
+            ready = threading.Event()
+            site = Site(startup, viewer_folder(), version("rerun-sdk"), token, port, "page")
+            server = Server(site.application(), ready.set)
+            thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+            thread.start()
+            startup.start()
+            try:
+                assert ready.wait(PATIENCE)
+                yield f"http://127.0.0.1:{port}/?token={token}"
+            finally:
+                server.end()
+                thread.join(PATIENCE)
+
+
+# --- a browser ----------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -92,7 +139,50 @@ def kill_browsers() -> None:
                 process.kill()
 
 
-until = partial(waiting.until, every=POLL)
+def watched_page(browser: Browser, width: int, height: int) -> Page:
+    """Return an empty page that keeps the viewer's events in ``window.seen``."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(1000 * PATIENCE)
+    page.add_init_script(
+        "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
+    )
+    return page
+
+
+@contextmanager
+def opened(
+    browser: Browser, address: str, width: int = 1000, height: int = 620, *, draws: bool = False
+) -> Iterator[Page]:
+    """Yield the page as soon as the viewer shows a frame.
+
+    Args:
+        browser: the browser.
+        address: address of the page.
+        width: of the window, in pixels.
+        height: of the window, in pixels.
+        draws: the page has Rerun's viewer, whose pictures take seconds without a graphics card. Otherwise a
+            stand-in takes its messages, and reports the same events: see ``stand_in_viewer.js``.
+    """
+    page = watched_page(browser, width, height)
+    try:
+        if not draws:
+            page.route("**/viewer/*/*", _stand_in)
+        page.goto(address)
+        until(lambda: events(page, "time_update") or events(page, "timeline_change"), "a shown frame")
+        yield page
+    finally:
+        page.close()
+
+
+def _stand_in(route: Route) -> None:
+    """Answer a request for one of the viewer's files."""
+    if route.request.url.endswith(".js"):
+        script = Path(__file__).with_name("stand_in_viewer.js").read_text()
+        route.fulfill(body=script, content_type="text/javascript")
+    elif route.request.url.endswith(".wasm"):
+        route.fulfill(body=EMPTY_WASM, content_type="application/wasm")
+    else:
+        route.continue_()
 
 
 def verdict(page: Page) -> str:
@@ -107,25 +197,10 @@ def state(page: Page) -> dict[str, list[str]]:
     return parse_qs(urlsplit(page.url).fragment)
 
 
-def watched_page(browser: Browser, width: int, height: int) -> Page:
-    """Return an empty page that keeps the viewer's events in ``window.seen``."""
-    page = browser.new_page(viewport={"width": width, "height": height})
-    page.add_init_script(
-        "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
-    )
-    return page
-
-
-@contextmanager
-def opened(browser: Browser, address: str, width: int = 1000, height: int = 620) -> Iterator[Page]:
-    """Yield the page as soon as the viewer shows a frame."""
-    page = watched_page(browser, width, height)
-    try:
-        page.goto(address)
-        until(lambda: events(page, "time_update") or events(page, "timeline_change"))
-        yield page
-    finally:
-        page.close()
+def subject(page: Page) -> dict[str, Any]:
+    """Return the identity of the object that the page's address holds."""
+    identity: dict[str, Any] = json.loads(state(page)["pick"][0])
+    return identity
 
 
 def events(page: Page, kind: str) -> list[dict[str, Any]]:
@@ -140,18 +215,27 @@ def listed(page: Page) -> bool:
     return whole and page.locator("#found button .missed").count() > 0
 
 
+# --- a page without a browser -------------------------------------------------------------------
+
+
+def channel(address: str, path: str, origin: str | None = "", token: bool = True) -> ClientConnection:
+    """Connect to a channel of the page, as the page itself or a page of another origin does."""
+    from websockets.sync.client import connect
+    from websockets.typing import Origin
+
+    parts = urlsplit(address)
+    url = f"ws://{parts.netloc}{path}" + (f"{'&' if '?' in path else '?'}{parts.query}" if token else "")
+    own = f"http://{parts.netloc}" if origin == "" else origin
+    return connect(url, origin=None if own is None else Origin(own), max_size=None)
+
+
 class Talk:
     """A page without a browser."""
 
     def __init__(self, address: str) -> None:
-        from websockets.sync.client import connect
-        from websockets.typing import Origin
-
-        parts = urlsplit(address)
         self.entries: dict[int, dict[str, Any]] = {}
         self._number = 0
-        url, origin = f"ws://{parts.netloc}/talk?{parts.query}", Origin(f"http://{parts.netloc}")
-        self._channel = connect(url, origin=origin, max_size=None).__enter__()
+        self._channel = channel(address, "/talk").__enter__()
         self.say(type="shown")
         self.over = self.until("progress", lambda message: message["over"])
 
