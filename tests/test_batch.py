@@ -199,6 +199,7 @@ def cluster() -> Iterator[Any]:
         yield started
 
 
+@pytest.mark.long
 def test_death_of_a_dask_worker_loses_and_repeats_no_bag(
     cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -540,6 +541,7 @@ def test_a_table_without_checksum_is_written_again(done: Job) -> None:
     assert ["1 tables of an older version hold no checksum" in text for text in warnings] == [True, True]
 
 
+@pytest.mark.long
 def test_a_batch_goes_on_over_damaged_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         bags.write(tmp_path / "bags" / name, bags.small_items(scans=2))

@@ -27,6 +27,8 @@ from tests.support import bags
 from tests.support.planted_faults import at, drive, planted
 from tests.support.planted_faults import run as run_fault
 
+pytestmark = pytest.mark.long
+
 
 def test_a_repeated_bag_goes_on_in_time(tmp_path: Path) -> None:
     folder = bags.write(tmp_path / "drive", bags.small_items(scans=5))

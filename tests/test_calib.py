@@ -79,6 +79,7 @@ def assert_found(result: Calibration, planted: dict[str, float]) -> None:
     assert result.score_corrected >= result.score_stated
 
 
+@pytest.mark.long
 def test_a_right_calibration_is_left_alone(faultless: Calibration) -> None:
     assert_found(faultless, {})
     assert set(findings(faultless).values()) == {"fine"}
@@ -89,6 +90,7 @@ def test_a_turn_and_a_late_clock_are_found(late_and_rolled: Calibration) -> None
     assert_found(late_and_rolled, {"rx": 1.0, "dt": 40.0})
 
 
+@pytest.mark.long
 def test_turns_and_shifts_are_found_together(drive: Drive) -> None:
     planted = {"ry": -2.0, "rz": 2.0, "tx": 10.0, "ty": -20.0, "tz": 15.0}
     assert_found(drive.calibrate(offsets(**planted)), planted)
@@ -243,6 +245,7 @@ def test_errors_of_kittis_calibration_are_near_zero(of_six: Calibration) -> None
     assert np.allclose(result.corrected, result.stated)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "planted",
     [{"ry": -2.0, "rx": 1.0}, {"rz": 2.0, "tx": -20.0, "ty": 20.0}, {"rx": -0.5, "tz": 20.0}],
@@ -317,6 +320,7 @@ def shots_of(frames: Iterable[Frame]) -> Shots:
 # --- what cannot be told -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_one_view_repeated_twelve_times_counts_once(drive: Drive) -> None:
     once, often = (
         calibrate(gather(drive.frames[3:4] * times, ["zed"], drive.pose)["zed"]) for times in (1, 12)

@@ -381,6 +381,7 @@ def test_a_cut_bag_is_processed_to_the_cut(tmp_path: Path, capsys: Capture) -> N
     assert 10 < frames < 30
 
 
+@pytest.mark.long
 def test_an_interrupted_run_leaves_a_readable_recording(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "bevviz.cli", "demo", "--frames", "500", "--save", "out.rrd"]
     saved = tmp_path / "out.rrd"

@@ -9,6 +9,7 @@ import time
 from types import SimpleNamespace
 
 import numba
+import pytest
 
 from bevviz.support import progress
 from bevviz.support.numba_kernel import _CompileAnnouncer, common_clock, thread_clock
@@ -45,6 +46,7 @@ def test_loaded_loops_import_no_scipy() -> None:
     assert runs[1].stdout.splitlines() == ["[[0]]", "False"]
 
 
+@pytest.mark.long
 def test_without_a_cache_folder_loops_are_recompiled() -> None:
     done = subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr

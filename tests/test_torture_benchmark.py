@@ -20,6 +20,8 @@ from benchmarks.torture.worker import Outcome, Worker
 from tests.support.bag_formats import FORMATS, items
 from tests.support.foreign_readers import judges, taken
 
+pytestmark = pytest.mark.long
+
 SHORT = ("mcap, no checksums", "mcap, zstd", "mcap, flat", "mcap.zstd", "sqlite3, with a log", "ros1, lz4")
 
 
