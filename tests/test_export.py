@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +18,21 @@ import bevviz
 from bevviz.cli import main
 from bevviz.datasets.kitti_files import read_labels
 from bevviz.errors import UserError
-from bevviz.export.folder import rectify
+from bevviz.export.folder import FolderExport, rectify
 from bevviz.export.kitti import KittiExport, label_lines
 from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, Intrinsics
+from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Objects
 from tests.support import bags
+from tests.support.commands import environment
+from tests.support.small_disk import small_disk
+from tests.support.waiting import PATIENCE
 
 OPTICAL = geometry.inverse(geometry.transform(np.array([0.2, 0.1, -0.3]), np.array([-0.5, 0.5, -0.5, 0.5])))
+
+MAKERS = pytest.mark.parametrize("make", [KittiExport, NuScenesExport])
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +131,67 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path, capsys: pytest
     assert main(["export", "nothing.mcap", "-o", str(tmp_path / "new")]) == 2
     assert "nothing.mcap: no such file" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+@MAKERS
+def test_a_folder_has_its_name_when_it_is_complete(tmp_path: Path, make: type[FolderExport]) -> None:
+    target = tmp_path / "made"
+    names: list[str] = []
+
+    class Watcher(Observer[FrameResult]):
+        def observe(self, result: FrameResult) -> None:
+            names.extend(path.name for path in tmp_path.iterdir())
+            if fails:
+                raise RuntimeError("a stage failed")
+
+    fails = True
+    with pytest.raises(RuntimeError):
+        bevviz.simulate(1).run([make(target), Watcher()])
+    assert re.fullmatch(r"made\.partial-[0-9a-f]{8}", names[0])
+    assert not list(tmp_path.iterdir())
+    fails = False
+    target.mkdir()  # An empty folder is replaced.
+    bevviz.simulate(1).run([make(target), Watcher()])
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+@MAKERS
+def test_a_full_disk_leaves_no_folder(tmp_path: Path, make: type[FolderExport]) -> None:
+    with small_disk(tmp_path / "small", "1m") as small:
+        with pytest.raises(UserError, match=r"small/made: cannot be written: No space left on device"):
+            bevviz.simulate(8).run([make(small / "made")])
+        assert not list(small.iterdir())
+
+
+def test_a_killed_export_leaves_another_name_that_the_next_one_deletes(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys; from pathlib import Path\n"
+        "from bevviz.support.unfinished_folder import UnfinishedFolder\n"
+        "(UnfinishedFolder(Path(sys.argv[1])).path / 'half').touch(); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    target = tmp_path / "made"
+    subprocess.run([sys.executable, "-c", script, target], env=environment(), timeout=PATIENCE)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith("made.partial-")
+    bevviz.simulate(1).run([KittiExport(target)])
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_two_exports_do_not_share_a_folder(tmp_path: Path) -> None:
+    first, second = (KittiExport(tmp_path / "made") for _ in range(2))
+    drive = bevviz.simulate(1)
+    first.begin(drive.frames)
+    with pytest.raises(UserError, match="another process is writing it"):
+        second.begin(drive.frames)
+    first.observe(drive.at(frame=0))
+    first.end()
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_the_working_directory_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"^\.: cannot be replaced; give a folder inside of it"):
+        KittiExport(Path())
 
 
 def test_a_scene_of_nuscenes_has_the_same_frames(exported: tuple[Path, bevviz.Drive]) -> None:

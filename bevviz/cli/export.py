@@ -59,5 +59,6 @@ def _export(options: argparse.Namespace) -> int:
         end = run_with_progress(drive.frames, drive.new_session(), [export, failures])
         warn([*source.warnings, *failures.warnings])
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
-    say(f"{export.frames} frames with {export.labels} labels in {options.output}")
+    if export.frames:
+        say(f"{export.frames} frames with {export.labels} labels in {options.output}")
     return 130 if end.interrupted else 0 if export.frames else 1

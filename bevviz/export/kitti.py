@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
-from bevviz.export.folder import FolderExport, rectify
+from bevviz.export.folder import FolderExport, encode_image, rectify
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
 from bevviz.model.results import FrameResult, Objects
@@ -60,11 +59,10 @@ class KittiExport(FolderExport):
             points[:, 3] = intensity
         lines = [] if result.objects is None else label_lines(result.objects, intrinsics, camera_from_points)
         with self._saving():
-            points.tofile(self._folder / "velodyne" / f"{name}.bin")
-            if not cv2.imwrite(str(self._folder / "image_2" / f"{name}.png"), rectify(bgr, intrinsics)):
-                raise OSError(0, "the image cannot be written")
-            (self._folder / "calib" / f"{name}.txt").write_text(calibration(intrinsics.K, camera_from_points))
-            (self._folder / "label_2" / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
+            self._write_file(f"velodyne/{name}.bin", points.tobytes())
+            self._write_file(f"image_2/{name}.png", encode_image(rectify(bgr, intrinsics), ".png"))
+            self._write_file(f"calib/{name}.txt", calibration(intrinsics.K, camera_from_points).encode())
+            self._write_file(f"label_2/{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         self.frames += 1
         self.labels += len(lines)
 

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevviz.export.folder import FolderExport, rectify
+from bevviz.export.folder import FolderExport, encode_image, rectify
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, F64, Camera, Frame
@@ -68,12 +68,10 @@ class NuScenesExport(FolderExport):
         self._class_scores: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         self._scene, self._start = "", 0  # scene name, and stamp of the first frame in nanoseconds
 
-    def begin(self, items: Items[object]) -> None:
-        """Create the folders, the placeholder map and the visibility table."""
-        super().begin(items)
+    def _prepare(self, items: Items[object]) -> None:
+        """Write the placeholder map and begin the visibility table."""
         self._scene = items.scene.name
-        with self._saving("made"):
-            cv2.imwrite(str(self._folder / MAP), np.zeros((8, 8), np.uint8))
+        self._write_file(MAP, encode_image(np.zeros((8, 8), np.uint8), ".png"))
         for token, level in (("1", "v0-40"), ("2", "v40-60"), ("3", "v60-80"), ("4", "v80-100")):
             self._tables["visibility"].append({"token": token, "level": level, "description": ""})
 
@@ -116,7 +114,7 @@ class NuScenesExport(FolderExport):
             if field in frame.fields:
                 points[:, column] = frame.fields[field]
         name = f"samples/{LIDAR}/{LIDAR}__{_micros(frame.stamp)}.pcd.bin"
-        points.tofile(self._folder / name)
+        self._write_file(name, points.tobytes())
         return name
 
     def _write_camera(self, frame: Frame, camera: Camera, sample: str) -> None:
@@ -130,11 +128,8 @@ class NuScenesExport(FolderExport):
             data = image.encoded
         else:
             flat = rectify(image.bgr, intrinsics)
-            done, encoded = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            if not done:
-                raise OSError(0, "the image cannot be written")
-            data = encoded.tobytes()
-        (self._folder / name).write_bytes(data)
+            data = encode_image(flat, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        self._write_file(name, data)
         mounted = self._calibrated(
             channel, "camera", geometry.inverse(mounting), np.asarray(intrinsics.K).tolist()
         )
@@ -236,11 +231,9 @@ class NuScenesExport(FolderExport):
         self._tables[table].append(row)
         return row
 
-    def end(self) -> None:
+    def _finish(self) -> None:
         """Write the tables."""
         samples = self._tables["sample"]
-        if not samples:
-            return
         captured = datetime.fromtimestamp(samples[0]["timestamp"] / 1e6, UTC)
         log, scene = self._token("log"), self._token("scene")
         self._tables["log"] = [
@@ -272,9 +265,8 @@ class NuScenesExport(FolderExport):
             row["category_token"] = self._token_of("category", kind, name=kind, description="")
             row["nbr_annotations"] = len(annotations)
             row["first_annotation_token"], row["last_annotation_token"] = annotations[0], annotations[-1]
-        with self._saving():
-            for table, rows in self._tables.items():
-                (self._folder / VERSION / f"{table}.json").write_text(json.dumps(rows, indent=0))
+        for table, rows in self._tables.items():
+            self._write_file(f"{VERSION}/{table}.json", json.dumps(rows, indent=0).encode())
 
 
 def _micros(stamp: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-import stat
 import tempfile
 import time
 from contextlib import suppress
@@ -63,14 +62,27 @@ class ScratchFolder:
         """Delete this user's temporary folders without a lock. A lock ends with its process."""
         for folder in Path(tempfile.gettempdir()).glob(f"{self.PREFIX}????????"):
             with suppress(OSError):
-                status = folder.lstat()
-                if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
-                    continue
-                if time.time() - status.st_mtime < YOUNG:
-                    continue
-                handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(folder, ignore_errors=True)
-                finally:
-                    os.close(handle)
+                if time.time() - folder.lstat().st_mtime >= YOUNG:
+                    remove_unlocked(folder)
+
+
+def remove_unlocked(folder: Path) -> bool:
+    """Delete a folder unless a process holds its lock. Return False if one does.
+
+    A folder of another user is left alone, and so is one whose file system has no locks.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return True
+    try:
+        if os.fstat(handle).st_uid == os.getuid():
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+    return True
