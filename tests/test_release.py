@@ -71,6 +71,15 @@ def test_the_actions_inputs_reach_its_script_by_variables() -> None:
     assert named == set(yaml("action.yml")["inputs"])
 
 
+def test_actions_are_pinned_by_commit() -> None:
+    """A tag or a branch of an action can be moved to other code. The comment names the release for people."""
+    files = [*(ROOT / ".github" / "workflows").glob("*.yml"), ROOT / "action.yml"]
+    used = [line for file in files for line in file.read_text().splitlines() if re.search(r"\buses:", line)]
+    assert len(used) > 10
+    pinned = re.compile(r"uses: [\w-]+/[\w./-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+$")
+    assert [line for line in used if not pinned.search(line)] == []
+
+
 @pytest.mark.parametrize("name", ["ci", "docs", "release"])
 def test_workflows_name_files_and_targets_that_exist(name: str) -> None:
     jobs = yaml(f".github/workflows/{name}.yml")["jobs"].values()
