@@ -1,10 +1,10 @@
 """Measure how many planted errors of the code the tests find: mutation testing by cosmic-ray.
 
 ``python -m benchmarks.mutants FOLDER --sample 100`` clones the checkout to FOLDER, draws mutants of stages,
-explanations, evaluation and synchronisation, changes the clone by one at a time, and runs the tests that
-belong to its package until one fails. It prints the share of killed mutants with its 95 % interval (Wilson
-1927), and names the survivors. ``--seed`` draws others. Run again with the same FOLDER, it
-goes on. It needs ``pip install cosmic-ray``.
+explanations, evaluation and synchronisation, changes the clone by one at a time, and runs the files of tests
+that name the changed module until one fails. It prints the share of killed mutants with its 95 % interval
+(Wilson 1927), and names the survivors. ``--seed`` draws others. Run again with the same FOLDER, it goes on.
+It needs ``pip install cosmic-ray``.
 """
 
 from __future__ import annotations
@@ -13,20 +13,16 @@ import argparse
 import math
 import os
 import random
+import re
 import shlex
+import shutil
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = {  # package: words of the names of its tests' files
-    "stages": "ground clustering packed_cells compiled_loops voxel frustum fusion bev tracking detector "
-    "detector_references onnx_providers instance_masks odometry user_stages pillars perceive",
-    "why": "why_sentences why_stages why_hints why explain robot_chain why_kitti",
-    "evaluate": "evaluate kitti marks unusable_labels",
-    "sync": "sync tf lidar_mounting video surroundings",
-}
+PACKAGES = ("stages", "why", "evaluate", "sync")
 SECONDS = 1200.0  # a mutant whose tests run longer than this hangs: it is killed
 # Annotations are full of these, and are not run.
 ANNOTATIONS = "core/ReplaceBinaryOperator_BitOr_"
@@ -40,58 +36,80 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=100, help="mutants in all (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the draw (default: %(default)s)")
     options = parser.parse_args()
-    clone = options.folder.resolve() / "clone"
+    folder = options.folder.resolve()
+    clone = folder / "clone"
     if not clone.exists():
         subprocess.run(["git", "clone", "--quiet", "--no-hardlinks", str(ROOT), str(clone)], check=True)
     killed = total = 0
-    for package in TESTS:
-        session = options.folder / f"{package}.sqlite"
-        if not session.exists():
-            _cosmic_ray(
-                clone, "baseline", _config(package, clone, session)
-            )  # raises if a test fails unchanged
-            _draw(package, clone, session, options.sample // len(TESTS), options.seed)
-        _cosmic_ray(clone, "exec", _config(package, clone, session), session)
-        outcomes = _outcomes(session)
-        survived = [place for place, outcome in outcomes if outcome == "SURVIVED"]
-        killed, total = killed + len(outcomes) - len(survived), total + len(outcomes)
-        print(f"{package}: {len(outcomes) - len(survived)} of {len(outcomes)} killed", flush=True)
-        for place in survived:
-            print(f"  survived: {place}", flush=True)
+    for package in PACKAGES:
+        listed = folder / f"{package}.sqlite"
+        if not listed.exists():
+            _list(package, clone, listed)
+        for module, jobs in _draw(
+            listed, options.sample // len(PACKAGES), f"{options.seed} {package}"
+        ).items():
+            session = folder / f"{module.replace('/', '.')}.{options.seed}.sqlite"
+            config = _config(module, clone, session)
+            if not session.exists():
+                _keep(listed, session, jobs)
+            _cosmic_ray(clone, "exec", config, session)
+            outcomes = _outcomes(session)
+            survived = [place for place, outcome in outcomes if outcome == "SURVIVED"]
+            killed, total = killed + len(outcomes) - len(survived), total + len(outcomes)
+            print(f"{module}: {len(outcomes) - len(survived)} of {len(outcomes)} killed", flush=True)
+            for place in survived:
+                print(f"  survived: {place}", flush=True)
     low, high = _interval(killed, total)
     print(f"{killed} of {total} killed: {killed / total:.0%} ({low:.0%} to {high:.0%})")
     return 0
 
 
-def _config(package: str, clone: Path, session: Path) -> Path:
-    """Write the configuration of cosmic-ray for one package and return its path."""
-    tests = [f"tests/test_{name}.py" for name in TESTS[package].split()]
-    present = [test for test in tests if (clone / test).exists()]
-    command = shlex.join([sys.executable, "-m", "pytest", "-q", "-x", "-m", "not long", *present])
+def _config(module: str, clone: Path, session: Path) -> Path:
+    """Write the configuration of cosmic-ray for one module or package and return its path."""
+    dotted = module.removesuffix(".py").replace("/", ".")
+    name = re.compile(
+        rf"{re.escape(dotted)}\b|{re.escape(dotted.rpartition('.')[0])} import .*\b{Path(module).stem}\b"
+    )
+    tests = [path for path in sorted((clone / "tests").glob("test_*.py")) if name.search(path.read_text())]
+    tests = sorted(tests, key=lambda path: path.stat().st_size) or [clone / "tests/test_perceive.py"]
+    command = shlex.join([sys.executable, "-m", "pytest", "-q", "-x", "-m", "not long", *map(str, tests)])
     path = session.with_suffix(".toml")
     path.write_text(
-        f'[cosmic-ray]\nmodule-path = "bevviz/{package}"\ntimeout = {SECONDS}\nexcluded-modules = []\n'
+        f'[cosmic-ray]\nmodule-path = "{module}"\ntimeout = {SECONDS}\nexcluded-modules = []\n'
         f"test-command = '''{command}'''\n[cosmic-ray.distributor]\nname = \"local\"\n",
         encoding="utf-8",
     )
     return path
 
 
-def _draw(package: str, clone: Path, session: Path, count: int, seed: int) -> None:
-    """List the mutants of a package and leave ``count`` of them, drawn at random."""
-    listed = session.with_suffix(".all")
-    _cosmic_ray(clone, "init", _config(package, clone, session), listed)
+def _list(package: str, clone: Path, listed: Path) -> None:
+    """List all mutants of a package."""
+    unfinished = listed.with_suffix(".all")
+    _cosmic_ray(clone, "init", _config(f"bevviz/{package}", clone, unfinished), unfinished)
+    unfinished.rename(listed)
+
+
+def _draw(listed: Path, count: int, seed: str) -> dict[str, list[str]]:
+    """Draw mutants at random. Return their jobs by module."""
     with sqlite3.connect(listed) as base:
         rows = base.execute(
-            "SELECT job_id, operator_name FROM mutation_specs "
+            "SELECT module_path, job_id, operator_name FROM mutation_specs "
             "ORDER BY module_path, start_pos_row, start_pos_col, operator_name, occurrence"
         )
-        jobs = [job for job, operator in rows if not operator.startswith(ANNOTATIONS)]
-        chosen = random.Random(f"{seed} {package}").sample(jobs, min(count, len(jobs)))
-        marks = ",".join("?" * len(chosen))
+        jobs = [(module, job) for module, job, operator in rows if not operator.startswith(ANNOTATIONS)]
+    drawn = dict[str, list[str]]()
+    for module, job in random.Random(seed).sample(jobs, min(count, len(jobs))):
+        drawn.setdefault(module, []).append(job)
+    return dict(sorted(drawn.items()))
+
+
+def _keep(listed: Path, session: Path, jobs: list[str]) -> None:
+    """Copy the list of mutants and keep these."""
+    shutil.copy(listed, session)
+    marks = ",".join("?" * len(jobs))
+    with sqlite3.connect(session) as base:
         for table in ("mutation_specs", "work_items"):
-            base.execute(f"DELETE FROM {table} WHERE job_id NOT IN ({marks})", chosen)
-    listed.rename(session)
+            base.execute(f"DELETE FROM {table} WHERE job_id NOT IN ({marks})", jobs)
 
 
 def _cosmic_ray(clone: Path, command: str, *files: Path) -> None:
@@ -104,13 +122,13 @@ def _cosmic_ray(clone: Path, command: str, *files: Path) -> None:
 
 def _outcomes(session: Path) -> list[tuple[str, str]]:
     """Return place and outcome of each mutant."""
-    query = """SELECT module_path, start_pos_row, operator_name, occurrence, test_outcome
-        FROM mutation_specs JOIN work_results USING (job_id) ORDER BY module_path, start_pos_row"""
+    query = """SELECT start_pos_row, operator_name, occurrence, test_outcome, output
+        FROM mutation_specs JOIN work_results USING (job_id) ORDER BY start_pos_row"""
     with sqlite3.connect(session) as base:
-        return [
-            (f"{path}:{row} {operator.removeprefix('core/')} {occurrence}", str(outcome))
-            for path, row, operator, occurrence, outcome in base.execute(query)
-        ]
+        rows = [*base.execute(query)]
+    if any("no tests ran" in str(row[-1]) for row in rows):
+        raise SystemExit(f"{session}: the tests cannot be run: {rows[0][-1][-500:]}")
+    return [(f"line {row}: {name.removeprefix('core/')} {n}", str(end)) for row, name, n, end, _ in rows]
 
 
 def _interval(killed: int, total: int) -> tuple[float, float]:
