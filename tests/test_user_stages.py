@@ -40,6 +40,7 @@ from bevviz.stages import user_stages
 from bevviz.stages.robot_results import detect
 from bevviz.synthetic import SyntheticSource
 from tests.support import bags
+from tests.support.modules import forget_modules
 from tests.support.waiting import PATIENCE
 
 MODULE = '''
@@ -143,11 +144,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (package / "stages.py").write_text(textwrap.dedent(MODULE))
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    plugins.load_plugin.cache_clear()
-    import sys
-
-    for name in [name for name in sys.modules if name.split(".")[0] in ("mine", "broken")]:
-        del sys.modules[name]
+    forget_modules("mine", "broken")
 
 
 @pytest.fixture(scope="module")

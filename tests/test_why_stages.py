@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz.config import load, plugins
+from bevviz.config import load
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
+from tests.support.modules import forget_modules
 from tests.support.planted_faults import at
 
 CLASSES = ("car", "person", "cyclist")
@@ -57,8 +57,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "somebody.py").write_text(textwrap.dedent(MODULE))
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    plugins.load_plugin.cache_clear()
-    sys.modules.pop("somebody", None)
+    forget_modules("somebody")
 
 
 @cache

@@ -8,6 +8,7 @@ import numpy as np
 
 from bevviz.messages.decoders import MessageError, either
 from bevviz.model.frame import F64, Intrinsics
+from bevviz.support.text import short_repr
 
 _DISTORTION = {
     "plumb_bob": "plumb_bob",
@@ -82,7 +83,9 @@ def _distortion(name: str, D: F64, topic: str) -> tuple[str, F64]:
             f"{', '.join(sorted(set(_DISTORTION.values())))}"
         )
     if not (np.abs(D) <= MAX_NUMBER).all():  # not true of NaN, too
-        raise MessageError(f"{topic}: {D.tolist()} are no coefficients of the distortion model '{name}'")
+        raise MessageError(
+            f"{topic}: {short_repr(D.tolist())} are no coefficients of the distortion model '{name}'"
+        )
     counts = OPENCV_COUNTS[:1] if model == "equidistant" else OPENCV_COUNTS
     if np.any(D[counts[-1] :]):
         raise MessageError(
