@@ -154,8 +154,9 @@ class _FolderHook:
 
     def __init__(self, folder: ModuleFolder) -> None:
         self.folder, self._root = folder, folder.root
-        # An environment of Python may lie in the folder.
-        self._installed = [path for path in map(Path, sys.path) if self._root in path.parents]
+        # An environment of Python may lie in the folder, or bevviz itself.
+        places = [*map(Path, sys.path), Path(__file__).parents[1]]
+        self._installed = [path for path in places if self._root in path.parents]
 
     def covers(self, path: str) -> bool:
         """Return whether a path is of the folder."""
