@@ -130,8 +130,8 @@ def trust_in(code: NamedCode) -> Trust:
         return Trust(granted=True, folder=folder)
     state = "has changed since you trusted it" if record is not None else "is not trusted"
     return Trust(
-        advice=f"{shown} {state} and would load {code}; read it, then run 'bevviz trust {shown}', or put "
-        "another method in its place by --set"
+        advice=f"{shown} {state} and would load {code}; read it and what it imports, then run "
+        f"'bevviz trust {shown}', or put another method in its place by --set"
     )
 
 
