@@ -194,7 +194,8 @@ def write_defined(path: Path, form: str, *messages: DefinedMessages, start: int 
                 connection = writer.add_connection("/a", sort.msgtype, typestore=store)
             for values in sort.values:
                 time += 1
-                writer.write(connection, time, serialize(store.types[sort.msgtype](**values), sort.msgtype))
+                message: Any = store.types[sort.msgtype]
+                writer.write(connection, time, serialize(message(**values), sort.msgtype))
     return path
 
 

@@ -498,7 +498,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         if not isinstance(frames, BagSource) or len(object_topics(frames)) < 2:
             return None
         if self.robot_bag is None:  # A bag of its own: other questions need not wait for it.
-            self.robot_bag = frames.opener()
+            self.robot_bag = BagSource(frames.recording.paths, frames.config)
         frame = self.robot_bag.frame(number)
         if frame is None:
             raise UserError(f"frame {number} cannot be read")
