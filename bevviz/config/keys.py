@@ -83,14 +83,9 @@ class ParameterChange:
         return "; ".join(f"{key}: {old} -> {new}" for key, (old, new) in pairs.items() if old != new)
 
 
-def changes(old: Config | Mapping[str, Any], new: Config | Mapping[str, Any]) -> dict[str, ParameterChange]:
-    """Return each dotted key that differs between two configurations.
-
-    Args:
-        old: configuration, or the mapping that ``flat_yaml`` returns, even for another version of bevviz.
-        new: the same.
-    """
-    before, after = (values(side) if isinstance(side, Config) else side for side in (old, new))
+def changes(old: Config, new: Config) -> dict[str, ParameterChange]:
+    """Return each dotted key that differs between two configurations."""
+    before, after = values(old), values(new)
     return {
         key: ParameterChange(before.get(key, "absent"), after.get(key, "absent"))
         for key in dict.fromkeys([*before, *after])

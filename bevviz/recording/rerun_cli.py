@@ -138,7 +138,7 @@ def start_web_viewer(address: str, port: int, source: str) -> Process:
 
 
 @contextmanager
-def reader_errors_as_user_errors(path: Path, otherwise: str = "cannot be read") -> Iterator[None]:
+def reader_errors_as_user_errors(path: Path, otherwise: str) -> Iterator[None]:
     """Raise a ``UserError`` for any error in this context, including a panic of Rerun's reader."""
     try:
         with warnings.catch_warnings():
