@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -528,17 +527,6 @@ def test_a_damaged_result_is_named_and_made_again(done: Job, damage: Any, line: 
     assert len(warnings) == 2 and all(text.startswith(f"drive: {line}") for text in warnings)
     assert not run(done, 1).error
     assert unfinished_jobs([done], False, warnings.append) == [] and len(warnings) == 2
-
-
-def test_a_table_without_checksum_is_written_again(done: Job) -> None:
-    table = pq.read_table(done.table)
-    about = json.loads(table.schema.metadata[b"bevviz"])
-    del about["recording_size"], about["recording_sha256"]
-    pq.write_table(table.replace_schema_metadata({"bevviz": json.dumps(about)}), done.table)
-    warnings: list[str] = []
-    assert [path for path, _ in intact_results(done.folder, warnings.append)] == [done.table]
-    assert unfinished_jobs([done], False, warnings.append) == [done]
-    assert ["1 tables of an older version hold no checksum" in text for text in warnings] == [True, True]
 
 
 @pytest.mark.long

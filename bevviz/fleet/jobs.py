@@ -272,40 +272,29 @@ def unfinished_jobs(
 def intact_results(folder: Path, warn: Callable[[str], None]) -> list[tuple[Path, RunInfo]]:
     """Return table and description of each result in a folder. Leave out damaged ones and warn of them."""
     results: list[tuple[Path, RunInfo]] = []
-    unchecked = 0
     for table in _with_bar([path for path in sorted(folder.glob("*.parquet")) if path.stem not in RESERVED]):
         info = read_info(table)
         if damage := find_damage(table, table.with_suffix(".rrd")):
             warn(f"{table.stem}: {damage}; it is left out until its bag is run again")
         elif info is not None:
             results.append((table, info))
-            unchecked += not info.recording_sha256
-    if unchecked:
-        warn(f"{unchecked} tables of an older version hold no checksum: their recordings are not checked")
     return results
 
 
 def _delete_damaged(jobs: Sequence[Job], warn: Callable[[str], None]) -> None:
-    """Delete the tables of damaged results, and those of an older version, which hold no checksum.
+    """Delete the tables of damaged results.
 
     Args:
         jobs: that have a table.
-        warn: gets a line for each damaged result, and one for all tables of an older version.
+        warn: gets a line for each damaged result.
     """
-    older = 0
     for job in _with_bar(jobs):
         info = read_info(job.table)
         if info is not None and info.key != job.key:
             continue  # It is out of date anyway.
         if damage := find_damage(job.table, job.recording):
             warn(f"{job.name}: {damage}; its bag is run again")
-        elif info is not None and info.recording_sha256:
-            continue
-        else:
-            older += 1
-        job.table.unlink()
-    if older:
-        warn(f"{older} tables of an older version hold no checksum of a recording; their bags are run again")
+            job.table.unlink()
 
 
 def _with_bar(results: Iterable[T]) -> Iterable[T]:

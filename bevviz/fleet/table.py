@@ -110,7 +110,7 @@ class RunInfo:
     recording_size: int = 0  # bytes
     # Hash of every byte: samples would miss damage between them. A core hashes about 1 GB/s, far faster than
     # a recording is made. Rerun writes the file, so it is read once more when it is complete.
-    recording_sha256: str = ""  # empty: the table is of an older version
+    recording_sha256: str = ""
 
 
 _INFO = TypeAdapter(RunInfo)
@@ -219,19 +219,15 @@ def read_info(path: Path) -> RunInfo | None:
 def find_damage(table: Path, recording: Path) -> str:
     """Return a text about the damage in the result of a bag. Empty: there is none.
 
-    A table of an older version has no checksum of its recording. Any recording is accepted there.
-
     Args:
         table: of the frames; the file exists.
         recording: made by the same run.
     """
     info = read_info(table)
-    if info is None or not _is_whole(table, info):
+    if info is None or not _is_whole(table):
         return f"{table.name} is damaged"
     try:
         size = recording.stat().st_size
-        if not info.recording_sha256:
-            return ""
         if size != info.recording_size:
             return f"{recording.name} has {size} bytes instead of {info.recording_size}"
         if file_hash(recording) != info.recording_sha256:
@@ -243,13 +239,11 @@ def find_damage(table: Path, recording: Path) -> str:
     return ""
 
 
-def _is_whole(table: Path, info: RunInfo) -> bool:
-    """Return whether a table can be read to its end and matches its checksums, if it has them."""
+def _is_whole(table: Path) -> bool:
+    """Return whether a table can be read to its end and matches its checksums."""
     try:
         with pq.ParquetFile(table, page_checksum_verification=True) as file:
             file.read()
-            if not info.recording_sha256:
-                return True
             metadata = file.schema_arrow.metadata
             checksum = hashlib.sha256(metadata[_ABOUT]).hexdigest()
             # Column names have no checksum. A damaged name would look like a missing column.
