@@ -21,7 +21,7 @@ from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support import bags, documented_json
 from tests.support.live_sessions import live_bench
 from tests.support.robot_graphs import PARENT, TOPICS, Graph, Plant, make_graph
-from tests.support.workbench_pages import Talk, serving
+from tests.support.workbench_pages import Talk, served
 
 SEEDS = range(500, 508)
 PARENTS = {TOPICS[node]: {TOPICS[parent]} for node, parent in PARENT.items()}
@@ -181,7 +181,7 @@ def test_the_page_shows_which_node_lost_it(bag: tuple[Path, Graph]) -> None:
     plant = next(plant for plant in graph.plants if plant.node == "tracker")
     pick = "point//" + ",".join(f"{value:.3f}" for value in place_of(plant, graph))
     (file,) = path.glob("*.mcap")
-    with serving(str(file)) as (address, _), Talk(address) as talk:
+    with served(file) as address, Talk(address) as talk:
         time = bags.START + plant.frame * bags.PERIOD
         robot = talk.asked("robot", type="ask", time=time, set=[], pick=pick)
     assert robot["text"].endswith("by the step that makes /tracks")

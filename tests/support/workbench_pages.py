@@ -24,6 +24,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_source
+from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE, until
 
 if TYPE_CHECKING:
@@ -43,9 +44,9 @@ EMPTY_WASM = b"\0asm\1\0\0\0"  # a module without content: the stand-in for the 
 
 
 def demo_bag(folder: Path) -> Path:
-    """Write the bag that the workbench opens in most tests."""
+    """Write the bag that the workbench opens in most tests: the first frames of the kept drive."""
     path = folder / "demo.mcap"
-    assert main(["demo", "--frames", str(FRAMES), "-o", str(path)]) == 0
+    assert main(["cut", str(BAG), "--end", f"{FRAMES / 10 - 0.05}", "-o", str(path)]) == 0
     return path
 
 
