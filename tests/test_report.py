@@ -395,6 +395,29 @@ def test_an_interrupted_run_is_a_shorter_report(
     assert main(["report", "--check", "bug.rrd"]) == 0
 
 
+def test_a_report_has_its_names_when_it_is_complete(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error leaves neither half a report nor an older one that could be taken for it."""
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=2))
+    folder = tmp_path / "reports"
+    folder.mkdir()
+    for name in ("bug.rrd", "bug.html", "bug.mcap"):
+        (folder / name).write_text("older")
+    seen: list[str] = []
+
+    def full(*_: object) -> str:
+        seen.extend(sorted(path.name for path in folder.iterdir()))
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("bevviz.report.make.page", full)
+    assert main(["report", str(bag), "--at", "0", "-o", str(folder / "bug.rrd"), "--force"]) == 2
+    assert "bug.rrd: cannot write the report: No space left on device" in capsys.readouterr().err
+    (unfinished,) = seen
+    assert unfinished.startswith("bug.partial-")
+    assert not list(folder.iterdir())
+
+
 # --- fingerprints ------------------------------------------------------------------------------
 
 

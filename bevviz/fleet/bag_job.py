@@ -101,6 +101,7 @@ def _fill(
             blueprint=job.blueprint,
             recording_id=job.recording_id,
             place=job.recording,
+            keep=False,
         ) as sinks:
             observers: list[Observer[FrameResult]] = [
                 Recorder(sinks.recording, job.config, session.stages.provider)

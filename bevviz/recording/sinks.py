@@ -88,6 +88,7 @@ def open_recording(
     blueprint: str | rrb.Blueprint = "debug",
     recording_id: str | None = None,
     place: Path | None = None,
+    keep: bool = True,
     origin: Origin | None = None,
 ) -> Iterator[OpenRecording]:
     """Open a recording with a blueprint and one or several outputs.
@@ -107,6 +108,7 @@ def open_recording(
         recording_id: viewers and catalogs merge recordings with the same identifier; None: a random one, the
             same for all recordings of a process.
         place: final path of the file, if it is not ``save``.
+        keep: whether an unfinished file stays after an error.
         origin: source of the recording; None: it is made from ``scene`` and ``config``.
 
     Raises:
@@ -121,7 +123,7 @@ def open_recording(
     writer: FileWriter | None = None
     with ExitStack() as stack:
         if save is not None:
-            unfinished = stack.enter_context(_open_file(save))
+            unfinished = stack.enter_context(_open_file(save, keep))
             file = unfinished.path
             writer = stack.enter_context(FileWriter(file))
             sinks.append(writer.sink)
@@ -192,12 +194,12 @@ def _flush_and_disconnect(recording: rr.RecordingStream) -> None:
         recording.disconnect()
 
 
-def _open_file(path: Path) -> AbstractContextManager[UnfinishedFile]:
+def _open_file(path: Path, keep: bool) -> AbstractContextManager[UnfinishedFile]:
     for name in (path, path.resolve()):  # a typing error must not overwrite a bag, not even through a link
         if name.suffix != ".rrd":
             link = f" (it is a link to {name})" if name != path else ""
             raise UserError(f"--save {path}: expected a file name that ends in .rrd{link}")
-    return atomic_write(path, "recording")
+    return atomic_write(path, "recording", keep=keep)
 
 
 def _connect(url: str) -> rr.GrpcSink:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import rerun as rr
@@ -62,8 +62,8 @@ from bevviz.report.result_topics import result_messages, without_result_files
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress
-from bevviz.support.files import atomic_write as write_beside
-from bevviz.support.files import claim_target, file_hash, save_text
+from bevviz.support.files import file_hash, save_text
+from bevviz.support.unfinished_folder import UnfinishedFolder
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.log import clear_answers, log_answers
 
@@ -136,6 +136,8 @@ def make(
     ``redact`` the images of that bag are changed, and the network would see less in them. So the network runs
     on the original images, its detections are stored in the recording, and every check uses these.
 
+    The files are written into an unfinished folder and get their names when all of them are complete.
+
     Args:
         request: the request.
         observers: further observers of the run.
@@ -160,11 +162,8 @@ def make(
             )
         # Delete an older report first. If this run fails, nobody may take the old files, perhaps
         # unredacted, for the new ones.
-        for target in (rrd, html, bag):
-            unfinished = claim_target(target, "report")
-            target.unlink(missing_ok=True)
-            unfinished.discard()
-            written.warnings += unfinished.warnings
+        unfinished = stack.enter_context(_unfinished_report([rrd, html, bag]))
+        rrd, html, bag = (unfinished / target.name for target in (rrd, html, bag))
         if request.redact:
             detections = _detect(request, window)
         detect = None if detections is None else replay(detections)
@@ -180,8 +179,6 @@ def make(
             request = replace(request, config=without_result_files(request.config))
         session = Session(request.config, detect, loader=loader)
         content = _cut(whole_bag, window, topics, bag, redactor, made)
-        cleanup.register(bag, partial(bag.unlink, missing_ok=True))  # A bag alone is no report.
-        stack.callback(cleanup.unregister, bag)
         written.files.append(bag)
         written.warnings += [
             *whole_bag.recording.warnings,
@@ -189,11 +186,7 @@ def make(
             *(redactor.notes if redactor else ()),
         ]
         if model is not None:
-            model_copy = rrd.with_name(model.name)
-            with write_beside(model_copy, "model") as file:
-                shutil.copyfile(model, file.path)
-            written.files.append(model_copy)
-
+            written.files.append(shutil.copyfile(model, unfinished / model.name))
         notes = [note for note in request.notes if window.low <= note.received < window.high]
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
@@ -202,10 +195,12 @@ def make(
         scene = replace(
             whole_bag.scene, bag=(), focus=focus
         )  # The recording must not contain the bag's path.
-        sinks = stack.enter_context(
-            open_recording(scene, public, save=rrd, blueprint=_layout(scene, public), origin=origin)
+        recorded = stack.enter_context(ExitStack())
+        sinks = recorded.enter_context(
+            open_recording(
+                scene, public, save=rrd, keep=False, blueprint=_layout(scene, public), origin=origin
+            )
         )
-        cleanup.unregister(bag)
         recording = sinks.recording
         written.files.insert(0, rrd)
         summary = WindowSummary(window.at, source.total, len(whole_bag.scene.cameras))
@@ -225,9 +220,40 @@ def make(
         info = _info(request, window, written, made_with, bag)
         recording.send_property("report", rr.AnyValues(about=info.dump()))
         recording.log(entities.REPORT, document(facts.markdown()), static=True)
-    save_text(html, page(facts, summary, file_hash(rrd), answers[:1]), "-o")
-    written.files.insert(1, html)
+        recorded.close()
+        save_text(html, page(facts, summary, file_hash(rrd), answers[:1]), "-o")
+        written.files.insert(1, html)
+        folder = request.output.parent
+        # The page that people open comes last.
+        for path in sorted(written.files, key=lambda path: path == html):
+            path.replace(folder / path.name)
+        written.files = [folder / path.name for path in written.files]
     return written
+
+
+@contextmanager
+def _unfinished_report(targets: Sequence[Path]) -> Iterator[Path]:
+    """Delete an older report. Yield a folder for the files of the new one, which is deleted at the end.
+
+    Raises:
+        UserError: the files cannot be written, or another process writes a report of the same name.
+    """
+    try:
+        unfinished = UnfinishedFolder(targets[0].with_suffix(""))
+    except OSError as error:
+        raise UserError(f"{targets[0]}: cannot write the report: {error.strerror}") from None
+    cleanup.register(unfinished, unfinished.discard)
+    try:
+        for target in targets:
+            target.unlink(missing_ok=True)
+        yield unfinished.path
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EISDIR, errno.EPERM, errno.EACCES):
+            raise
+        raise UserError(f"{targets[0]}: cannot write the report: {error.strerror}") from None
+    finally:
+        cleanup.unregister(unfinished)
+        unfinished.discard()
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,9 +451,8 @@ def _facts(
     answers = () if frame is None else frame.answers
     sizes = {
         path.name: f"{description}, {megabytes(path.stat().st_size)}"
-        for path, description in (
-            (request.output.with_suffix(".mcap"), "the raw messages of the window"),
-            *((path, "the model") for path in written.files[2:]),
+        for path, description in zip(
+            written.files[1:], ("the raw messages of the window", "the model"), strict=False
         )
     }
     sizes = {request.output.name: "everything that was seen, made and decided, for the Rerun viewer", **sizes}

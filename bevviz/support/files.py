@@ -106,7 +106,7 @@ def create_file(path: Path) -> int:
 
 
 @contextmanager
-def atomic_write(target: Path, what: str) -> Iterator[UnfinishedFile]:
+def atomic_write(target: Path, what: str, *, keep: bool = True) -> Iterator[UnfinishedFile]:
     """Yield an unfinished file beside ``target``, locked for this process. At the end it replaces ``target``.
 
     An interrupt also replaces ``target``. After an error or a kill, the data stays in the unfinished file,
@@ -115,6 +115,7 @@ def atomic_write(target: Path, what: str) -> Iterator[UnfinishedFile]:
     Args:
         target: the file. A link is followed.
         what: kind of file, for error messages.
+        keep: whether the data stays after an error.
 
     Raises:
         UserError: the target cannot be written, is no file, is a link to a file of another kind, or another
@@ -133,7 +134,7 @@ def atomic_write(target: Path, what: str) -> Iterator[UnfinishedFile]:
                 _finish(path, resolved, what)
                 raise
             except BaseException as error:
-                if not os.fstat(handle).st_size:
+                if not keep or not os.fstat(handle).st_size:
                     path.unlink(missing_ok=True)
                 elif isinstance(error, UserError):
                     raise UserError(f"{error}; what was made until then is in {path.name}") from error
