@@ -305,9 +305,9 @@ def _live(folder: Path) -> Hashes:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.runtime import Live, Outputs
-    from bevviz.live.source_wrappers import Replay
     from bevviz.live.status import Notes
     from bevviz.synthetic import SyntheticSource
+    from tests.support.replay import Replay
 
     path = folder / f"live_{time.time_ns()}.rrd"
     drive = SyntheticSource(frames=FRAMES)

@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.runtime import Live, Outputs, Status
-from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.synthetic import SyntheticSource
+from tests.support.replay import Replay
 
 WARM = 10.0  # seconds at the start that are left out: kernels are loaded, buffers fill
 GROWTH = 1.1  # memory at the end to memory when the flight recorder was full

@@ -21,6 +21,7 @@ from websockets.typing import Subprotocol
 
 from bevviz.live.foxglove_server import FoxgloveServer
 from bevviz.recording.ports import free_port
+from tests.support import replay
 from tests.support.commands import environment
 from tests.support.waiting import PATIENCE, until
 
@@ -29,7 +30,7 @@ WANTED = {"/detection/fused_3d", "/lidar/points_no_ground", "/visualization/trac
 
 
 def test_a_foreign_client_reads_the_results(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "bevviz.cli", "live", "--synthetic", "4", "--model", "demo"]
+    command = [sys.executable, replay.__file__, "4", "live", "--model", "demo"]
     command += ["--foxglove", str(free_port(18765)), "--set", "live.flight_time=0"]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment()

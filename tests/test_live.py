@@ -32,7 +32,7 @@ from bevviz.live.flight_recorder import FlightRecorder, Triggers
 from bevviz.live.indexing import INDEX, Indexer, add_index, remove_leftovers
 from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.source_wrappers import Replay, ThinnedSource, thin
+from bevviz.live.source_wrappers import ThinnedSource, thin
 from bevviz.live.status import Notes
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
@@ -50,6 +50,7 @@ from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.support.recordings import Recording, verify
+from tests.support.replay import Replay
 from tests.support.waiting import until
 
 Run = Callable[..., "Outcome"]

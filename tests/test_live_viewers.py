@@ -13,7 +13,6 @@ from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -23,6 +22,7 @@ from bevviz.workbench.live_buffer import AHEAD, WHOLE
 from bevviz.workbench.running_robot import RunningRobot
 from tests.support.live_sessions import live_bench
 from tests.support.recordings import Recording
+from tests.support.replay import Replay
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 LIMIT = 500  # points

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import pytest
 from bevviz.errors import UserError
 from bevviz.recording import rerun_cli
 from bevviz.recording.ports import allowed_origins, host_for, is_listening, own_address
-from tests.support import bags
+from tests.support import bags, replay
 from tests.support.waiting import PATIENCE, until
 
 LOOPBACK = "0100007F"  # as /proc/net/tcp has it
@@ -66,10 +66,15 @@ def listening(pid: int) -> dict[int, str]:
     return found
 
 
+BEVVIZ = ("-m", "bevviz.cli")
+
+
 @contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def running(
+    *arguments: str, program: Sequence[str] = ("-m", "bevviz.cli")
+) -> Iterator[subprocess.Popen[bytes]]:
     """Run a command and kill it at the end."""
-    with subprocess.Popen([sys.executable, "-m", "bevviz.cli", *arguments]) as process:
+    with subprocess.Popen([sys.executable, *program, *arguments]) as process:
         try:
             yield process
         finally:
@@ -79,7 +84,7 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 COMMANDS: dict[str, list[str]] = {  # one for each way in which commands open their outputs
     "demo": ["demo", "--frames", "2"],
     "sweep": ["sweep", "drive", "--set", "clustering.eps=0.5,0.6"],
-    "live": ["live", "--synthetic", "2"],
+    "live": ["live"],  # with two scans in place of a robot
 }
 
 
@@ -95,7 +100,8 @@ def is_let_in(port: int, origin: str) -> bool:
 def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
     bags.write(Path("drive"), bags.small_items(scans=2))
     port = a_port()
-    with running(*COMMANDS[name], "--serve", str(port)) as process:
+    program = (replay.__file__, "2") if name == "live" else BEVVIZ
+    with running(*COMMANDS[name], "--serve", str(port), program=program) as process:
         until(lambda: port in listening(process.pid) and len(listening(process.pid)) >= 2)
         found = listening(process.pid)
         assert set(found.values()) == {LOOPBACK}

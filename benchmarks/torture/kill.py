@@ -19,7 +19,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from bevviz.support.files import unfinished_files
-from tests.support import bags
+from tests.support import bags, replay
 
 SCANS = 40
 SHORT = (10, 3, 6)  # scans of each of a batch's bags
@@ -32,6 +32,9 @@ ADDRESS = "BEVVIZ_TORTURE_SCHEDULER"  # of the Dask cluster, in the environment
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
 
 
+PROGRAM = ("-m", "bevviz")
+
+
 @dataclass(frozen=True)
 class Command:
     """A command, and what must be true of what it made where it ends with status 0."""
@@ -40,6 +43,7 @@ class Command:
     true: Callable[[Path, str], bool]  # of the folder and what was printed
     made: tuple[str, ...] = ()  # removed before each run
     endless: float = 0.0  # seconds until it has begun all that it does until it is ended
+    program: tuple[str, ...] = PROGRAM
 
 
 def _saved(name: str, entity: str = "/bev") -> Callable[[Path, str], bool]:
@@ -84,7 +88,9 @@ COMMANDS: dict[str, Command] = {
     ),
     "batch": Command((*BATCH, "--jobs", "2"), _batch_is_whole, ("runs",)),
     "batch --dask": Command((*BATCH, "--dask", ADDRESS), _batch_is_whole, ("runs",)),
-    "live": Command(("live", "--synthetic", "10", "--save", "l.rrd"), lambda *_: True, ("l.rrd",), endless=8),
+    "live": Command(
+        ("live", "--save", "l.rrd"), lambda *_: True, ("l.rrd",), endless=8, program=(replay.__file__, "10")
+    ),
     "open": Command(("open", "drive", "--no-browser"), lambda *_: True, endless=6),
 }
 
@@ -161,7 +167,7 @@ def _one(
     command = COMMANDS[name]
     _clean(folder, name)
     before = _files(folder)
-    process = _start(folder, *command.arguments)
+    process = _start(folder, *command.arguments, program=command.program)
     time.sleep(delay)
     everyone = everyone and number != signal.SIGKILL
     what = f"{name}, {number.name}{' to all' if everyone else ''} after {delay:.3f} s"
@@ -299,13 +305,13 @@ def _clean(folder: Path, name: str) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+def _start(folder: Path, *arguments: str, program: Sequence[str] = PROGRAM) -> subprocess.Popen[str]:
     kept = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     temporary = folder / "tmp"
     temporary.mkdir(exist_ok=True)
     given = [os.environ.get(a, a) for a in arguments]
     return subprocess.Popen(
-        [sys.executable, "-m", "bevviz", *given],
+        [sys.executable, *program, *given],
         cwd=folder,
         env={**kept, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "XDG_RUNTIME_DIR": str(temporary)},
         stdout=subprocess.PIPE,

@@ -20,7 +20,6 @@ from bevviz.cli.options import (
     add_output,
     add_ros_args,
     port,
-    positive,
     project_layers,
 )
 from bevviz.cli.outputs import has_display, say, warn
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
     from bevviz.live.source import LiveSource
-    from bevviz.live.source_wrappers import Replay
     from bevviz.live.status import Notes
     from bevviz.model.frame import Frame
     from bevviz.model.protocols import Items
@@ -90,14 +88,6 @@ def add(commands: Commands) -> None:
     choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
     choice.add_argument("--points", metavar="N", help="points kept of each scan")
     choice.add_argument("--nice", metavar="0..19", help="priority given up to other processes")
-    choice.add_argument(
-        "--synthetic",
-        nargs="?",
-        type=positive,
-        const=30,
-        metavar="N",
-        help="instead of a robot N scans of the synthetic drive, forth and back (default: 30)",
-    )
     add_config(live)
     output = add_output(live, blueprint="live", raw=True)
     add_keep(output)
@@ -153,15 +143,13 @@ def _live(options: argparse.Namespace) -> int:
     option_settings = [f"{key}={value}" for key, value in option_values.items() if value is not None]
     if options.split is not None:
         option_settings.append(options.split)
-    _, messages = _files(options.save)
+    _files(options.save)
     if options.split is not None and not options.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
     if options.observe and options.foxglove is not None:
         raise UserError("--observe makes no results that --foxglove could serve: leave one of them out")
     if options.observe and options.publish:
         raise UserError("--observe makes no results that --publish could send: leave one of them out")
-    if messages is not None and options.synthetic:
-        raise UserError(f"--save {messages}: the synthetic drive has no messages; 'bevviz demo --bag' does")
     if options.observe and options.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = ReloadableConfig(
@@ -183,17 +171,7 @@ def _run(
     loader: StageLoader,
     server: FoxgloveServer | None,
 ) -> int:
-    """Run on the synthetic drive or beside a robot."""
-    if options.synthetic:
-        source = _replay(options.synthetic)
-        if server is None:
-            return _watch(source, settings, options, notes, loader)
-        from bevviz.live.publish import Publisher
-
-        publisher = Publisher(settings.config, [server])
-        return _watch(
-            source, settings, options, notes, loader, publisher.publish, lambda live: publisher.configure
-        )
+    """Run beside a robot."""
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.source import LiveSource
 
@@ -315,24 +293,14 @@ def _watch_robot(
         return _watch(source, settings, options, notes, loader, callback, follow, control, raw)
 
 
-def _replay(frames: int) -> Replay:
-
-    from bevviz.live.source_wrappers import Replay
-    from bevviz.synthetic import SyntheticSource
-
-    source = SyntheticSource(frames=frames)
-    drive = list(progress.bar(source, total=source.total, unit="scan", desc="simulate"))
-    return Replay(drive, source.scene)
-
-
 def _watch(
     source: Items[Frame],
     settings: ReloadableConfig,
     options: argparse.Namespace,
     notes: Notes,
     loader: StageLoader,
-    on_result: Callable[[FrameResult], None] | None = None,
-    follow: Callable[[Live], Callable[[Config], None]] | None = None,
+    on_result: Callable[[FrameResult], None] | None,
+    follow: Callable[[Live], Callable[[Config], None]],
     control: Control | None = None,
     raw: RawRecorder | None = None,
 ) -> int:
@@ -358,8 +326,7 @@ def _watch(
         raw=raw,
         robot=options.robot,
     )
-    if follow is not None:
-        live.on_change = follow(live)
+    live.on_change = follow(live)
     for url in live.urls:
         say(f"viewer at {url}", always=True)
     if no_output and not show_window:

@@ -36,7 +36,7 @@ class FlightRecorder(Closable):
         encoder: makes the beginning of a recording.
         indexer: gives saved recordings an index.
         notes: takes a report of each snapshot.
-        raw: recorder of the messages. None: there are no messages, as in a synthetic drive.
+        raw: recorder of the messages. None: there are no messages.
     """
 
     def __init__(

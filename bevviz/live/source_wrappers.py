@@ -1,8 +1,7 @@
-"""Frames of a run: thinned on purpose, replayed as of a robot, and artificial ones to warm up."""
+"""Frames of a run: thinned on purpose, and artificial ones to warm up."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -121,63 +120,6 @@ def thin(frame: Frame, points: int | None) -> Frame:
         points=frame.points[rows],
         fields={name: values[rows] for name, values in frame.fields.items()},
         clouds=tuple(clouds),
-    )
-
-
-class Replay:
-    """Endless source that plays frames forward and backward at a steady rate, so that nothing jumps.
-
-    Stamps and times of receipt are shifted to the current time.
-
-    Args:
-        frames: frames in order of time.
-        scene: names of the sensors.
-        rate: frames a second.
-        total: frames until it ends. None: it does not end.
-    """
-
-    def __init__(
-        self, frames: Sequence[Frame], scene: Scene, *, rate: float = 10.0, total: int | None = None
-    ) -> None:
-        self.scene = scene
-        self.total = total
-        self.warnings: tuple[str, ...] = ()
-        self._frames = [*frames, *frames[-2:0:-1]]
-        self._period = 1 / rate
-        self._stopped = threading.Event()
-
-    def stop(self) -> None:
-        """End the iteration. Any thread may call it."""
-        self._stopped.set()
-
-    def __iter__(self) -> Iterator[Frame]:
-        start = time.monotonic()
-        index = 0
-        while self.total is None or index < self.total:
-            if self._stopped.wait(max(0.0, start + index * self._period - time.monotonic())):
-                return
-            yield _at(self._frames[index % len(self._frames)], index, time.time_ns())
-            index += 1
-
-
-def _at(frame: Frame, index: int, now: int) -> Frame:
-    """Return the frame with its times shifted, so that its cloud is received now."""
-    shift = now - frame.received
-    stamp = frame.stamp + shift
-    cameras = [
-        replace(c, image=c.image and replace(c.image, stamp=c.image.stamp + shift, received=now))
-        for c in frame.cameras
-    ]
-    return replace(
-        frame,
-        index=index,
-        stamp=stamp,
-        received=now,
-        clouds=tuple(replace(c, stamp=c.stamp + shift, received=now) for c in frame.clouds),
-        cameras=tuple(cameras),
-        robot_boxes=tuple(replace(b, stamp=b.stamp + shift) for b in frame.robot_boxes),
-        robot_detections=tuple(replace(d, stamp=d.stamp + shift) for d in frame.robot_detections),
-        truth=frame.truth and replace(frame.truth, stamp=frame.truth.stamp + shift),
     )
 
 

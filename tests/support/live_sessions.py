@@ -11,11 +11,11 @@ from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
-from bevviz.live.source_wrappers import Replay
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.running_robot import RunningRobot
+from tests.support.replay import Replay
 
 
 def run_beside(live: Live, during: Callable[[], object]) -> None:
