@@ -183,6 +183,22 @@ INPUTS: dict[str, Input] = {
 ELSEWHERE = {"`--model FILE.onnx`", "`batch --dask ADDRESS`"}
 
 
+def test_each_test_that_the_page_names_exists() -> None:
+    named = re.findall(r"`(test_\w+)::(test_\w+)`", PAGE.read_text())
+    sources = {file: (Path(__file__).parent / f"{file}.py").read_text() for file, _ in named}
+    assert len(named) > 20
+    assert [(file, name) for file, name in named if f"def {name}(" not in sources[file]] == []
+
+
+@pytest.mark.parametrize("section", ["What listens", "Limits"])
+def test_each_row_names_its_test(section: str) -> None:
+    text = PAGE.read_text().split(f"## {section}\n")[1].split("\n## ")[0]
+    _, _, *table = [line for line in text.splitlines() if line.startswith("|")]
+    others = [line for line in table if not re.search(r"`test_\w+::test_\w+`[^|]*\|$", line)]
+    assert len(table) > 5
+    assert not [line for line in others if not line.endswith("| none: ROS's SROS 2 protects it |")]
+
+
 def test_each_row_of_the_page_is_checked() -> None:
     assert set(rows()) == set(INPUTS) | ELSEWHERE
 
