@@ -25,9 +25,6 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# They run a robot or a viewer beside the clock on the wall.
-REAL_TIME = ("test_live", "test_workbench_live", "test_robot_examples", "test_snap")
-
 # The longest files first, so that no worker is left alone with one at the end.
 FIRST = (
     *("test_workbench_journeys", "test_calib", "test_workbench", "test_example_notebooks"),
@@ -42,10 +39,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave one share of the files, and sort the longest first.
-
-    Let real-time tests fail once, as on a busy machine. Such a failure is reported as a rerun.
-    """
+    """Leave one share of the files, and sort the longest first."""
     number, shares = map(int, config.getoption("share").split("/"))
     if shares > 1:
         marked = config.option.markexpr == "long"
@@ -55,9 +49,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item.path in chosen]
     rank = {f"{name}.py": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
-    for item in items:
-        if item.path.name.startswith(REAL_TIME):
-            item.add_marker(pytest.mark.flaky(reruns=1))
 
 
 @pytest.fixture(scope="session")

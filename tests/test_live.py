@@ -49,6 +49,7 @@ from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
 from bevviz.synthetic import SyntheticSource
 from bevviz.synthetic.sensors import Lidar, PinholeCamera
+from tests.support.live_sessions import run_beside
 from tests.support.recordings import Recording, verify
 from tests.support.replay import Replay
 from tests.support.waiting import until
@@ -138,27 +139,16 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         paced = source.replay if isinstance(source, Stalled) else source
         if isinstance(paced, Paced):
             paced.through = lambda: live.frames
-        failed: list[BaseException] = []
 
         def beside() -> None:
+            until(lambda: live.frames > 0)
             assert during is not None
-            try:
-                until(lambda: live.frames > 0)
-                during(live)
-            except BaseException as error:
-                failed.append(error)
-                live.stop()
+            during(live)
 
-        thread = threading.Thread(target=beside)
-        if during is not None:
-            thread.start()
-        try:
+        if during is None:
             live.run()
-        finally:
-            if during is not None:
-                thread.join()
-        if failed:
-            raise failed[0]
+        else:
+            run_beside(live, beside)
         return Outcome(live, said)
 
     return play
@@ -555,8 +545,8 @@ def test_the_flight_recorder_holds_the_last_seconds(
     written = [path.stat().st_ino for path in saved]
     assert indexer.close()  # a process that nobody waits for has begun
     until(lambda: all(path.stat().st_ino != inode for path, inode in zip(saved, written, strict=True)))
+    verify(saved[0])
     for path in saved:
-        verify(path)
         recording = Recording(path)
         assert numbers(path) == list(range(60, 80)), "from the first whole one on"
         assert recording.blueprints == 1
@@ -924,6 +914,7 @@ def received(port: int, path: Path, enough: Callable[[Recording], object]) -> Re
     raise AssertionError("it was sent nothing, or not enough")
 
 
+@pytest.mark.long
 def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
     run: Run, frames: list[Frame], drive: SyntheticSource
 ) -> None:
@@ -952,6 +943,7 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
     assert not listens(port)
 
 
+@pytest.mark.long
 def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     port = a_port()
     arguments = ("--serve-grpc", "--port", str(port), "--server-memory-limit", "1GB")

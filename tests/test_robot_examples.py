@@ -59,6 +59,7 @@ def test_the_systemd_unit_is_valid(tmp_path: Path) -> None:
         assert [line for line in done.stderr.splitlines() if "bevviz.service" in line] == []
 
 
+@pytest.mark.long  # of its own it shows that these arguments are taken; test_live_ros has the run
 def test_the_command_of_the_unit_runs_and_ends(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
     _, *arguments = shlex.split(unit()["Service"]["ExecStart"])
