@@ -943,6 +943,27 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
     assert not listens(port)
 
 
+def test_a_viewer_that_dies_is_started_again(
+    results: list[FrameResult], drive: SyntheticSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bevviz.live.outputs.RETRY", 0.01)
+    said: list[str] = []
+    with packets_of(results, drive.scene, 1) as (encoder, packets):
+        program = Program("screen", ["sh", "-c", "cat > /dev/null"])
+        screen = Viewer(program, 20, encoder, Notes(said.append))
+        first = screen._process
+        first.kill()
+
+        def told(text: str) -> bool:
+            screen.put(packets[0])
+            return any(text in line for line in said)
+
+        until(lambda: told("the screen viewer is gone"))
+        until(lambda: told("the screen viewer is back"))
+        assert screen._process is not first and len(said) == 2
+        screen.close(60.0)
+
+
 @pytest.mark.long
 def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     port = a_port()

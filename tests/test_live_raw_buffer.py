@@ -31,9 +31,10 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import read_origin
 from bevviz.report.fingerprints import compare, digest
 from bevviz.support.files import write_all
-from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import LIDAR_TOPIC
+from tests.support.played_drive import drive_of
 from tests.support.recordings import Recording, verify_when_indexed
+from tests.support.ros_player import Play
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
@@ -51,6 +52,7 @@ from tests.support.live_sessions import run_beside
 SECONDS = 1.0  # that the flight recorder holds: with three seconds before them less than the run takes
 POINTS = 3000
 STRING = "std_msgs/msg/String"
+TYPES = drive_of(Play()).types
 
 
 @dataclass
@@ -145,9 +147,9 @@ def test_other_libraries_read_it(flight: Flight) -> None:
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         channels = {channel.topic: channel for channel in summary.channels.values()}
-        assert channels.keys() >= {*TOPICS, "/robot_description"}
+        assert channels.keys() >= {*TYPES, "/robot_description"}
         schemas = summary.schemas
-        for topic, kind in TOPICS.items():
+        for topic, kind in TYPES.items():
             schema = schemas[channels[topic].schema_id]
             assert (schema.name, schema.encoding) == (kind, "ros2msg")
             assert channels[topic].message_encoding == "cdr"

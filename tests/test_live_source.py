@@ -19,8 +19,9 @@ from bevviz.errors import UserError
 from bevviz.messages.encode import encode_boxes_3d, encode_cloud
 from bevviz.model.frame import Boxes3D, Cloud, Frame
 from bevviz.pipeline.run import DropPolicy, run
-from bevviz.synthetic.bag import TOPICS
 from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
+from tests.support.played_drive import drive_of
+from tests.support.ros_player import Play
 from tests.support.waiting import until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
@@ -213,7 +214,9 @@ def test_the_first_frame_waits_for_its_calibration(graph: FedGraph) -> None:
         player.play(2.0)
         absent = "no transform from 'rslidar' to 'zed2_left_camera_optical_frame' yet"
         assert session.source.missing.startswith(absent) and not session.frames
-        both = Player(graph, name="late", without=tuple(topic for topic in TOPICS if topic not in late))
+        both = Player(
+            graph, name="late", without=tuple(topic for topic in drive_of(Play()).types if topic not in late)
+        )
         for _ in range(40):
             both.play(0.05)
             player.play(0.0)

@@ -1,53 +1,60 @@
-"""The synthetic drive as messages, for the robots of tests."""
+"""The kept drive as messages, for the robots of tests."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
+from bevviz.bags.source import BagSource
+from bevviz.config import load
 from bevviz.messages.definitions import typestore
-from bevviz.model.frame import Frame
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.bag import TOPICS, messages, mounting
 from bevviz.synthetic.drive import START
-from tests.support.ros_player import Drive, Play, shifted
+from tests.support.kept_drives import BAG
+from tests.support.ros_player import PERIOD, Drive, Play, shifted
+
+FRAMES = 3
 
 
 @cache
 def drive_of(play: Play) -> Drive:
-    source = _source()
-    static = typestore().serialize_cdr(mounting(source), TOPICS["/tf_static"])
-    frames = [_messages(play, index) for index in range(play.frames)]
-    return Drive(play, TOPICS, bytes(static), frames)
+    types, messages = _messages()
+    frames: list[list[tuple[float, str, bytes]]] = [[] for _ in range(play.frames)]
+    static = b""
+    for topic, at, data in messages:
+        if topic == "/tf_static":
+            static = data
+        elif at < play.frames * PERIOD:
+            message = _changed(play, typestore().deserialize_cdr(data, types[topic]))
+            changed = bytes(typestore().serialize_cdr(message, types[topic]))
+            frames[at // PERIOD].append((at % PERIOD * 1e-9, topic, changed))
+    return Drive(play, types, static, frames)
 
 
 @cache
-def _source() -> SyntheticSource:
-    return SyntheticSource(frames=3)
+def _messages() -> tuple[dict[str, str], Sequence[tuple[str, int, bytes]]]:
+    """Return the types by topic, and topic, nanoseconds since the begin and message, in order."""
+    with BagSource([BAG], load()) as source:
+        types = {topic.name: topic.type for topic in source.recording.topics}
+        found = [
+            (message.connection.topic, message.received, bytes(message.data))
+            for message in source.recording.messages(list(types))
+        ]
+    return types, [(topic, at - START, data) for topic, at, data in found if at - START < FRAMES * PERIOD]
 
 
-@cache
-def _frame(index: int) -> Frame:
-    return _source().snapshot(index).frame
-
-
-def _messages(play: Play, index: int) -> list[tuple[float, str, bytes]]:
-    """Return the messages of one frame."""
-    frame = _frame(index)
-    cloud, camera = frame.clouds[0], frame.cameras[0]
-    rows = np.resize(np.arange(len(cloud.xyz)), play.points)
-    fields = {name: values[rows] for name, values in cloud.fields.items()}
-    assert camera.intrinsics is not None
-    K = camera.intrinsics.K * np.array([[play.focal], [play.focal], [1.0]])
-    frame = replace(
-        frame,
-        clouds=(replace(cloud, xyz=cloud.xyz[rows], fields=fields),),
-        cameras=(replace(camera, intrinsics=replace(camera.intrinsics, K=K)),),
-    )
-    return [
-        ((at - frame.stamp) * 1e-9, topic, bytes(typestore().serialize_cdr(shifted(one, -START), kind)))
-        for topic, at, one in messages(_source(), frame)
-        for kind in [TOPICS[topic]]
-    ]
+def _changed(play: Play, message: Any) -> Any:
+    """Return a message with stamps from 0 on, and with the points and the focal length of the play."""
+    if hasattr(message, "point_step"):
+        points = message.data.reshape(-1, message.point_step)
+        data = np.resize(points, (play.points, message.point_step)).ravel()
+        message = replace(message, data=data, height=1, width=play.points, row_step=len(data))
+    if hasattr(message, "distortion_model"):
+        k, p = message.k.copy(), message.p.copy()
+        k[[0, 4]] *= play.focal
+        p[[0, 5]] *= play.focal
+        message = replace(message, k=k, p=p)
+    return shifted(message, -START)
