@@ -555,6 +555,26 @@ def test_the_flight_recorder_holds_the_last_seconds(
         assert min(recording.at["/explain/states/pipeline"]["StateChange:state"]) == 60
 
 
+def test_a_snapshot_has_its_name_when_it_is_complete(
+    results: list[FrameResult], drive: SyntheticSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names: list[str] = []
+
+    def full(handle: int, data: bytes) -> None:
+        names.extend(path.name for path in tmp_path.iterdir())
+        raise OSError(28, "No space left on device")
+
+    with packets_of(results, drive.scene, 4) as (encoder, packets):
+        flight = FlightRecorder(load().live, encoder, Indexer(), Notes(lambda text: None))
+        for packet in packets:
+            flight.put(packet)
+        monkeypatch.setattr("bevviz.live.flight_recorder.write_all", full)
+        with pytest.raises(UserError, match="cannot be saved: No space left on device"):
+            flight.save(tmp_path / "a.rrd")
+    assert [name.startswith("a.partial-") for name in names] == [True]
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_flight_recorder_is_bounded_in_memory(results: list[FrameResult], drive: SyntheticSource) -> None:
     sizes: list[int] = []
     config = load(settings=["live.flight_time=1000", "live.flight_size=1 MB"]).live

@@ -22,7 +22,7 @@ from bevviz.live.status import Notes, give_way
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.support.contexts import Closable
-from bevviz.support.files import write_all
+from bevviz.support.files import claim_target, rename_new, write_all
 
 
 class FlightRecorder(Closable):
@@ -165,21 +165,20 @@ class FlightRecorder(Closable):
     def _write_recording(self, target: Path, packets: list[Packet]) -> None:
         if target.suffix != ".rrd":
             raise UserError(f"{target}: expected a file name that ends in .rrd")
+        if os.path.lexists(target):
+            raise UserError(f"{target}: is already there")
+        unfinished = claim_target(target, "recording")
         try:
-            file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-            try:
-                write_all(file, self._encoder.prelude(packets[0].context))
-                for packet in packets:
-                    write_all(file, packet.data)
-            except OSError:
-                target.unlink()
-                raise
-            finally:
-                os.close(file)
+            write_all(unfinished.handle, self._encoder.prelude(packets[0].context))
+            for packet in packets:
+                write_all(unfinished.handle, packet.data)
+            rename_new(unfinished.path, target)
         except FileExistsError:
             raise UserError(f"{target}: is already there") from None
         except OSError as error:
             raise UserError(f"{target}: cannot be saved: {error.strerror}") from None
+        finally:
+            unfinished.discard()
         remove_leftovers(target.parent)
         self._indexer.add(target)
 
