@@ -245,7 +245,7 @@ def test_a_report_has_what_was_asked_tried_and_noted(
         told.index(part) for part in ("Missed: the", before["verdict"], "What was tried", after["verdict"])
     ]
     assert places == sorted(places)
-    assert f"{' '.join(hint['settings'])} {after['verdict']}" in told
+    assert f"{', '.join(hint['settings'])} {after['verdict']}" in told
     assert "--set-b" in told
     assert hint["settings"][0].partition("=")[0] not in told[told.index("How it was made") :]
     talk.say(type="unnote", stamp=str(stamp), text="a note of mine")
