@@ -162,6 +162,7 @@ def test_a_table_without_its_recording_is_ignored(batch: Batch, model: str, tmp_
     assert {job.name for job in unfinished_jobs(jobs, force=True)} == {"bad", *GOOD}
 
 
+@pytest.mark.long
 def test_an_interrupted_batch_can_be_continued(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, scans in (("long", 400), ("short", 2)):
         bags.write(tmp_path / "bags" / name, bags.small_items(scans=scans))

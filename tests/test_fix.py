@@ -39,6 +39,7 @@ def samples() -> tuple[Sample, Sample]:
     return sample(10, loader), sample(10 + DRIVES, loader)
 
 
+@pytest.mark.long
 def test_two_wrong_parameters_are_repaired(samples: tuple[Sample, Sample]) -> None:
     choosing, confirming = samples
     config = load(settings=["detector.conf_threshold=0.9", "fusion.min_iou=0.6"])

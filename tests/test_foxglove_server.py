@@ -29,6 +29,7 @@ FIRST = "/detection/fused_3d"
 WANTED = {"/detection/fused_3d", "/lidar/points_no_ground", "/visualization/tracks", "/tf"}
 
 
+@pytest.mark.long
 def test_a_foreign_client_reads_the_results(tmp_path: Path) -> None:
     command = [sys.executable, replay.__file__, "4", "live", "--model", "demo"]
     command += ["--foxglove", str(free_port(18765)), "--set", "live.flight_time=0"]

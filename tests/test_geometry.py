@@ -235,7 +235,7 @@ def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn:
     reach = [np.array([np.hypot(box[2], box[3]) / 2]) for box in (a, b)]
     low = np.minimum(np.subtract(a[:2], reach[0]), np.subtract(b[:2], reach[1]))
     high = np.maximum(np.add(a[:2], reach[0]), np.add(b[:2], reach[1]))
-    sides = [np.linspace(start, end, 400) for start, end in zip(low, high, strict=True)]
+    sides = [np.linspace(start, end, 200) for start, end in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
     inside = []
     for x, y, length, width, angle in (a, b):

@@ -107,6 +107,7 @@ def test_a_bag_that_cannot_be_read_is_one_line(tmp_path: Path, capsys: pytest.Ca
     assert "drive.db3: the file is empty" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_reruns_own_command_finds_it(drive: Path, tmp_path: Path) -> None:
     (bag,) = drive.glob("*.db3")
     saved = tmp_path / "out.rrd"

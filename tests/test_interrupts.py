@@ -160,6 +160,7 @@ def interrupt_at(moment, work):
 """
 
 
+@pytest.mark.long
 def test_an_interrupt_at_any_line_ends_an_open_recording(tmp_path: Path) -> None:
     """Rerun holds the pipe to the file open until its sink is closed, and the writer waits for that."""
     script = INTERRUPTED_AT + (

@@ -227,6 +227,7 @@ def test_a_drive_that_was_run_before_shows_its_list_at_once(
     assert passes == {"again"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["evaluate", "batch"])
 def test_a_drive_run_by_another_command_shows_its_list(
     drives: tuple[Drive, Drive],

@@ -181,6 +181,7 @@ def test_a_long_answer_is_cut_and_says_so() -> None:
     assert tree["few"] == [1, 2] and tree["nothing"] is None
 
 
+@pytest.mark.long
 def test_a_client_talks_to_the_command(bag: Path) -> None:
     async def talk() -> tuple[dict[str, Any], dict[str, Any], list[str]]:
         async with connected(str(bag), "--model", "demo") as client:

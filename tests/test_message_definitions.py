@@ -267,6 +267,7 @@ def fields_in(kind: Kind) -> Iterator[tuple[str, str, str]]:
                 yield "renamed", part, field
 
 
+@pytest.mark.long
 def test_no_field_makes_a_handler_raise_an_unexpected_error() -> None:
     roles = find_roles([Topic(k.topic, k.type, 1, k.topic, video="film" in k.topic) for k in KINDS], STATED)
     errors = 0

@@ -48,6 +48,7 @@ def estimated(frames: list[Frame]) -> list[F64]:
     return [odometry.estimate(frame.points, frame.stamp) for frame in frames]
 
 
+@pytest.mark.long
 def test_the_estimate_drifts_by_less_than_3_percent(street: list[Frame]) -> None:
     assert drift(street, estimated(street)) < 0.03
 
@@ -187,6 +188,7 @@ def test_the_workbench_places_questions_as_its_run_does(shared: Path) -> None:
         bench.close()
 
 
+@pytest.mark.long
 def test_estimated_motion_shows_that_a_queue_stands(shared: Path) -> None:
     """The robot drives at 2.2 m/s past cars and trucks, most of which stand."""
     model, speeds = shared / "models" / "yolox_nano.onnx", {}

@@ -173,6 +173,7 @@ def test_commands_take_a_recording_for_its_bag(folder: Path, capsys: pytest.Capt
         assert len(drive) == 3
 
 
+@pytest.mark.long
 def test_reduced_recordings_can_be_asked_and_checked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -41,6 +41,7 @@ def run_action(folder: Path, **inputs: str) -> tuple[int, str, dict[str, str]]:
     return done.returncode, summary.read_text(), named
 
 
+@pytest.mark.long
 def test_the_action_holds_bags_to_limits(tmp_path: Path) -> None:
     assert main(["demo", "--frames", "3", "-o", str(tmp_path / "drive.mcap")]) == 0
     status, summary, named = run_action(
