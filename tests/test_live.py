@@ -969,7 +969,7 @@ def test_a_viewer_that_dies_is_started_again(
     monkeypatch.setattr("bevviz.live.outputs.RETRY", 0.01)
     said: list[str] = []
     with packets_of(results, drive.scene, 1) as (encoder, packets):
-        program = Program("screen", ["sh", "-c", "cat > /dev/null"])
+        program = Program("screen", ["sh", "-c", "exec cat > /dev/null"])
         screen = Viewer(program, 20, encoder, Notes(said.append))
         first = screen._process
         first.kill()
