@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from functools import partial
@@ -304,10 +304,12 @@ def _why(arguments: Sequence[str], folder: Path) -> Results:
     """Return the verdict, chain and hints of every object of a frame."""
     tree = _tree("why", [*arguments, "--all"], folder)
     results = {"summary": tree.get("summary", tree.get("text"))}
-    for number, answer in enumerate(tree.get("answers", [])):
-        name = f"{answer['name']} #{number}"
+    known: Counter[str] = Counter()
+    for answer in tree.get("answers", []):
+        known[answer["name"]] += 1
+        name = f"{answer['name']} #{known[answer['name']]}"
         results[name] = f"{answer['reason']}: {answer['verdict']}"
-        results[f"{name} chain"] = _brief(answer["chain"])
+        results[f"{name} chain"] = [f"{step['stage']}: {step['text']}" for step in answer["chain"]]
         results[f"{name} hints"] = [hint.get("set", hint.get("settings")) for hint in answer["hints"]]
     return results
 
