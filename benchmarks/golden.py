@@ -51,7 +51,20 @@ TRACKED = re.compile(r"track|trail|/world/fused|/clusters")  # depends on the cl
 # Keys that depend on the machine, the clock or the place of a file.
 UNSTABLE_KEYS = {
     *("milliseconds", "seconds", "ms", "times", "took", "run", "machine", "memory", "network", "created"),
-    *("file", "files", "path", "bag", "bags", "command", "commands", "version", "versions", "python"),
+    *(
+        "file",
+        "files",
+        "path",
+        "paths",
+        "batch",
+        "bag",
+        "bags",
+        "command",
+        "commands",
+        "version",
+        "versions",
+        "python",
+    ),
 }
 READABLE = 160  # characters of a value that is stored as it is; a longer one is hashed
 # Values that many drives are wrong with: what is explained must be more than the defaults' few misses.
@@ -362,11 +375,9 @@ def _report(arguments: Sequence[str], work: Path) -> Results:
         return {"report": "none"}
     page = path.with_suffix(".html").read_text(encoding="utf-8")
     text = re.sub(r"<(style|script)\b.*?</\1>|<[^>]+>|data:[^\"]+", " ", page, flags=re.DOTALL)
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
     unstable = re.compile(r"bevviz [\d.]|/|\d ms|GB|MB|Python|Linux|sha|[0-9a-f]{12}|cores?\b|checkout")
-    results: Results = {
-        f"line {n}": line for n, line in enumerate(text for text in lines if not unstable.search(text))
-    }
+    sentences = (line.strip() for line in text.splitlines() if len(line.split()) > 3)
+    results: Results = dict(Counter(line for line in sentences if not unstable.search(line)))
     return results | {f"recording {key}": value for key, value in digest(path).items()}
 
 
