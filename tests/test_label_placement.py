@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from rerun.chunk import RrdReader
 
-from bevviz.model.frame import F32
+from bevviz.model.frame import F32, Boxes3D
 from bevviz.recording.labels import MAX_NAMES, choose_named, choose_named_in_3d
+from bevviz.recording.layers import Layer, Style, draw
 from bevviz.recording.states import COLORS, StateLanes
 from bevviz.recording.writer import Writer
 
@@ -62,3 +68,22 @@ def test_a_lane_starts_with_its_first_state() -> None:
     assert to.written == [
         *[("/b", "colours"), ("/b", "ok"), ("/a", "colours"), ("/a", "failed"), ("/a", "")],
     ]
+
+
+def test_a_style_is_logged_once_and_again_after_a_refresh(tmp_path: Path) -> None:
+    """A viewer may lack what was logged before a refresh."""
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "a.rrd")
+    boxes = Layer("/world/fused", Boxes3D.empty(), Style(width=2.0, labels=False))
+    box = Boxes3D(np.ones((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32))
+    with Writer(recording) as to:
+        for index in range(4):
+            to.begin(index, index + 1, 0)
+            if index == 2:
+                to.refresh()
+            draw(to, boxes, replace(boxes, path="/world/missed", items=box))
+            to.end()
+    recording.disconnect()
+    chunks = [c for c in RrdReader(tmp_path / "a.rrd").stream() if c.entity_path.startswith("/world")]
+    assert {chunk.entity_path for chunk in chunks} == {"/world/missed"}, "a layer without items is left out"
+    assert sum(chunk.num_rows for chunk in chunks if chunk.is_static) == 2

@@ -358,7 +358,8 @@ def test_truth_and_results_of_the_robot_are_logged(record: Callable[..., Recordi
     assert found.at["/robot/detection/fused_3d"]["Boxes3D:labels"][0] == ["car 0.70", "bus 0.60"]
     robot = found.at["/robot/detection/camera_2d"]
     assert robot["Boxes2D:centers"][0] == [[6.5, 12.5]]
-    assert robot["CoordinateFrame:frame"][0] == ["tf#/world/zed/image"]
+    frame = found.static["/robot/detection/camera_2d"]["CoordinateFrame:frame"]
+    assert frame == ["tf#/world/zed/image"]
     (outline,) = found.at["/bev/overlay/ground_truth"]["LineStrips2D:strips"][0]
     center = np.mean(outline[:4], axis=0)
     np.testing.assert_allclose(center, [(40 - 1) / 0.1, (40 - 2) / 0.1], atol=0.01)

@@ -32,7 +32,7 @@ from bevviz.model.results import Explanation, FrameResult, Objects, Opinion, Opi
 from bevviz.pipeline.session import Session
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.primitives import image_outlines
+from bevviz.recording.projection import image_outlines
 from bevviz.recording.sinks import open_recording
 from bevviz.stages.detector.names import COCO
 from bevviz.stages.opinions import matching_names, opinions
@@ -462,9 +462,10 @@ def test_the_images_and_the_look_from_above_show_what_is_said(tmp_path: Path) ->
     seen = Counter[str]()
     for view, (opinion, color) in product(views, OPINION_COLORS.items()):
         path = view(opinion)
+        if not (says := found.at[path]["says"].get(index, [])):
+            continue
         [packed] = found.static[path]["LineStrips2D:colors"]
         assert tuple(packed.to_bytes(4, "big")[:3]) == color
-        says = found.at[path]["says"].get(index, [])
         for instance, said in enumerate(says):
             assert f": {opinion} by " in said
             row = told[said]

@@ -209,7 +209,7 @@ def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs:
         logger = FrameLogger(sinks.recording, result.config, scene)
         logger.log_static()
         logger.log(result)
-        log_answers(sinks.recording, result.frame, answers, limit, result.config.bev)
+        log_answers(logger, result.frame, answers, limit, result.config.bev)
         if outputs.save is not None:
             say(f"saved in {outputs.save}")
         outputs.keep_serving(sinks)

@@ -17,9 +17,9 @@ from bevviz.compare.differences import (
 )
 from bevviz.model.frame import F64
 from bevviz.recording import entities
-from bevviz.recording.images import image_frame
-from bevviz.recording.labels import choose_named_in_3d
-from bevviz.recording.primitives import OUTLINE, boxes2d, boxes3d, document, transform
+from bevviz.recording.labels import choose_named_in_3d, shown
+from bevviz.recording.layers import Layer, Style, draw
+from bevviz.recording.primitives import document, transform
 from bevviz.recording.states import StateLanes
 from bevviz.recording.writer import Writer
 from bevviz.support import table
@@ -33,6 +33,7 @@ COLORS = {
     Change.ONLY_A: SIDE_COLORS["only A"],
     Change.ONLY_B: SIDE_COLORS["only B"],
 }
+_OUTCOME_COLORS = {"broken": StateColor.BAD.value, "fixed": StateColor.GOOD.value}
 HEIGHT = 0.57  # height of a view of one side, as a share of a 3D view's height in other layouts
 
 
@@ -54,21 +55,8 @@ class DifferenceLogger(Writer):
         self.static(entities.COMPARE_ABOUT, document(text))
         for change in DIFFERENT:
             self.static(
-                entities.DIFFERENCE.path(change),
-                rr.Boxes3D.from_fields(
-                    colors=[COLORS[change]], radii=rr.Radius.ui_points(2.5), show_labels=True
-                ),
-            )
-            self.static(
                 entities.DIFFERENCE_COUNT.path(change),
                 rr.SeriesLines(colors=[COLORS[change]], names=[change], widths=[2]),
-            )
-        for outcome, state in (("broken", StateColor.BAD), ("fixed", StateColor.GOOD)):
-            self.static(
-                entities.DIFFERENCE.path(outcome),
-                rr.Boxes3D.from_fields(
-                    colors=[state.value], radii=rr.Radius.ui_points(3.5), show_labels=True, fill_mode=OUTLINE
-                ),
             )
         for side, color in (("a", COLORS[Change.ONLY_A]), ("b", COLORS[Change.ONLY_B])):
             for series in ("objects", "clusters"):
@@ -124,8 +112,8 @@ class DifferenceLogger(Writer):
         labels = [
             _label(d) if differences.judged is None and is_named[i] else "" for i, d in enumerate(objects)
         ]
-        boxes = boxes3d(side.boxes, np.array(rows), labels)
-        self.put(path, transform(world_from_points), boxes)
+        style, pose = Style(COLORS[change], 2.5, labels=True), transform(world_from_points)
+        draw(self, Layer(path, side.boxes.chosen(rows), style, labels, frame=pose))
         if change is Change.MOVED:
             start = differences.a.boxes.center[[d.row_a for d in objects]]
             end = differences.b.boxes.center[rows]
@@ -137,13 +125,11 @@ class DifferenceLogger(Writer):
         is_broken = np.arange(len(rows)) < len(judged.broken)
         is_named = choose_named_in_3d(judged.boxes.center[rows], is_broken, HEIGHT)
         for outcome, selected in (("broken", is_broken), ("fixed", ~is_broken)):
-            if selected.any():
-                labels = [
-                    f"{outcome}: {judged.labels[row]}" if named else ""
-                    for row, named in zip(rows[selected].tolist(), is_named[selected], strict=True)
-                ]
-                boxes = boxes3d(judged.boxes, rows[selected], labels)
-                self.put(entities.DIFFERENCE.path(outcome), transform(world_from_points), boxes)
+            names = [f"{outcome}: {judged.labels[row]}" for row in rows[selected].tolist()]
+            labels, boxes = shown(names, is_named[selected]), judged.boxes.chosen(rows[selected])
+            style = Style(_OUTCOME_COLORS[outcome], 3.5, labels=True, wire=True)
+            path, pose = entities.DIFFERENCE.path(outcome), transform(world_from_points)
+            draw(self, Layer(path, boxes, style, labels, frame=pose))
 
     def _log_image(self, camera: str, pairs: tuple[Difference, ...], differences: FrameDifferences) -> None:
         for change in (Change.CLASS, Change.ONLY_A, Change.ONLY_B):
@@ -154,17 +140,11 @@ class DifferenceLogger(Writer):
                 boxes = differences.a.images[camera].xyxy[[d.row_a for d in selected]]
             else:
                 boxes = differences.b.images[camera].xyxy[[d.row_b for d in selected]]
-            self.put(
+            path, style = (
                 entities.IMAGE_DIFFERENCE.path(camera, change),
-                image_frame(camera),
-                boxes2d(
-                    boxes,
-                    [_label(d) for d in selected],
-                    colors=[COLORS[change]],
-                    radii=rr.Radius.ui_points(2.5),
-                    draw_order=40.0,
-                ),
+                Style(COLORS[change], 2.5, order=40.0),
             )
+            draw(self, Layer(path, boxes, style, [_label(d) for d in selected], frame=camera))
 
 
 def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]:

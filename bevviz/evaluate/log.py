@@ -15,9 +15,9 @@ from bevviz.model.protocols import Items, Observer
 from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.labels import log_box_label_style, log_box_labels
-from bevviz.recording.marks import MARK_COLORS, Mark, box_mark, log_mark_style, log_marks
-from bevviz.recording.primitives import boxes3d, document, transform
+from bevviz.recording.layers import Layer, Style, callouts, draw
+from bevviz.recording.marks import MARK_COLORS, Mark, box_mark, log_marks
+from bevviz.recording.primitives import document, transform
 from bevviz.recording.writer import SCALAR_WAIT, Writer
 from bevviz.support.colors import TRUTH_COLORS
 from bevviz.support.text import markdown
@@ -42,12 +42,8 @@ class EvaluationRecorder(Observer[FrameResult]):
     def begin(self, items: Items[object]) -> None:
         """Log the colours and the names of the plots."""
         for outcome, color in TRUTH_COLORS.items():
-            looks = rr.Boxes3D.from_fields(colors=[color], radii=rr.Radius.ui_points(0.5), show_labels=False)
-            self._writer.static(entities.JUDGED.path(outcome), looks)
-            log_box_label_style(self._writer, entities.JUDGED.path(outcome))
             series = rr.SeriesLines(colors=[color], names=[outcome], widths=[2])
             self._writer.static(entities.JUDGED_COUNT.path(outcome), series)
-        log_mark_style(self._writer, items.scene.cameras)
 
     def observe(self, result: FrameResult) -> None:
         """Log the evaluation of a frame."""
@@ -82,17 +78,17 @@ class EvaluationRecorder(Observer[FrameResult]):
             chosen, path = boxes.chosen(rows), entities.JUDGED.path(outcome)
             causes = self._evaluation.causes if outcome == "false" else {}
             labels = [f"{outcome}: {names[row]}{_cause(causes, row)}" for row in rows]
-            logged = boxes3d(boxes, np.asarray(rows), labels)
-            self._writer.put(path, transform(result.frame.pose), logged)
             distances = chosen.distance.tolist()
-            descriptions = [
-                f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)
-            ]
-            colors = [TRUTH_COLORS[outcome]] * len(rows)
-            log_box_labels(self._writer, path, chosen, [""] * len(rows), descriptions, colors)
+            says = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)]
+            color, pose = TRUTH_COLORS[outcome], transform(result.frame.pose)
+            draw(
+                self._writer,
+                Layer(path, chosen, Style(color, 0.5, labels=False), labels, frame=pose),
+                *callouts(path, chosen, says, (), [color] * len(rows)),
+            )
             for state in MARK_COLORS:
                 if state == outcome:
-                    texts = zip(rows, labels, descriptions, strict=True)
+                    texts = zip(rows, labels, says, strict=True)
                     marks += [box_mark(state, boxes, *text) for text in texts]
         log_marks(self._writer, result, marks)
 

@@ -11,10 +11,10 @@ from bevviz.evaluate.ground_truth import truth_of
 from bevviz.evaluate.matching import AcceptedNames, judge
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, LabelledBoxes3D
-from bevviz.model.protocols import Items, Observer
+from bevviz.model.protocols import Observer
 from bevviz.model.results import Decision, FrameResult
 from bevviz.recording.images import unexplained_detections
-from bevviz.recording.marks import Mark, MarkState, box_mark, log_mark_style, log_marks
+from bevviz.recording.marks import Mark, MarkState, box_mark, log_marks
 from bevviz.recording.primitives import scored, texts_by_row
 from bevviz.recording.writer import Writer
 
@@ -33,10 +33,6 @@ class MarkRecorder(Observer[FrameResult]):
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._writer = Writer(recording)
         self._names = AcceptedNames()
-
-    def begin(self, items: Items[object]) -> None:
-        """Log the style of the marks."""
-        log_mark_style(self._writer, items.scene.cameras)
 
     def observe(self, result: FrameResult) -> None:
         """Log the marks of a frame."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,32 +12,17 @@ import rerun as rr
 from bevviz import anomalies
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
+from bevviz.model.frame import F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
 from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks
 from bevviz.recording import entities
 from bevviz.recording.entities import TRACK_COLORS, ClassId
-from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
-from bevviz.recording.labels import choose_named_in_3d, log_box_label_style, log_box_labels
+from bevviz.recording.labels import choose_named_in_3d, shown
+from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.opinions import outline_colors
-from bevviz.recording.primitives import (
-    OUTLINE,
-    boxes2d,
-    boxes3d,
-    class_annotations,
-    scored,
-    strips,
-    texts_by_row,
-    transform,
-)
+from bevviz.recording.primitives import scored, texts_by_row, transform
+from bevviz.recording.projection import bev_outlines, bev_pixels, ground_outlines
 from bevviz.recording.writer import Writer
-from bevviz.support.colors import CONTEXT, SERIES_COLORS, Color, class_color
-
-
-def log_object_style(to: Writer) -> None:
-    """Log the static style of fused boxes, their labels and their measured boxes."""
-    to.static(entities.FUSED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False))
-    log_box_label_style(to, entities.FUSED)
-    to.static(entities.MEASURED, rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=False))
+from bevviz.support.colors import CONTEXT, SERIES_COLORS, class_color
 
 
 def log_objects(to: Writer, result: FrameResult) -> None:
@@ -67,42 +53,45 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         values["opinion"] = [Opinion(value).word for value in opinions.opinion.tolist()]
         is_unusual |= opinions.opinion == Opinion.CONTRADICTED
     colors = [class_color(name) for name in objects.names]
-    to.put(
-        entities.FUSED,
-        transform(result.frame.pose),
-        boxes3d(objects.boxes, np.arange(len(objects)), labels, colors=colors),
-        rr.AnyValues(
-            class_name=list(objects.names),
-            score=objects.score,
-            track=ids,
-            speed=speeds,
-            cluster=objects.cluster,
-            camera=list(objects.camera),
-            seen=_sides(objects),
-            reason=reasons,
-            **values,
-        ),
-    )
-    distances = objects.boxes.distance
     is_named = choose_named_in_3d(objects.boxes.center, is_unusual) & is_unusual
-    log_box_labels(
+    draw(
         to,
-        entities.FUSED,
-        objects.boxes,
-        [label if named else "" for label, named in zip(_with_doubts(labels, result), is_named, strict=True)],
-        [
-            f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
-            for label, metres, reason in zip(labels, distances, reasons, strict=True)
-        ],
-        outline_colors(result, colors),
+        Layer(
+            entities.FUSED,
+            objects.boxes,
+            Style(width=0.5, labels=False),
+            labels=labels,
+            colors=colors,
+            values={
+                "class_name": list(objects.names),
+                "score": objects.score,
+                "track": ids,
+                "speed": speeds,
+                "cluster": objects.cluster,
+                "camera": list(objects.camera),
+                "seen": _sides(objects),
+                "reason": reasons,
+                **values,
+            },
+            frame=transform(result.frame.pose),
+        ),
+        *callouts(
+            entities.FUSED,
+            objects.boxes,
+            [
+                f"{label}, {metres:.1f} m away: {reason.partition(': ')[2] or 'an object'}"
+                for label, metres, reason in zip(labels, objects.boxes.distance, reasons, strict=True)
+            ],
+            shown(_with_doubts(labels, result), is_named),
+            outline_colors(result, colors),
+        ),
     )
     if objects.measured is not None:
         rows = np.flatnonzero((objects.measured.size != objects.boxes.size).any(axis=1))
-        if len(rows):
-            measured = boxes3d(
-                objects.measured, rows, [labels[row] for row in rows], colors=[colors[row] for row in rows]
-            )
-            to.put(entities.MEASURED, measured)  # The entity above has the pose.
+        measured, looks = objects.measured.chosen(rows), [colors[row] for row in rows]
+        # The entity above has the pose.
+        style, texts = Style(width=1.0, labels=False), [labels[row] for row in rows]
+        draw(to, Layer(entities.MEASURED, measured, style, labels=texts, colors=looks))
 
 
 def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
@@ -132,53 +121,43 @@ def _sides(objects: Objects) -> list[str]:
 TRACK_LANES = 12  # tracks with a lane for state and speed; the viewer never frees an entity
 
 
-def log_track_style(to: Writer) -> None:
-    """Log the static style of tracks and trails, in 3D and over the bird's-eye image."""
-    style = rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(0.75), show_labels=False, fill_mode=OUTLINE)
-    for path in (entities.TRACKS, entities.UNSEEN):
-        to.static(path, style)
-    to.static(entities.TRAILS, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)))
-    to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(TRACK_LANES)]))
-    for name, radius in (("tracks", 1.0), ("trails", 1.5)):
-        to.static(
-            entities.OVERLAY.path(name),
-            class_annotations(),
-            rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(radius), draw_order=20.0),
-        )
-
-
 def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> None:
     """Log tracks in the fixed frame and over the bird's-eye image."""
     rows = confirmed_rows(tracks)
-    named = tracks.object[rows] >= 0
-    for path, chosen, text in (
-        (entities.TRACKS, rows[named], track_label),
-        (entities.UNSEEN, rows[~named], _unseen_label),
-    ):
-        if len(chosen):
-            labels = [text(tracks, row) for row in chosen.tolist()]
-            to.put(path, boxes3d(tracks.boxes, chosen, labels, class_ids=track_class_ids(tracks.id[chosen])))
     if len(rows) == 0:
         return
-    colors, points_from_world = track_class_ids(tracks.id[rows]), geometry.inverse(frame.pose)
-    trail, lengths = _trails(tracks, rows)
-    to.put(entities.TRAILS, rr.LineStrips3D(strips(trail, lengths), class_ids=colors))
-    pixels = bev_pixels(config, points_from_world, trail)
-    to.put(entities.OVERLAY.path("trails"), rr.LineStrips2D(strips(pixels, lengths), class_ids=colors))
-    outlines = ground_outlines(geometry.corners(tracks.boxes)[rows])
-    to.put(
-        entities.OVERLAY.path("tracks"),
-        rr.LineStrips2D(
-            bev_pixels(config, points_from_world, outlines),
-            class_ids=colors,
+    named, colors = tracks.object[rows] >= 0, track_class_ids(tracks.id[rows])
+    for path, is_drawn, text in (
+        (entities.TRACKS, named, track_label),
+        (entities.UNSEEN, ~named, _unseen_label),
+    ):
+        boxes = tracks.boxes.chosen(rows[is_drawn])
+        labels = [text(tracks, row) for row in rows[is_drawn].tolist()]
+        style = Style(width=0.75, labels=False, wire=True)
+        draw(to, Layer(path, boxes, style, labels=labels, class_ids=colors[is_drawn]))
+    points_from_world = geometry.inverse(frame.pose)
+    trails = [positions[np.isfinite(positions[:, 0])] for positions in tracks.trail[rows]]
+    above = [bev_pixels(config, points_from_world, trail) for trail in trails]
+    rims = ground_outlines(geometry.corners(tracks.boxes)[rows])
+    draw(
+        to,
+        Layer(entities.TRAILS, trails, Style(width=1.5), class_ids=colors),
+        Layer(entities.OVERLAY.path("trails"), above, Style(width=1.5, order=20.0), class_ids=colors),
+        Layer(
+            entities.OVERLAY.path("tracks"),
+            bev_pixels(config, points_from_world, rims),
+            # The bird's-eye image has the names of objects.
+            Style(width=1.0, labels=False, order=20.0),
             labels=[track_label(tracks, row) for row in rows.tolist()],
-            show_labels=False,  # the bird's-eye image has the names of objects
+            class_ids=colors,
         ),
     )
 
 
 def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
     """Log the speed of each lane's track. ``rows`` is lane -> row of its track."""
+    if to.is_first(entities.TRACK_SPEEDS):
+        to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(TRACK_LANES)]))
     speeds = np.full(TRACK_LANES, np.nan)
     speeds[list(rows)] = tracks.speed[list(rows.values())]
     to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))
@@ -251,52 +230,24 @@ def track_rows_of_objects(tracks: Tracks | None, count: int) -> list[int | None]
     return rows
 
 
-def _trails(tracks: Tracks, rows: I64) -> tuple[F32, I64]:
-    """Return the trails, oldest position first.
-
-    Returns:
-        (N, 3) points, one track after the other, and the number of points of each track.
-    """
-    positions = tracks.trail[rows]
-    known = np.isfinite(positions[:, :, 0])
-    return positions[known], known.sum(axis=1)
-
-
 # --- ground truth, and boxes of the robot ------------------------------------------------------
 
-Put = Callable[..., None]  # ``Writer.put`` or ``Writer.write``
-
-_TRUTH_COLOR, _ROBOT_COLOR = CONTEXT, SERIES_COLORS[4]
-
-
-def log_truth_style(to: Writer) -> None:
-    """Log the static style of the ground truth."""
-    to.static(
-        entities.TRUTH,
-        rr.Boxes3D.from_fields(
-            colors=[_TRUTH_COLOR], radii=rr.Radius.ui_points(0.5), show_labels=False, fill_mode=OUTLINE
-        ),
-    )
+_TRUTH = Style(CONTEXT, 0.5, labels=False, wire=True)
+_ROBOT = Style(SERIES_COLORS[4])
 
 
 def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Log the ground truth boxes in 3D and over the bird's-eye image."""
-    if frame.truth is not None and len(frame.truth.boxes):
-        _log_labelled_boxes(to.put, entities.TRUTH, frame.truth, None)
+    if frame.truth is not None:
         path = entities.OVERLAY.path("ground_truth")
-        _log_bev_outlines(to.put, path, frame.pose, frame.truth, config, _TRUTH_COLOR)
+        draw(to, *_labelled_layers(frame.truth, entities.TRUTH, path, frame.pose, config, _TRUTH))
 
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Log the robot's boxes and detections under the names of their topics."""
-    for labelled in frame.robot_boxes:
-        if len(labelled.boxes):
-            _log_labelled_boxes(to.put, entities.ROBOT.path(labelled.topic), labelled, _ROBOT_COLOR)
-            path = entities.ROBOT_OVERLAY.path(labelled.topic)
-            _log_bev_outlines(to.put, path, frame.pose, labelled, config, _ROBOT_COLOR)
-    for detections in frame.robot_detections:
-        if len(detections.xyxy):
-            _log_image_boxes(to.put, detections)
+    results: list[LabelledBoxes3D | LabelledBoxes2D] = [*frame.robot_boxes, *frame.robot_detections]
+    for boxes in results:
+        draw(to, *_robot_layers(boxes, frame.pose, config))
 
 
 def log_late(to: Writer, late: LateBoxes, config: BevConfig) -> None:
@@ -304,15 +255,12 @@ def log_late(to: Writer, late: LateBoxes, config: BevConfig) -> None:
 
     It stays visible until the next result or ``clear_late``.
     """
-    boxes = late.boxes
-    to.set_time(late.index, boxes.stamp, boxes.received)
-    if isinstance(boxes, LabelledBoxes2D):
-        _log_image_boxes(to.write, boxes)
-        return
-    _log_labelled_boxes(to.write, entities.ROBOT.path(boxes.topic), boxes, _ROBOT_COLOR)
-    path = entities.ROBOT_OVERLAY.path(boxes.topic)
-    if not _log_bev_outlines(to.write, path, late.pose, boxes, config, _ROBOT_COLOR):
-        to.write(path, rr.Clear(recursive=False))
+    to.set_time(late.index, late.boxes.stamp, late.boxes.received)
+    layers = _robot_layers(late.boxes, late.pose, config)
+    for layer in layers:
+        if not len(layer.items):
+            to.write(layer.path, rr.Clear(recursive=False))
+    draw(to, *layers, put=to.write)
 
 
 def clear_late(to: Writer, topic: str) -> None:
@@ -321,55 +269,27 @@ def clear_late(to: Writer, topic: str) -> None:
         to.write(path, rr.Clear(recursive=False))
 
 
-def _log_labelled_boxes(put: Put, path: str, labelled: LabelledBoxes3D, color: Color | None) -> None:
-    put(
-        path,
-        transform(_pose(labelled)),
-        boxes3d(
-            labelled.boxes,
-            np.arange(len(labelled.boxes)),
-            scored(labelled.labels, labelled.scores),
-            colors=None if color is None else [color],
-        ),
-    )
+def _robot_layers(boxes: LabelledBoxes3D | LabelledBoxes2D, pose: F64, config: BevConfig) -> list[Layer]:
+    """Return the layers of a topic's boxes: in space and from above, or over the image."""
+    path = entities.ROBOT.path(boxes.topic)
+    if isinstance(boxes, LabelledBoxes3D):
+        overlay = entities.ROBOT_OVERLAY.path(boxes.topic)
+        return _labelled_layers(boxes, path, overlay, pose, config, _ROBOT)
+    labels, style = scored(boxes.labels, boxes.scores), replace(_ROBOT, order=25.0)
+    return [Layer(path, boxes.xyxy, style, labels=labels, frame=boxes.camera or None)]
 
 
-def _log_image_boxes(put: Put, detections: LabelledBoxes2D) -> None:
-    """Log detections under /robot. They have the coordinate frame of the image, so that it can show them."""
-    put(
-        entities.ROBOT.path(detections.topic),
-        *([image_frame(detections.camera)] if detections.camera else []),
-        boxes2d(
-            detections.xyxy,
-            scored(detections.labels, detections.scores),
-            colors=[_ROBOT_COLOR],
-            draw_order=25.0,
-        ),
-    )
-
-
-def _log_bev_outlines(
-    put: Put, path: str, pose: F64, labelled: LabelledBoxes3D, config: BevConfig, color: Color
-) -> bool:
-    """Log outlines of the boxes with their centre in the bird's-eye view. Return whether there are any."""
-    points_from_boxes = geometry.inverse(pose) @ _pose(labelled)
-    reach = np.array([config.range_x, config.range_y], np.float32)
-    inside = (np.abs(geometry.apply(points_from_boxes, labelled.boxes.center)[:, :2]) < reach).all(axis=1)
-    if not inside.any():
-        return False
-    outlines = ground_outlines(geometry.corners(labelled.boxes)[inside])
-    put(
-        path,
-        rr.LineStrips2D(
-            bev_pixels(config, points_from_boxes, outlines),
-            colors=[color],
-            radii=rr.Radius.ui_points(0.75),
-            labels=[labelled.labels[row] for row in np.flatnonzero(inside)],
-            show_labels=False,
-            draw_order=10.0,
-        ),
-    )
-    return True
+def _labelled_layers(
+    labelled: LabelledBoxes3D, path: str, overlay: str, pose: F64, config: BevConfig, style: Style
+) -> list[Layer]:
+    """Return the layers of boxes in space, and of the outlines of those in the bird's-eye view."""
+    labels, world_from_boxes = scored(labelled.labels, labelled.scores), _pose(labelled)
+    rows, outlines = bev_outlines(config, labelled.boxes, geometry.inverse(pose) @ world_from_boxes)
+    above = Style(style.color, 0.75, labels=False, order=10.0)
+    return [
+        Layer(path, labelled.boxes, style, labels=labels, frame=transform(world_from_boxes)),
+        Layer(overlay, outlines, above, labels=[labelled.labels[row] for row in rows]),
+    ]
 
 
 def _pose(labelled: LabelledBoxes3D) -> F64:

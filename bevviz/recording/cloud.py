@@ -19,7 +19,8 @@ from bevviz.model.results import Clusters, ClusterState, FrameResult, Tracks
 from bevviz.recording import entities, retention
 from bevviz.recording.boxes import track_class_ids, track_ids_of_clusters
 from bevviz.recording.entities import ClassId
-from bevviz.recording.primitives import OUTLINE, boxes3d, point_classes, rounded, transform
+from bevviz.recording.layers import Layer, Style, draw
+from bevviz.recording.primitives import point_classes, rounded, transform
 from bevviz.recording.retention import RawCloud
 from bevviz.recording.writer import Writer
 from bevviz.stages.voxel import spread_to_points
@@ -28,12 +29,10 @@ from bevviz.support.numba_kernel import kernel
 
 
 def log_cloud_style(to: Writer, lidars: Iterable[str]) -> None:
-    """Log the static style of the points of each LiDAR."""
+    """Log the static style of the raw points of each LiDAR."""
     for lidar in lidars:
         radii = rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.0))
         to.static(entities.POINTS.path(lidar), radii, quantity_annotations())
-        for path in (entities.GROUND.path(lidar), entities.OBSTACLES.path(lidar)):
-            to.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
 
 
 def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -> None:
@@ -100,8 +99,7 @@ def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
 
 
 def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
-    if len(points):
-        to.put(path, rr.Points3D(points, class_ids=class_id))
+    draw(to, Layer(path, points, Style(width=1.5), class_ids=class_id))
 
 
 def round_voxels(points: F32, voxel_size: float) -> F32:
@@ -316,17 +314,6 @@ def _brightest(values: NDArray[Any]) -> float:
 # --- clusters ----------------------------------------------------------------------------------
 
 
-def log_cluster_style(to: Writer, lidars: Iterable[str]) -> None:
-    """Log the static style of the clusters of each LiDAR."""
-    for lidar in lidars:
-        to.static(
-            entities.CLUSTERS.path(lidar),
-            rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False),
-            rr.Boxes3D.from_fields(radii=rr.Radius.ui_points(1.0), fill_mode=OUTLINE, show_labels=False),
-        )
-        to.static(entities.SET_ASIDE.path(lidar), rr.Boxes3D.from_fields(show_labels=False))
-
-
 def log_clusters(
     to: Writer,
     frame: Frame,
@@ -357,22 +344,25 @@ def log_clusters(
             rows = retention.sorted_rows(points, packed, labels)
             points, labels = round_points(points.take(rows, axis=0), packed), labels.take(rows)
         point_ids, box_ids = _cluster_colors(clusters, tracked, labels, kept)
-        to.put(
-            entities.CLUSTERS.path(frame.lidar),
-            rr.Points3D(points, class_ids=point_ids),
-            boxes3d(boxes, kept, [f"{row}" for row in kept], class_ids=box_ids),
+        path, style = entities.CLUSTERS.path(frame.lidar), Style(width=2.0, labels=False)
+        outline, numbers = Style(width=1.0, labels=False, wire=True), [f"{row}" for row in kept]
+        draw(
+            to,
+            Layer(path, points, style, class_ids=point_ids),
+            Layer(path, boxes.chosen(kept), outline, numbers, class_ids=box_ids),
         )
-    if len(others):
-        states = [ClusterState(state) for state in clusters.state[others].tolist()]
-        to.put(
+    states = [ClusterState(state) for state in clusters.state[others].tolist()]
+    counts = zip(others, clusters.count[others], strict=True)
+    draw(
+        to,
+        Layer(
             entities.SET_ASIDE.path(frame.lidar),
-            boxes3d(
-                boxes,
-                others,
-                [f"{row}: {count} points" for row, count in zip(others, clusters.count[others], strict=True)],
-                class_ids=[entities.CLUSTER_CLASS[state] for state in states],
-            ),
-        )
+            boxes.chosen(others),
+            Style(labels=False),
+            [f"{row}: {count} points" for row, count in counts],
+            class_ids=[entities.CLUSTER_CLASS[state] for state in states],
+        ),
+    )
 
 
 def unclustered(obstacles: F32, clusters: Clusters) -> F32:

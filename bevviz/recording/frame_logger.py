@@ -19,20 +19,16 @@ from bevviz.recording.boxes import (
     TrackLanes,
     clear_late,
     log_late,
-    log_object_style,
     log_objects,
     log_robot,
     log_speeds,
-    log_track_style,
     log_tracks,
     log_truth,
-    log_truth_style,
 )
 from bevviz.recording.cloud import (
     log_cloud,
     log_cloud_poses,
     log_cloud_style,
-    log_cluster_style,
     log_clusters,
     log_ground,
     log_obstacles,
@@ -42,12 +38,11 @@ from bevviz.recording.cloud import (
     unclustered,
 )
 from bevviz.recording.decisions import log_decisions
-from bevviz.recording.health import FrameRates, log_anomalies, log_anomaly_style, log_health, log_health_style
+from bevviz.recording.health import FrameRates, log_anomalies, log_health
 from bevviz.recording.images import (
     VideoEncoders,
     log_bev,
     log_camera,
-    log_camera_style,
     log_detections,
     log_frustums,
     log_grid,
@@ -56,7 +51,6 @@ from bevviz.recording.images import (
 )
 from bevviz.recording.opinions import (
     log_fusion,
-    log_opinion_style,
     log_opinions_in_bev,
     log_opinions_in_images,
 )
@@ -184,15 +178,6 @@ class FrameLogger(Writer):
         log_run_settings(self, self._config, self._scene, self._network)
         log_world(self)
         log_cloud_style(self, lidars)
-        log_cluster_style(self, lidars)
-        log_camera_style(self, self._scene.cameras)
-        log_object_style(self)
-        if self._has_opinions:
-            log_opinion_style(self, self._scene.cameras)
-        log_track_style(self)
-        log_truth_style(self)
-        log_anomaly_style(self)
-        log_health_style(self)
 
     def log_context(self, context: RecordingContext) -> None:
         """Log static data, calibration and states for a recording that starts with a frame."""
@@ -207,21 +192,13 @@ class FrameLogger(Writer):
 
     def reconfigure(self, config: Config, scene: Scene) -> None:
         """Change the configuration and the sensors for the frames that follow."""
-        had_opinions = self._has_opinions
         same, self._config, self._scene = scene == self._scene, config, scene
         self._config_changed = True
         self.streams_video = config.logging.video == "stream"
         if same:  # the viewer loses class colours that are logged twice
             log_run_settings(self, config, scene, self._network)
-            if self._has_opinions and not had_opinions:
-                log_opinion_style(self, scene.cameras)
         else:
             self.log_static()
-
-    @property
-    def _has_opinions(self) -> bool:
-        """Whether a method other than our fusion makes the objects. Cameras then have opinions on them."""
-        return self._config.objects.method != "frustum"
 
     # --- each frame ----------------------------------------------------------------------------
 

@@ -9,12 +9,12 @@ import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import KINDS
-from bevviz.model.counts import count_results
+from bevviz.model.counts import OPINIONS, count_results
 from bevviz.model.frame import Frame
 from bevviz.model.results import Anomaly, FrameResult
 from bevviz.recording import entities
 from bevviz.recording.writer import Writer
-from bevviz.support.colors import SERIES_COLORS
+from bevviz.support.colors import SERIES_COLORS, Color
 
 # Curves of one plot, in the order of their colours. The viewer's automatic colours may repeat.
 STAGES = (
@@ -23,6 +23,11 @@ STAGES = (
 )
 COUNTS = ("detections", "clusters", "matches", "problems", "failures")
 
+_COLORS: Mapping[str, Color] = {  # by the entity of the curve
+    path: color
+    for entity, names in ((entities.STAGE_TIME, STAGES), (entities.COUNT, (*COUNTS, *OPINIONS)))
+    for path, color in zip(map(entity.path, names), SERIES_COLORS, strict=False)
+}
 RATE_WINDOW = 1_000_000_000  # nanoseconds that a rate is counted over
 MIN_RATE_SPAN = 250_000_000  # nanoseconds, minimum time span for a rate
 
@@ -52,13 +57,6 @@ class FrameRates:
                 yield clock, (len(times) - 1) * 1e9 / (times[-1] - times[0])
 
 
-def log_health_style(to: Writer) -> None:
-    """Log the static colours of the stage time and count curves."""
-    for paths in (map(entities.STAGE_TIME.path, STAGES), map(entities.COUNT.path, COUNTS)):
-        for path, color in zip(paths, SERIES_COLORS, strict=False):
-            to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
-
-
 def log_health(
     to: Writer, result: FrameResult, last: Frame | None, rates: FrameRates, extra_scalars: Mapping[str, float]
 ) -> None:
@@ -73,6 +71,8 @@ def log_health(
     """
     for path, value in (*health(result, last, rates), *extra_scalars.items()):
         if np.isfinite(value):
+            if (color := _COLORS.get(path)) is not None and to.is_first(path):
+                to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
             to.scalar(path, float(value))
 
 
@@ -103,11 +103,6 @@ def health(result: FrameResult, last: Frame | None, rates: FrameRates) -> Iterat
 # --- anomalies ---------------------------------------------------------------------------------
 
 
-def log_anomaly_style(to: Writer) -> None:
-    """Log the static names of the anomaly count curves."""
-    to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
-
-
 def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -> None:
     """Log new anomalies as lines, and the number of anomalies of each kind.
 
@@ -120,5 +115,7 @@ def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -
         entities.ANOMALY_LOG,
         [(new_anomaly.severity, f"{new_anomaly.kind}: {new_anomaly.text}") for new_anomaly in started],
     )
+    if to.is_first(entities.ANOMALY_COUNTS):
+        to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
     count = Counter(anomaly.kind for anomaly in result.anomalies)
     to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

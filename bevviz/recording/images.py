@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import rerun as rr
 
-from bevviz.config import BevConfig, Config
+from bevviz.config import Config
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import (
@@ -24,13 +24,12 @@ from bevviz.model.results import (
     Masks,
 )
 from bevviz.recording import entities, retention
-from bevviz.recording.labels import IN_IMAGE, choose_named, log_image_box_label_style, log_image_box_labels
+from bevviz.recording.labels import NameRoom, shown, under
+from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.primitives import (
     CORNER,
     blob,
-    boxes2d,
     depth_annotations,
-    edges,
     encode_image,
     jpeg,
     png,
@@ -38,54 +37,15 @@ from bevviz.recording.primitives import (
     texts_by_row,
     transform,
 )
+from bevviz.recording.projection import edges
 from bevviz.recording.writer import Writer
-from bevviz.support.colors import FAINT, UNNAMED, StateColor, class_color, color_rows
+from bevviz.support.colors import FAINT, UNNAMED, Color, StateColor, class_color, color_rows
 
 if TYPE_CHECKING:
     from bevviz.recording.video import VideoEncoder
 
 
 _SAME_BOX = 0.5  # IoU from which a detection is the double of another
-
-
-def log_camera_style(to: Writer, cameras: Iterable[str]) -> None:
-    """Log the static style of detections, labels and projected points of each camera."""
-    for camera in cameras:
-        to.static(
-            entities.PROJECTED.path(camera),
-            depth_annotations(),
-            rr.Points2D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=False, draw_order=10.0),
-        )
-        to.static(
-            entities.DETECTIONS.path(camera), rr.Boxes2D.from_fields(draw_order=30.0, show_labels=False)
-        )
-        log_image_box_label_style(to, entities.DETECTIONS.path(camera), 31.0)
-        if to.root:
-            _log_over_shared_image(to, camera)
-        to.static(
-            entities.WEAK.path(camera),
-            rr.Boxes2D.from_fields(
-                colors=[FAINT], radii=rr.Radius.ui_points(0.5), show_labels=False, draw_order=20.0
-            ),
-        )
-
-
-def _log_over_shared_image(to: Writer, camera: str) -> None:
-    """Draw the results of a run under a root over the main run's image. There is only one image."""
-    boxes = entities.DETECTIONS.path(camera)
-    paths = (
-        entities.PROJECTED.path(camera),
-        boxes,
-        entities.OUTLINES.path(boxes),
-        entities.NAMES.path(boxes),
-    )
-    for path in (*paths, entities.WEAK.path(camera)):
-        to.static(path, image_frame(camera))
-
-
-def image_frame(camera: str) -> rr.CoordinateFrame:
-    """Return the coordinate frame of the camera's image. An entity with it is drawn over the image."""
-    return rr.CoordinateFrame(entities.space(entities.IMAGE.path(camera)))
 
 
 def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
@@ -207,47 +167,41 @@ def log_detections(
     if detections is None:
         return
     kept, others = np.flatnonzero(detections.kept), np.flatnonzero(~detections.kept)
-    if len(others):
-        to.put(entities.WEAK.path(name), _detection_boxes(detections, others))
-    if len(kept):
-        colors = [class_color(detections.names[row]) for row in kept]
-        to.put(entities.DETECTIONS.path(name), _detection_boxes(detections, kept, colors=colors))
-        texts = texts_by_row(explanations, "detection", name)
-        if detections.masks is not None:
-            _log_masks(to, name, detections, detections.masks, kept)
-        xyxy = detections.xyxy[kept]
-        labels = scored((detections.names[row] for row in kept), detections.score[kept])
-        doubtful = np.isin(kept, unexplained_detections(result)) & (not has_truth)
-        # The box of a double lies over that of the best, so both have one colour.
-        doubtful_outlines = np.isin(kept, unexplained_detections(result, doubles=True)) & (not has_truth)
-        outline_colors = [
-            StateColor.DOUBTFUL.value if is_doubtful else color
-            for is_doubtful, color in zip(doubtful_outlines, colors, strict=True)
-        ]
-        size = _size(result.camera)
-        label_positions = np.stack([xyxy[:, ::2].mean(axis=1), xyxy[:, 3]], axis=1) / size[0]
-        # The tallest boxes come first, as they are usually the nearest.
-        has_name = choose_named(label_positions, xyxy[:, 1] - xyxy[:, 3], IN_IMAGE, doubtful) & doubtful
-        log_image_box_labels(
-            to,
-            entities.DETECTIONS.path(name),
-            xyxy,
-            [label if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
-            [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)],
-            outline_colors,
-        )
+    weak = Style(FAINT, 0.5, labels=False, order=20.0)
+    draw(to, _detection_layer(entities.WEAK.path(name), name, detections, others, weak))
+    if not len(kept):
+        return
+    path, colors = entities.DETECTIONS.path(name), [class_color(detections.names[row]) for row in kept]
+    boxes = _detection_layer(path, name, detections, kept, Style(labels=False, order=30.0), colors)
+    texts = texts_by_row(explanations, "detection", name)
+    labels = scored((detections.names[row] for row in kept), detections.score[kept])
+    doubtful = np.isin(kept, unexplained_detections(result)) & (not has_truth)
+    # The box of a double lies over that of the best, so both have one colour.
+    doubtful_outlines = np.isin(kept, unexplained_detections(result, doubles=True)) & (not has_truth)
+    outline_colors = [
+        StateColor.DOUBTFUL.value if is_doubtful else color
+        for is_doubtful, color in zip(doubtful_outlines, colors, strict=True)
+    ]
+    xyxy = detections.xyxy[kept]
+    # The tallest boxes come first, as they are usually the nearest.
+    room, heights = NameRoom.in_image(_width(result.camera)), xyxy[:, 3] - xyxy[:, 1]
+    has_name = room.choose(under(xyxy), labels, -heights, doubtful) & doubtful
+    says = [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)]
+    outlines = Style(width=1.5, order=31.0)
+    names = shown(labels, has_name)
+    draw(to, boxes, *callouts(path, xyxy, says, names, outline_colors, outlines, frame=name))
+    if detections.masks is not None:
+        _log_masks(to, name, detections, detections.masks, kept)
 
 
-def _size(camera: Camera) -> F32:
-    """Return (2,) width and height of the image in pixels.
+def _width(camera: Camera) -> float:
+    """Return the width of the image in pixels.
 
-    Return infinity if the size is unknown: then all names overlap, and only one is written.
+    Return infinity if it is unknown: then all names overlap, and only one is written.
     """
     if camera.intrinsics is not None:
-        return np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
-    if camera.image is not None:
-        return np.array(camera.image.bgr.shape[1::-1], np.float32)
-    return np.full(2, np.inf, np.float32)
+        return camera.intrinsics.width
+    return np.inf if camera.image is None else camera.image.bgr.shape[1]
 
 
 def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
@@ -264,17 +218,21 @@ def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows
             closed = np.concatenate([outline[:, 0], outline[:1, 0]])
             lines.append((closed + corner) / masks.grid[:2])
             colors.append(class_color(detections.names[row]))
-    if lines:
-        to.put(entities.MASKS.path(name), rr.LineStrips2D(lines, colors=colors))
+    draw(to, Layer(entities.MASKS.path(name), lines, colors=colors, frame=name))
 
 
-def _detection_boxes(detections: Detections, rows: I64, **style: Any) -> rr.Boxes2D:
-    return boxes2d(
-        detections.xyxy[rows],
-        scored((detections.names[row] for row in rows), detections.score[rows]),
-        class_ids=[entities.DETECTION_CLASS[DetectionState(state)] for state in detections.state[rows]],
-        **style,
-    )
+def _detection_layer(
+    path: str,
+    camera: str,
+    detections: Detections,
+    rows: I64,
+    style: Style,
+    colors: Sequence[Color] | None = None,
+) -> Layer:
+    labels = scored((detections.names[row] for row in rows), detections.score[rows])
+    class_ids = [entities.DETECTION_CLASS[DetectionState(state)] for state in detections.state[rows]]
+    boxes = detections.xyxy[rows]
+    return Layer(path, boxes, style, labels, colors=colors, class_ids=class_ids, frame=camera)
 
 
 def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
@@ -297,7 +255,11 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
                 np.rint(uv[rows] * retention.PIXEL_STEPS) / np.float32(retention.PIXEL_STEPS),
                 depth[rows],
             )
-        to.put(entities.PROJECTED.path(result.camera.name), rr.Points2D(uv, class_ids=depth))
+        name = result.camera.name
+        path, style = entities.PROJECTED.path(name), Style(width=1.5, labels=False, order=10.0)
+        if to.is_first(path):
+            to.static(path, depth_annotations())
+        draw(to, Layer(path, uv, style, class_ids=depth, frame=name))
 
 
 # --- frustums ----------------------------------------------------------------------------------
@@ -335,16 +297,8 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
         ]
         labels += scored(names, detections.score[rows])
     if strips:
-        to.put(
-            entities.FRUSTUMS,
-            rr.LineStrips3D(
-                np.concatenate(strips),
-                colors=colors,
-                labels=labels,
-                radii=rr.Radius.ui_points(1.0),
-                show_labels=False,
-            ),
-        )
+        style = Style(width=1.0, labels=False)
+        draw(to, Layer(entities.FRUSTUMS, np.concatenate(strips), style, labels, colors=colors))
 
 
 # --- bird's-eye view ---------------------------------------------------------------------------
@@ -401,16 +355,3 @@ def _grid_style(rows: int, columns: int, resolution: float) -> rr.GridMap:
         opacity=0.2,
         colormap=rr.components.Colormap.RvizMap,
     )
-
-
-def bev_pixels(config: BevConfig, points_from_frame: F64, positions: F32) -> F32:
-    """Project (..., 3) positions to (..., 2) pixels of the bird's-eye image."""
-    reach = np.array([config.range_x, config.range_y], np.float32)
-    xy = geometry.apply(points_from_frame, positions.reshape(-1, 3))[:, :2]
-    pixels = ((reach - xy) / np.float32(config.resolution))[:, ::-1]
-    return np.asarray(pixels, np.float32).reshape(*positions.shape[:-1], 2)
-
-
-def ground_outlines(corners: F32) -> F32:
-    """Return (K, 5, 3) closed outlines on the ground for (K, 8, 3) box corners."""
-    return corners[:, [0, 1, 2, 3, 0]]

@@ -1,23 +1,15 @@
-"""Log outlines and names over boxes, so that the viewer's tooltip shows one sentence.
-
-The tooltip shows the values of a component only if at most three components differ from row to row. Otherwise
-it shows their number. A box has five such components. So bevviz logs outlines and names over the boxes. Each
-has a shape, a colour or a name, and a sentence. Their rows equal the rows of the boxes.
-"""
+"""Placement of names in the views: few, and none over another."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-import rerun as rr
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, Bool, Boxes3D
-from bevviz.recording import entities
-from bevviz.recording.primitives import CORNER, edges, strips
-from bevviz.recording.writer import Writer
-from bevviz.support.colors import Color
+from bevviz.model.frame import F32, F64, Bool
 
 MAX_NAMES = 6  # boxes with a name; names of all boxes would cover the scene
 EYE, LOOK_TARGET = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position and look target in 3D
@@ -26,87 +18,43 @@ EYE, LOOK_TARGET = (-16.0, 5.0, 11.0), (10.0, 0.0, -1.0)  # default eye position
 IN_SPACE, FROM_ABOVE, IN_IMAGE = (0.24, 0.045), (20.0, 3.5), (0.21, 0.05)
 LETTER_WIDTH = 0.014  # width of a letter in an image, as a fraction of the image width; for longer names
 
-_INVISIBLE, _COLOR = rr.Radius.ui_points(0.0), (235, 238, 245)
 
+@dataclass(frozen=True, slots=True)
+class NameRoom:
+    """Room that a name takes in an image or in the bird's-eye view, in pixels.
 
-def log_box_label_style(to: Writer, path: str) -> None:
-    """Log the static style of outlines and names of 3D boxes."""
-    to.static(entities.OUTLINES.path(path), rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(2.5)))
-    to.static(
-        entities.NAMES.path(path),
-        rr.Points3D.from_fields(radii=_INVISIBLE, colors=[_COLOR], show_labels=True),
-    )
-
-
-def log_image_box_label_style(to: Writer, path: str, draw_order: float) -> None:
-    """Log the static style of outlines and names of boxes in an image."""
-    lines = rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(1.5), draw_order=draw_order)
-    to.static(entities.OUTLINES.path(path), lines)
-    log_name_style(to, path, draw_order + 1)
-
-
-def log_name_style(to: Writer, path: str, draw_order: float) -> None:
-    """Log the static style of names in an image."""
-    points = rr.Points2D.from_fields(
-        radii=_INVISIBLE, colors=[_COLOR], show_labels=True, draw_order=draw_order
-    )
-    to.static(entities.NAMES.path(path), points)
-
-
-def log_box_labels(
-    to: Writer,
-    path: str,
-    boxes: Boxes3D,
-    names: Sequence[str],
-    sentences: Sequence[str],
-    colors: Sequence[Color],
-) -> None:
-    """Log outlines and names over the (K,) boxes at ``path``, in the frame of the boxes.
-
-    Args:
-        to: writer of the recording.
-        path: entity of the boxes.
-        boxes: boxes, in the order of their rows.
-        names: text next to each box; empty: no text.
-        sentences: tooltip of each box.
-        colors: colour of each outline.
+    Attributes:
+        width, height: size of a name.
+        letter: width of a letter of a longer name.
     """
-    rows, tooltips = _logged_rows(len(boxes)), rr.AnyValues(says=_repeat_single(sentences))
-    lines = edges(geometry.corners(boxes))[rows]
-    to.put(
-        entities.OUTLINES.path(path), rr.LineStrips3D(lines, colors=[colors[row] for row in rows]), tooltips
-    )
-    if any(names):
-        tops = boxes.center + boxes.size * np.array([0, 0, 0.5], np.float32)
-        to.put(entities.NAMES.path(path), rr.Points3D(tops[rows], labels=_repeat_single(names)), tooltips)
+
+    width: float
+    height: float
+    letter: float = 0.0
+
+    @classmethod
+    def in_image(cls, width: float) -> Self:
+        """Return the room in an image of this width."""
+        return cls(IN_IMAGE[0] * width, IN_IMAGE[1] * width, LETTER_WIDTH * width)
+
+    @classmethod
+    def from_above(cls, resolution: float) -> Self:
+        """Return the room in the bird's-eye view, whose pixels have this size in metres."""
+        return cls(FROM_ABOVE[0] / resolution, FROM_ABOVE[1] / resolution)
+
+    def over(self, bounds: F32) -> F32:
+        """Return (K, 2) places of names above items with these (K, 4) bounds."""
+        return np.stack([bounds[:, ::2].mean(axis=1), np.maximum(bounds[:, 1] - self.height, 0)], axis=1)
+
+    def choose(self, places: F32, names: Sequence[str], order: F32 | F64, first: Bool | None = None) -> Bool:
+        """Choose names that do not overlap, see ``choose_named``. Return a (K,) mask."""
+        widths = np.maximum(self.width, self.letter * np.array([len(name) for name in names], np.float64))
+        return choose_named(places, order, (widths, self.height), first)
 
 
-def log_image_box_labels(
-    to: Writer, path: str, xyxy: F32, names: Sequence[str], sentences: Sequence[str], colors: Sequence[Color]
-) -> None:
-    """Log outlines and names over boxes in an image. ``xyxy``: (K, 4) pixels in bevviz's convention."""
-    rows, tooltips = _logged_rows(len(xyxy)), rr.AnyValues(says=_repeat_single(sentences))
-    corners = (xyxy + CORNER)[rows][:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
-    to.put(
-        entities.OUTLINES.path(path), rr.LineStrips2D(corners, colors=[colors[row] for row in rows]), tooltips
-    )
-    if any(names):
-        to.put(
-            entities.NAMES.path(path),
-            rr.Points2D((corners[:, 2] + corners[:, 3]) / 2, labels=_repeat_single(names)),
-            tooltips,
-        )
-
-
-def log_labelled_outlines(
-    to: Writer, path: str, strokes: Sequence[F32], names: Sequence[str], sentences: Sequence[str], places: F32
-) -> None:
-    """Log (K,) outlines of (M, 2) pixels with a sentence each, and names at (K, 2) ``places``."""
-    rows, tooltips = _logged_rows(len(strokes)), rr.AnyValues(says=_repeat_single(sentences))
-    lines = [strokes[row] for row in rows]
-    to.put(path, rr.LineStrips2D(strips(np.concatenate(lines), np.array([*map(len, lines)]))), tooltips)
-    if any(names):
-        to.put(entities.NAMES.path(path), rr.Points2D(places[rows], labels=_repeat_single(names)), tooltips)
+def under(bounds: F32) -> F32:
+    """Return (K, 2) places of names below items with these (K, 4) bounds."""
+    return np.stack([bounds[:, ::2].mean(axis=1), bounds[:, 3]], axis=1)
 
 
 def box_row(instance: int, count: int) -> int:
@@ -135,7 +83,7 @@ def choose_named_in_3d(places: F32 | F64, first: Bool | None = None, height: flo
 
 
 def choose_named(
-    at: geometry.FloatArray, order: F32, room: tuple[float | F64, float], first: Bool | None = None
+    at: geometry.FloatArray, order: F32 | F64, room: tuple[float | F64, float], first: Bool | None = None
 ) -> Bool:
     """Choose the first ``MAX_NAMES`` names that do not overlap. Return a (K,) mask.
 
@@ -168,13 +116,6 @@ def _distances(places: F32 | F64) -> F32:
     return distances
 
 
-def _logged_rows(count: int) -> list[int]:
-    """Return the rows to log. A single row is repeated.
-
-    The viewer takes a component with one row for a value of all rows, and shows only its number.
-    """
-    return list(range(count)) if count > 1 else [0, 0]
-
-
-def _repeat_single(texts: Sequence[str]) -> list[str]:
-    return [*texts] if len(texts) > 1 else [*texts, *texts]
+def shown(names: Sequence[str], is_shown: Bool) -> list[str]:
+    """Return the names, with empty texts for those that are not shown."""
+    return [name if show else "" for name, show in zip(names, is_shown.tolist(), strict=True)]

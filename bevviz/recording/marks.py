@@ -6,21 +6,21 @@ unexplained ones are dotted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 import rerun as rr
 
-from bevviz.config import BevConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Boxes3D, Camera
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.images import bev_pixels
-from bevviz.recording.labels import IN_IMAGE, LETTER_WIDTH, choose_named, choose_named_in_3d, log_name_style
-from bevviz.recording.primitives import CORNER, image_outlines, transform
+from bevviz.recording.labels import NameRoom, choose_named_in_3d, shown
+from bevviz.recording.layers import Layer, Style, draw, name_layers, rectangles
+from bevviz.recording.primitives import CORNER, transform
+from bevviz.recording.projection import bev_pixels, bounds_of, image_outlines
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import Color, StateColor
 
@@ -33,12 +33,18 @@ MARK_COLORS: Mapping[MarkState, Color] = {
     "unexplained": StateColor.DOUBTFUL.value,
 }
 _DASHES: Mapping[MarkState, int] = {"missed": 4, "false": 1, "unexplained": 8}  # dashes of each line
+_FLAT = Style(width=1.75, order=36.0)  # look over an image and the bird's-eye image
 _GAP = 0.45  # share of a dash that is its gap
 # Lines between the corners of a box: all edges, the cross on its top, the rim seen from above.
 _BOX: Lines = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 _CROSS: Lines = ((4, 6), (5, 7))
 _FLAT_CROSS: Lines = ((0, 2), (1, 3))
 _SIDES: Lines = _BOX[:4]
+_RIMS: Mapping[MarkState, Lines] = {
+    "missed": _SIDES,
+    "false": (*_SIDES, *_FLAT_CROSS),
+    "unexplained": _SIDES,
+}
 _WEDGE: Lines = ((0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 6), (6, 7), (7, 4))  # of a frustum
 
 
@@ -73,64 +79,32 @@ def box_mark(state: MarkState, boxes: Boxes3D, row: int, name: str, sentence: st
     return Mark(state, name, sentence, geometry.corners(box)[0], box)
 
 
-def log_mark_style(to: Writer, cameras: Iterable[str]) -> None:
-    """Log the static style of marks in all views."""
-    names = rr.Points3D.from_fields(
-        radii=rr.Radius.ui_points(0.0), colors=[StateColor.SUBJECT.value], show_labels=True
-    )
-    for state, color in MARK_COLORS.items():
-        path = entities.MARKED.path(state)
-        to.static(path, rr.LineStrips3D.from_fields(colors=[color], radii=rr.Radius.ui_points(2.0)))
-        to.static(entities.NAMES.path(path), names)
-        for flat in (
-            entities.OVERLAY.path(state),
-            *(entities.IMAGE_MARK.path(name, state) for name in cameras),
-        ):
-            radius = rr.Radius.ui_points(1.75)
-            lines = rr.LineStrips2D.from_fields(colors=[color], radii=radius, draw_order=36.0)
-            to.static(flat, lines)
-            log_name_style(to, flat, 37.0)
-
-
 def log_marks(to: Writer, result: FrameResult, marks: Sequence[Mark]) -> None:
     """Log the marks of a frame in space, in the images and over the bird's-eye image."""
     if not marks:
         return
-    pose = transform(result.frame.pose)
-    order = np.array([not mark.name for mark in marks])  # names first
-    has_name = choose_named_in_3d(np.stack([mark.center for mark in marks]), ~order)
+    config, pose = result.config.bev, transform(result.frame.pose)
+    centers = np.stack([mark.center for mark in marks])
+    has_name = choose_named_in_3d(centers, np.array([bool(mark.name) for mark in marks]))
+    reach = np.array([config.range_x, config.range_y], np.float32)
+    above = np.asarray((np.abs(centers[:, :2]) < reach).all(axis=1), np.bool_)
+    pixels = bev_pixels(config, np.eye(4), np.stack([mark.corners for mark in marks]))
     for state in MARK_COLORS:
         rows = [row for row, mark in enumerate(marks) if mark.state == state]
-        if not rows:
-            continue
-        path, chosen = entities.MARKED.path(state), [marks[row] for row in rows]
-        lines = [_styled(state, mark.corners[np.array(_edges(mark))]) for mark in chosen]
-        to.put(path, pose, rr.LineStrips3D(np.concatenate(lines)), _tooltips(chosen, lines))
-        named = [marks[row] for row in rows if has_name[row] and marks[row].name]
-        if named:
-            places = np.stack([mark.center for mark in named]) + np.array([0, 0, 0.3], np.float32)
-            words = rr.Points3D(places, labels=[mark.name for mark in named])
-            to.put(
-                entities.NAMES.path(path), pose, words, rr.AnyValues(says=[mark.sentence for mark in named])
-            )
-        _log_above(to, state, chosen, result.config.bev)
+        chosen = [marks[row] for row in rows]
+        lines = [mark.corners[np.array(_edges(mark))] for mark in chosen]
+        names = shown([mark.name for mark in chosen], has_name[rows])
+        places = centers[rows] + np.array([0, 0, 0.3], np.float32)
+        _draw(to, entities.MARKED.path(state), state, chosen, lines, names, places, Style(width=2.0), pose)
+        rows = [row for row in rows if above[row]]
+        chosen = [marks[row] for row in rows]
+        lines = [
+            pixels[row][np.array(_WEDGE if mark.box is None else _RIMS[state])]
+            for row, mark in zip(rows, chosen, strict=True)
+        ]
+        _draw(to, entities.OVERLAY.path(state), state, chosen, lines)
     for camera in result.cameras:
         _log_in_image(to, camera.camera, [mark for mark in marks if mark.box is not None])
-
-
-def _log_above(to: Writer, state: MarkState, marks: Sequence[Mark], config: BevConfig) -> None:
-    """Log the marks over the bird's-eye image, if their centre is in it."""
-    reach = np.array([config.range_x, config.range_y], np.float32)
-    inside = [mark for mark in marks if (np.abs(mark.center[:2]) < reach).all()]
-    if inside:
-        corners = np.stack([mark.corners for mark in inside])
-        pixels = bev_pixels(config, np.eye(4), corners)
-        rim = (*_SIDES, *_FLAT_CROSS) if state == "false" else _SIDES
-        lines = [
-            _styled(state, row[np.array(rim if mark.box is not None else _WEDGE)])
-            for mark, row in zip(inside, pixels, strict=True)
-        ]
-        to.put(entities.OVERLAY.path(state), rr.LineStrips2D(np.concatenate(lines)), _tooltips(inside, lines))
 
 
 def _log_in_image(to: Writer, camera: Camera, marks: Sequence[Mark]) -> None:
@@ -138,37 +112,45 @@ def _log_in_image(to: Writer, camera: Camera, marks: Sequence[Mark]) -> None:
     if camera.intrinsics is None or not marks:
         return
     boxes = Boxes3D.joined([mark.box for mark in marks if mark.box is not None])
-    outlines = image_outlines(boxes, camera)
-    drawn = [(mark, stroke) for mark, stroke in zip(marks, outlines, strict=True) if len(stroke)]
-    if not drawn:
-        return
-    width, (across, up) = camera.intrinsics.width, IN_IMAGE
+    strokes = image_outlines(boxes, camera)
+    visible = [row for row, stroke in enumerate(strokes) if len(stroke)]
+    marks, bounds = [marks[row] for row in visible], bounds_of([strokes[row] for row in visible])
+    room = NameRoom.in_image(camera.intrinsics.width)
     # Names stand above the objects, because detections have theirs below.
-    tops = [(stroke[:, 0].mean(), max(stroke[:, 1].min() - up * width, 0)) for _, stroke in drawn]
-    places = np.array(tops, np.float32)
-    letters = np.array([len(mark.name) for mark, _ in drawn], np.float64)
-    distances = np.array([np.hypot(*mark.center[:2]) for mark, _ in drawn], np.float32)
-    room = (np.maximum(across, LETTER_WIDTH * letters), up)
-    has_name = choose_named(places / width, distances, room, letters > 0)
+    names, places = [mark.name for mark in marks], room.over(bounds)
+    is_named = np.array([bool(name) for name in names], np.bool_)
+    names = shown(names, room.choose(places, names, boxes.distance[visible], is_named))
+    # All edges of a box would be one blot where the object is small.
+    corners = rectangles(bounds + CORNER)
     for state in MARK_COLORS:
-        rows = [row for row, (mark, _) in enumerate(drawn) if mark.state == state]
-        if not rows:
-            continue
-        lines = []
-        for row in rows:
-            # All edges of a box would be one blot where the object is small.
-            stroke = drawn[row][1] + np.float32(CORNER)
-            (x0, y0), (x1, y1) = stroke.min(axis=0), stroke.max(axis=0)
-            corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], np.float32)
-            rim = (*_SIDES, *_FLAT_CROSS) if state == "false" else _SIDES
-            lines.append(_styled(state, corners[np.array(rim)]))
-        path, chosen = entities.IMAGE_MARK.path(camera.name, state), [drawn[row][0] for row in rows]
-        to.put(path, rr.LineStrips2D(np.concatenate(lines)), _tooltips(chosen, lines))
-        named = [row for row in rows if has_name[row] and drawn[row][0].name]
-        if named:
-            words = rr.Points2D(places[named], labels=[drawn[row][0].name for row in named])
-            sentences = rr.AnyValues(says=[drawn[row][0].sentence for row in named])
-            to.put(entities.NAMES.path(path), words, sentences)
+        rows = [row for row, mark in enumerate(marks) if mark.state == state]
+        lines = [corners[row][np.array(_RIMS[state])] for row in rows]
+        path, chosen = entities.IMAGE_MARK.path(camera.name, state), [marks[row] for row in rows]
+        _draw(to, path, state, chosen, lines, [names[row] for row in rows], places[rows])
+
+
+def _draw(
+    to: Writer,
+    path: str,
+    state: MarkState,
+    marks: Sequence[Mark],
+    lines: Sequence[F32],
+    names: Sequence[str] = (),
+    places: F32 | None = None,
+    style: Style = _FLAT,
+    frame: rr.AsComponents | None = None,
+) -> None:
+    """Draw marks with the dashes of their state, and the names that are not empty."""
+    if not marks:
+        return
+    dashes = [_styled(state, mark_lines) for mark_lines in lines]
+    says = [mark.sentence for mark, strokes in zip(marks, dashes, strict=True) for _ in strokes]
+    style = replace(style, color=MARK_COLORS[state])
+    draw(to, Layer(path, np.concatenate(dashes), style, says=says, frame=frame))
+    named = [row for row, name in enumerate(names) if name]
+    if places is not None and named:
+        texts, sentences = [names[row] for row in named], [marks[row].sentence for row in named]
+        draw(to, *name_layers(path, places[named], texts, sentences, style.order, frame=frame))
 
 
 def _edges(mark: Mark) -> Lines:
@@ -187,9 +169,3 @@ def _styled(state: MarkState, lines: F32) -> F32:
     first, last = lines[:, None, None, 0], lines[:, None, None, 1]
     dashes = first + shares * (last - first)
     return np.asarray(dashes.reshape(-1, 2, lines.shape[-1]), np.float32)
-
-
-def _tooltips(marks: Sequence[Mark], lines: Sequence[F32]) -> rr.AnyValues:
-    """Return a sentence for each line of the marks."""
-    sentences = [mark.sentence for mark, dashes in zip(marks, lines, strict=True) for _ in dashes]
-    return rr.AnyValues(says=sentences)

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import rerun as rr
 
-from bevviz.model import geometry
-from bevviz.model.counts import OPINIONS as COUNTED
-from bevviz.model.frame import F32, F64, I64, Boxes3D, Camera
+from bevviz.model.frame import F32, I64, Boxes3D, Camera
 from bevviz.model.results import FrameResult, Objects, Opinion
 from bevviz.recording import entities
-from bevviz.recording.health import COUNTS
-from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
-from bevviz.recording.labels import (
-    FROM_ABOVE,
-    IN_IMAGE,
-    LETTER_WIDTH,
-    choose_named,
-    choose_named_in_3d,
-    log_box_labels,
-    log_labelled_outlines,
-    log_name_style,
-)
-from bevviz.recording.primitives import (
-    CORNER,
-    OUTLINE,
-    boxes3d,
-    image_outlines,
-    scored,
-    texts_by_row,
-    transform,
-)
+from bevviz.recording.labels import NameRoom, choose_named_in_3d, shown, under
+from bevviz.recording.layers import Layer, Style, callouts, draw, name_layers
+from bevviz.recording.primitives import CORNER, scored, texts_by_row, transform
+from bevviz.recording.projection import bev_outlines, bounds_of, image_outlines
 from bevviz.recording.writer import Writer
-from bevviz.support.colors import OPINION_COLORS, SERIES_COLORS, Color, StateColor, class_color
+from bevviz.support.colors import OPINION_COLORS, Color, StateColor, class_color
 
 SHARED_OBJECT_BRIGHTNESS = 0.65  # factor on the class colour of objects that both methods have
 MISSED = "missed"
@@ -44,29 +24,6 @@ NAMED_OPINIONS = ("contradicted", "named otherwise", MISSED)  # opinions whose o
 _DOUBT_COLORS = {
     opinion: OPINION_COLORS[opinion.word] for opinion in (Opinion.CONTRADICTED, Opinion.NAMED_OTHERWISE)
 }
-
-
-def log_opinion_style(to: Writer, cameras: Iterable[str]) -> None:
-    """Log the static style of opinions. Lines are thinner than those of the objects."""
-    thin = rr.Radius.ui_points(0.5)
-    to.static(entities.FUSION, rr.Boxes3D.from_fields(radii=thin, show_labels=False, fill_mode=OUTLINE))
-    lines = rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.0))
-    to.static(entities.OUTLINES.path(entities.FUSION), lines)
-    points = rr.Points3D.from_fields(
-        radii=rr.Radius.ui_points(0.0), colors=[StateColor.DOUBTFUL.value], show_labels=True
-    )
-    to.static(entities.NAMES.path(entities.FUSION), points)
-    for camera in cameras:
-        for opinion in OPINION_COLORS:
-            path = entities.IMAGE_OPINION.path(camera, opinion)
-            _log_outline_style(to, path, opinion)
-            if to.root:
-                for entity in (path, entities.NAMES.path(path)):
-                    to.static(entity, image_frame(camera))
-    for opinion in OPINION_COLORS:
-        _log_outline_style(to, entities.OVERLAY_OPINION.path(opinion), opinion)
-    for name, color in zip(COUNTED, SERIES_COLORS[len(COUNTS) :], strict=False):
-        to.static(entities.COUNT.path(name), rr.SeriesLines(colors=[color], widths=[1.5]))
 
 
 def log_fusion(to: Writer, result: FrameResult) -> None:
@@ -81,27 +38,34 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
         class_color(name) if is_missed else _dim(class_color(name))
         for name, is_missed in zip(fused.names, missed.tolist(), strict=True)
     ]
-    to.put(
-        entities.FUSION,
-        transform(result.frame.pose),
-        boxes3d(fused.boxes, np.arange(len(fused)), labels, colors=colors),
-        rr.AnyValues(
-            class_name=list(fused.names),
-            score=fused.score,
-            cluster=fused.cluster,
-            camera=list(fused.camera),
-            missed=missed,
-            reason=[reasons.get(row, "") for row in range(len(fused))],
-        ),
-    )
     has_name = choose_named_in_3d(fused.boxes.center, missed) & missed
-    log_box_labels(
+    draw(
         to,
-        entities.FUSION,
-        fused.boxes,
-        [f"{label}, missed" if is_named else "" for label, is_named in zip(labels, has_name, strict=True)],
-        [reasons.get(row, label) for row, label in enumerate(labels)],
-        colors,
+        Layer(
+            entities.FUSION,
+            fused.boxes,
+            Style(width=0.5, labels=False, wire=True),
+            labels=labels,
+            colors=colors,
+            values={
+                "class_name": list(fused.names),
+                "score": fused.score,
+                "cluster": fused.cluster,
+                "camera": list(fused.camera),
+                "missed": missed,
+                "reason": [reasons.get(row, "") for row in range(len(fused))],
+            },
+            frame=transform(result.frame.pose),
+        ),
+        *callouts(
+            entities.FUSION,
+            fused.boxes,
+            [reasons.get(row, label) for row, label in enumerate(labels)],
+            shown([f"{label}, missed" for label in labels], has_name),
+            colors,
+            Style(width=1.0),
+            name_color=StateColor.DOUBTFUL.value,
+        ),
     )
 
 
@@ -137,17 +101,12 @@ def opinion_outlines_in_bev(result: FrameResult) -> Mapping[str, OpinionOutlines
 
     Only objects with their centre in the view count.
     """
-    config = result.config.bev
-    reach = np.array([config.range_x, config.range_y], np.float32)
     outlines_by_entity = {}
-    for opinion, boxes, all_rows in _by_opinion(result):
-        rows = all_rows[(np.abs(boxes.center[all_rows, :2]) < reach).all(axis=1)]
-        if len(rows):
-            outlines = ground_outlines(geometry.corners(boxes.chosen(rows)))
-            strokes = [*bev_pixels(config, np.eye(4), outlines)]
-            outlines_by_entity[entities.OVERLAY_OPINION.path(opinion)] = OpinionOutlines(
-                opinion, rows.tolist(), strokes
-            )
+    for opinion, boxes, rows in _by_opinion(result):
+        inside, strokes = bev_outlines(result.config.bev, boxes.chosen(rows))
+        if len(inside):
+            outlines = OpinionOutlines(opinion, rows[inside].tolist(), [*strokes])
+            outlines_by_entity[entities.OVERLAY_OPINION.path(opinion)] = outlines
     return outlines_by_entity
 
 
@@ -155,17 +114,16 @@ def log_opinions_in_images(to: Writer, result: FrameResult) -> None:
     """Log object outlines over each image, in the colour of the cameras' opinion."""
     for camera_result in result.cameras if result.opinions is not None else ():
         camera = camera_result.camera
-        if (outlines := opinion_outlines_in_image(result, camera)) and camera.intrinsics is not None:
-            width = camera.intrinsics.width
-            layout = _NameLayout(np.array(IN_IMAGE) * width, LETTER_WIDTH * width, CORNER, over=True)
-            _log_outlines(to, result, outlines, layout)
+        if camera.intrinsics is not None:
+            outlines = opinion_outlines_in_image(result, camera)
+            _log_outlines(to, result, outlines, NameRoom.in_image(camera.intrinsics.width), camera.name)
 
 
 def log_opinions_in_bev(to: Writer, result: FrameResult) -> None:
     """Log object outlines over the bird's-eye image, which has the names of the method's objects already."""
     if result.opinions is not None:
-        room = np.array(FROM_ABOVE) / result.config.bev.resolution
-        _log_outlines(to, result, opinion_outlines_in_bev(result), _NameLayout(room, 0.0, 0.0, over=False))
+        room = NameRoom.from_above(result.config.bev.resolution)
+        _log_outlines(to, result, opinion_outlines_in_bev(result), room, None)
 
 
 def _by_opinion(result: FrameResult) -> Iterator[tuple[str, Boxes3D, I64]]:
@@ -187,68 +145,53 @@ def _visible_outlines(opinion: str, rows: I64, strokes: Sequence[F32]) -> Opinio
     return OpinionOutlines(opinion, [row for row, _ in shown], [stroke for _, stroke in shown])
 
 
-@dataclass(frozen=True, slots=True)
-class _NameLayout:
-    """Layout of names in a view.
-
-    Attributes:
-        room: (2,) width and height of a name in pixels.
-        letter: width of a letter of a longer name, in pixels.
-        corner: Rerun's offset of a pixel.
-        over: write names above the outlines, as detections have theirs below; False: below the outlines.
-    """
-
-    room: F64
-    letter: float
-    corner: float
-    over: bool
-
-    def place(self, stroke: F32) -> tuple[float, float]:
-        """Return the centre of the name's upper edge in pixels."""
-        (left, top), (right, bottom) = stroke.min(axis=0).tolist(), stroke.max(axis=0).tolist()
-        return (left + right) / 2, max(top - float(self.room[1]), 0.0) if self.over else bottom
-
-
 def _log_outlines(
-    to: Writer, result: FrameResult, outlines_by_entity: Mapping[str, OpinionOutlines], layout: _NameLayout
+    to: Writer,
+    result: FrameResult,
+    outlines_by_entity: Mapping[str, OpinionOutlines],
+    room: NameRoom,
+    camera: str | None,
 ) -> None:
     """Log outlines, and names of doubtful objects as long as names do not overlap.
 
     Missed objects come last, because their detection has a name already. Among the others the nearest comes
-    first.
+    first. Names in an image are above the outlines, because detections have theirs below.
     """
+
+    def places(outlines: OpinionOutlines) -> F32:
+        bounds = bounds_of(outlines.strokes)
+        return under(bounds) if camera is None else room.over(bounds)
+
     doubtful = [outlines for outlines in outlines_by_entity.values() if outlines.opinion in NAMED_OPINIONS]
-    places = np.array(
-        [layout.place(stroke) for outlines in doubtful for stroke in outlines.strokes], np.float32
-    )
-    centers = [
-        _indexed_objects(result, outlines.opinion).boxes.center[outlines.rows, :2] for outlines in doubtful
-    ]
-    distances = np.hypot(*np.concatenate([np.zeros((0, 2), np.float32), *centers]).T)
-    is_contradicted = np.array(
-        [outlines.opinion != MISSED for outlines in doubtful for _ in outlines.rows], bool
-    )
-    letters = [len(name) for outlines in doubtful for name in _outline_names(result, outlines)]
-    across = np.maximum(layout.room[0], layout.letter * np.array(letters, np.float64))
-    named = iter(
-        choose_named(
-            places.reshape(-1, 2), distances, (across, float(layout.room[1])), is_contradicted
-        ).tolist()
-    )
-    for path, outlines in outlines_by_entity.items():
-        subject = "fused" if outlines.opinion == MISSED else "object"
-        sentences = texts_by_row(result.explanations, subject)
-        names = _outline_names(result, outlines)
-        has_name = (
-            [next(named) for _ in names] if outlines.opinion in NAMED_OPINIONS else [False] * len(names)
+    named = iter(())
+    if doubtful:
+        boxes = [
+            _indexed_objects(result, outlines.opinion).boxes.chosen(outlines.rows) for outlines in doubtful
+        ]
+        is_first = [outlines.opinion != MISSED for outlines in doubtful for _ in outlines.rows]
+        named = iter(
+            room.choose(
+                np.concatenate([places(outlines) for outlines in doubtful]),
+                [name for outlines in doubtful for name in _outline_names(result, outlines)],
+                Boxes3D.joined(boxes).distance,
+                np.array(is_first, np.bool_),
+            ).tolist()
         )
-        log_labelled_outlines(
+    for path, outlines in outlines_by_entity.items():
+        names, opinion = _outline_names(result, outlines), outlines.opinion
+        sentences = texts_by_row(result.explanations, "fused" if opinion == MISSED else "object")
+        says = [sentences.get(row, name) for row, name in zip(outlines.rows, names, strict=True)]
+        is_doubtful = opinion in NAMED_OPINIONS
+        width, order = (2.0, 34.0) if is_doubtful else (0.75, 33.0)
+        style = Style(OPINION_COLORS[opinion], width, order=order)
+        strokes = outlines.strokes
+        if camera is not None:
+            strokes = [stroke + np.float32(CORNER) for stroke in strokes]
+        chosen = [name if is_doubtful and next(named) else "" for name in names]
+        draw(
             to,
-            path,
-            [stroke + np.float32(layout.corner) for stroke in outlines.strokes],
-            [name if is_named else "" for name, is_named in zip(names, has_name, strict=True)],
-            [sentences.get(row, name) for row, name in zip(outlines.rows, names, strict=True)],
-            np.array([layout.place(stroke) for stroke in outlines.strokes], np.float32),
+            Layer(path, strokes, style, says=says, frame=camera),
+            *name_layers(path, places(outlines), chosen, says, order, frame=camera),
         )
 
 
@@ -261,17 +204,6 @@ def _indexed_objects(result: FrameResult, opinion: str) -> Objects:
     """Return the ``Objects`` that the rows of this opinion index."""
     assert result.opinions is not None and result.objects is not None
     return result.opinions.fused if opinion == MISSED else result.objects
-
-
-def _log_outline_style(to: Writer, path: str, opinion: str) -> None:
-    is_doubtful = opinion in NAMED_OPINIONS
-    radius, order = (2.0, 34.0) if is_doubtful else (0.75, 33.0)
-    style = rr.LineStrips2D.from_fields(
-        colors=[OPINION_COLORS[opinion]], radii=rr.Radius.ui_points(radius), draw_order=order
-    )
-    to.static(path, style)
-    if is_doubtful:
-        log_name_style(to, path, order + 1)
 
 
 # --- in space ----------------------------------------------------------------------------------

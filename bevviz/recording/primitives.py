@@ -1,4 +1,4 @@
-"""Building blocks of logged data: boxes, outlines, images, documents, colours of class ids."""
+"""Building blocks of logged data: poses, lines, images, documents, colours of class ids."""
 
 from __future__ import annotations
 
@@ -12,19 +12,15 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, U8, Boxes3D, Camera, Image
+from bevviz.model.frame import F32, F64, U8, Image
 from bevviz.model.results import ClusterState, DetectionState, Explanation
 from bevviz.recording import entities
 from bevviz.recording.entities import ClassId
 from bevviz.recording.writer import Writer
-from bevviz.stages.visibility import image_points
 from bevviz.support.colors import CONTEXT, FAINT, GROUND, UNNAMED, turbo
 from bevviz.support.numba_kernel import kernel
 
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
-OUTLINE = rr.components.FillMode.MajorWireframe
-
-_EDGES = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 
 
 def transform(world_from_entity: F64) -> rr.Transform3D:
@@ -33,52 +29,6 @@ def transform(world_from_entity: F64) -> rr.Transform3D:
         translation=world_from_entity[:3, 3],
         quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
     )
-
-
-def boxes3d(boxes: Boxes3D, rows: np.ndarray[Any, Any], labels: list[str], **style: Any) -> rr.Boxes3D:
-    """Convert the boxes in ``rows`` to Rerun boxes."""
-    half_yaw = boxes.yaw[rows] / 2
-    quaternions = np.zeros((len(rows), 4), np.float32)
-    quaternions[:, 2], quaternions[:, 3] = np.sin(half_yaw), np.cos(half_yaw)
-    return rr.Boxes3D(
-        centers=boxes.center[rows], sizes=boxes.size[rows], quaternions=quaternions, labels=labels, **style
-    )
-
-
-def boxes2d(xyxy: F32, labels: list[str], **style: Any) -> rr.Boxes2D:
-    """Convert (N, 4) boxes to Rerun boxes. Pixels are in bevviz's convention."""
-    return rr.Boxes2D(array=xyxy + CORNER, array_format=rr.Box2DFormat.XYXY, labels=labels, **style)
-
-
-def edges(corners: F32) -> F32:
-    """Return one stroke along all edges of each box or frustum: (..., 16, D) for (..., 8, D) corners."""
-    return corners[..., _EDGES, :]
-
-
-def image_outlines(boxes: Boxes3D, camera: Camera) -> list[F32]:
-    """Return the outline of each of (K,) boxes around the robot in an image: one stroke of (M, 2) pixels.
-
-    The stroke follows all edges of a box that is completely in the image. Otherwise it is the contour of the
-    box, cut at the image border. It is empty for a box outside of the image.
-    """
-    empty = np.zeros((0, 2), np.float32)
-    if camera.intrinsics is None or (projected := image_points(boxes, camera)) is None:
-        return [empty] * len(boxes)
-    width, height = camera.intrinsics.width - 0.5, camera.intrinsics.height - 0.5
-    image = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)], np.float32)
-    with np.errstate(invalid="ignore"):
-        inside = (projected >= image[0]) & (projected < image[2])
-    is_whole: list[bool] = inside[:, :8].all(axis=(1, 2)).tolist()
-    outlines = []
-    for points, whole in zip(projected, is_whole, strict=True):
-        if whole:
-            outlines.append(edges(points[:8]))
-            continue
-        area, cut, visible = 0.0, empty, points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
-        if len(visible):
-            area, cut = cv2.intersectConvexConvex(cv2.convexHull(visible), image)
-        outlines.append(np.concatenate([cut[:, 0], cut[:1, 0]]) if area > 0 else empty)
-    return outlines
 
 
 def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
@@ -166,6 +116,7 @@ def rounded(points: F32, scale: float) -> F32:
 def log_world(to: Writer) -> None:
     """Log the axes of the fixed frame, and the names and colours of class ids. Both are static."""
     to.static(entities.WORLD, rr.ViewCoordinates.FLU, class_annotations())
+    to.static(entities.BEV, class_annotations())
 
 
 def class_annotations() -> rr.AnnotationContext:

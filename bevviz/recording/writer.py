@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Hashable, Mapping, Sequence, Set
 
 import numpy as np
 import rerun as rr
@@ -59,6 +59,7 @@ class Writer(Closable):
         self.streams_video = True  # False: each video picture is logged as an image
         self._codecs: dict[str, Codec] = {}  # codec of entities that are video
         self._last_packets: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet and its time
+        self._logged_once: set[tuple[Hashable, ...]] = set()  # keys of ``is_first``
         self._versions: dict[str, int] = {}  # entity -> version in the last ``keep``
 
     def begin(self, index: int, stamp: int, received: int) -> None:
@@ -95,6 +96,7 @@ class Writer(Closable):
         """
         self._previous_entities = self._all_entities | known
         self._versions.clear()
+        self._logged_once.clear()
         self._last_packets.clear()
 
     @property
@@ -120,6 +122,16 @@ class Writer(Closable):
         """Log data that holds at all times."""
         for archetype in archetypes:
             self.recording.log(self.root + path, archetype, static=True)
+
+    def is_first(self, *key: Hashable) -> bool:
+        """Return whether the key is new in this recording, so that its static data must be logged.
+
+        After ``refresh``, all keys are new, because a viewer may lack what was logged before.
+        """
+        if key in self._logged_once:
+            return False
+        self._logged_once.add(key)
+        return True
 
     def put(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Log data of this frame alone. The next frame without data for the entity clears it."""

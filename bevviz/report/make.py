@@ -323,9 +323,9 @@ class _ReportRecorder(Recorder):
         def mark() -> None:
             """Mark the subject in its frame alone."""
             if is_reported:
-                log_answers(self.recording, frame, self._answers, 1, result.config.bev)
+                log_answers(self.logger, frame, self._answers, 1, result.config.bev)
             else:
-                clear_answers(self.recording)
+                clear_answers(self.logger)
 
         self.logger.sequences = {entities.REPORTED: frame.index} if frame.received <= self._at else {}
         self.logger.log(result, notes=[("INFO", line) for line in lines], states=states, log_more=mark)

@@ -9,10 +9,11 @@ import rerun as rr
 
 from bevviz.config import BevConfig
 from bevviz.model import geometry
-from bevviz.model.frame import F32, U8, Camera, Frame
+from bevviz.model.frame import F32, U8, Boxes3D, Camera, Frame
 from bevviz.recording import entities
-from bevviz.recording.images import bev_pixels, ground_outlines, image_frame
-from bevviz.recording.primitives import boxes2d, document, edges, transform
+from bevviz.recording.layers import Layer, Style, draw
+from bevviz.recording.primitives import document, transform
+from bevviz.recording.projection import bev_outlines, bev_pixels, edges
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import FATE_COLORS, StateColor
 from bevviz.why.answer import Answer
@@ -41,42 +42,32 @@ _LINE = 0.65  # metres between the lines of the legend
 _DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 
 
-def clear_answers(recording: rr.RecordingStream) -> None:
-    """Clear all answers from the recording's current time on."""
+def clear_answers(to: Writer) -> None:
+    """Clear all answers from the writer's current time on."""
     for path in (entities.WHY, entities.OVERLAY.path("why")):
-        recording.log(path, rr.Clear(recursive=True))
+        to.write(path, rr.Clear(recursive=True))
 
 
 def log_answers(
-    recording: rr.RecordingStream,
-    frame: Frame,
-    answers: Sequence[Answer],
-    shown: int,
-    above: BevConfig | None = None,
+    to: Writer, frame: Frame, answers: Sequence[Answer], shown: int, above: BevConfig | None = None
 ) -> None:
-    """Log the sentences of all answers, and draw the first ones at the recording's current time.
+    """Log the sentences of all answers, and draw the first ones at the writer's current time.
 
     Args:
-        recording: recording that the frame was just logged to.
+        to: writer to which the frame was just logged.
         frame: the explained frame.
         answers: the answers, worst first.
         shown: number of answers to draw.
         above: configuration of the bird's-eye view, to draw there as well.
     """
-    recording.log(entities.WHY, document(markdown_page(answers, shown)))
-    place_frame = _frame_of_points(frame)
+    to.write(entities.WHY, document(markdown_page(answers, shown)))
     drawn = answers[:shown]
-    if drawn:
-        _log_legend(recording, frame, drawn[0])
     fate = np.zeros(len(frame.points), np.uint8)
     for answer in reversed(drawn):
         fate = np.where(answer.fate > 0, answer.fate, fate).astype(np.uint8)
     known = fate > 0
-    if known.any():
-        colors = np.zeros((len(Fate), 3), np.uint8)
-        colors[list(COLORS)] = list(COLORS.values())
-        points = rr.Points3D(frame.points[known], colors=colors[fate[known]], radii=rr.Radius.ui_points(4.0))
-        _log(recording, "points", place_frame, points)
+    colors = np.zeros((len(Fate), 3), np.uint8)
+    colors[list(COLORS)] = list(COLORS.values())
     strips, widths = list[F32](), list[float]()
     for answer in drawn:
         box = answer.subject.box
@@ -84,26 +75,28 @@ def log_answers(
         lines += [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
         strips += lines
         widths += [2.0 if answer is drawn[0] else 0.5] * len(lines)
-    if strips:
-        place = rr.LineStrips3D(strips, colors=[_SUBJECT], radii=rr.Radius.ui_points(widths))
-        _log(recording, "place", place_frame, place)
-    for camera in frame.cameras:
-        _log_image(recording, camera, drawn)
-    if above is not None:
-        _log_above(recording, frame, drawn, above, fate)
+    points, place = entities.WHY_PART.path("points"), entities.WHY_PART.path("place")
+    layers = [
+        *_legend(frame, drawn),
+        Layer(points, frame.points[known], Style(width=4.0), colors=colors[fate[known]]),
+        Layer(place, strips, Style(_SUBJECT), widths=widths),
+    ]
+    for layer in layers:
+        _log_frame_of_points(to, layer, frame)
+    images = [_image_layer(camera, drawn) for camera in frame.cameras]
+    draw(to, *layers, *images, *_layers_above(frame, drawn, above, fate), put=to.write)
 
 
-def _frame_of_points(frame: Frame) -> rr.AsComponents:
-    """Return the coordinate frame of the points: that of the sensor, or a pose where there is none."""
-    if not frame.lidar:
-        return transform(frame.pose)
-    return rr.CoordinateFrame(entities.space(entities.SENSOR.path(frame.lidar)))
+def _log_frame_of_points(to: Writer, layer: Layer, frame: Frame) -> None:
+    """Log the coordinate frame of a layer in space: that of the sensor, or a pose where there is none.
 
-
-def _log(recording: rr.RecordingStream, name: str, place: rr.AsComponents, data: rr.AsComponents) -> None:
-    """Log data in a coordinate frame. Rerun drops a frame that is logged at the time of a recursive clear."""
-    recording.log(entities.WHY_PART.path(name), place, static=isinstance(place, rr.CoordinateFrame))
-    recording.log(entities.WHY_PART.path(name), data)
+    The frame of the sensor is static, because Rerun drops a frame that is logged at the time of a recursive
+    clear.
+    """
+    if len(layer.items) and not frame.lidar:
+        to.write(layer.path, transform(frame.pose))
+    elif len(layer.items):
+        to.static(layer.path, rr.CoordinateFrame(entities.space(entities.SENSOR.path(frame.lidar))))
 
 
 def focus_point(frame: Frame, answer: Answer) -> F32 | None:
@@ -114,43 +107,37 @@ def focus_point(frame: Frame, answer: Answer) -> F32 | None:
     return np.median(points, axis=0).astype(np.float32) if len(points) else None
 
 
-def _log_legend(recording: rr.RecordingStream, frame: Frame, answer: Answer) -> None:
-    """Log the name of the worst subject and the meaning of its colours above it."""
-    place = focus_point(frame, answer)
+def _legend(frame: Frame, drawn: Sequence[Answer]) -> Iterator[Layer]:
+    """Yield the name of the worst subject and the meaning of its colours above it."""
+    place = focus_point(frame, drawn[0]) if drawn else None
     if place is None:
         return
-    counts = np.bincount(answer.fate, minlength=len(Fate))
+    subject, counts = drawn[0].subject, np.bincount(drawn[0].fate, minlength=len(Fate))
     fates = [fate for fate in COLORS if counts[fate]]
-    lines = [f"{counts[fate]} {NAMES[fate]}" for fate in fates] + [answer.subject.name]
+    lines = [f"{counts[fate]} {NAMES[fate]}" for fate in fates] + [subject.name]
     colors = [COLORS[fate] for fate in fates] + [_SUBJECT]
-    box = answer.subject.box
-    top = place[2] + (0.5 if box is None else box.size[0, 2] / 2)
+    top = place[2] + (0.5 if subject.box is None else subject.box.size[0, 2] / 2)
     places = np.tile(place, (len(lines), 1))
     places[:, 2] = top + _LINE * (1 + np.arange(len(lines)))
-    legend = rr.Points3D(places, labels=lines, colors=colors, radii=rr.Radius.ui_points(0), show_labels=True)
-    _log(recording, "legend", _frame_of_points(frame), legend)
+    path, style = entities.WHY_PART.path("legend"), Style(width=0.0, labels=True)
+    yield Layer(path, places, style, lines, colors=colors)
 
 
-def _log_above(
-    recording: rr.RecordingStream, frame: Frame, answers: Sequence[Answer], config: BevConfig, fate: U8
-) -> None:
-    """Log the outlines of the boxes in the bird's-eye view, or the points if there is no box."""
-    reach = np.array([config.range_x, config.range_y], np.float32)
-    boxes = [answer.subject.box for answer in answers if answer.subject.box is not None]
-    inside = [box for box in boxes if (np.abs(box.center[0, :2]) < reach).all()]
-    points = frame.points[fate > 0]
-    points = points[(np.abs(points[:, :2]) < reach).all(axis=1)]
-    marks: rr.LineStrips2D | rr.Points2D
-    if inside:
-        outlines = np.concatenate([ground_outlines(geometry.corners(box)) for box in inside])
-        strips, radii = bev_pixels(config, np.eye(4), outlines), rr.Radius.ui_points(2.5)
-        marks = rr.LineStrips2D(strips, radii=radii, colors=[_SUBJECT], draw_order=40.0)
-    elif len(points) and not boxes:
-        dots, radii = bev_pixels(config, np.eye(4), points), rr.Radius.ui_points(2.0)
-        marks = rr.Points2D(dots, radii=radii, colors=[_SUBJECT], draw_order=40.0)
-    else:
+def _layers_above(
+    frame: Frame, answers: Sequence[Answer], config: BevConfig | None, fate: U8
+) -> Iterator[Layer]:
+    """Yield the outlines of the boxes in the bird's-eye view, or the points if there is no box."""
+    if config is None:
         return
-    recording.log(entities.OVERLAY.path("why"), marks)
+    path, boxes = entities.OVERLAY.path("why"), [a.subject.box for a in answers if a.subject.box is not None]
+    if boxes:
+        _, outlines = bev_outlines(config, Boxes3D.joined(boxes))
+        yield Layer(path, outlines, Style(_SUBJECT, 2.5, order=40.0))
+    else:
+        dots = bev_pixels(config, np.eye(4), frame.points[fate > 0])
+        reach = 2 * np.array([config.range_y, config.range_x]) / config.resolution
+        inside = ((dots > 0) & (dots < reach)).all(axis=1)
+        yield Layer(path, dots[inside], Style(_SUBJECT, 2.0, order=40.0))
 
 
 def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: BevConfig | None = None) -> None:
@@ -162,11 +149,12 @@ def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: Bev
         answers: the answers; all are drawn.
         above: as for ``log_answers``.
     """
+    to.refresh()  # A viewer may lack what was logged with earlier answers.
     to.set_time(frame.index, frame.stamp, frame.received)
-    clear_answers(to.recording)
-    log_answers(to.recording, frame, answers, len(answers), above)
+    clear_answers(to)
+    log_answers(to, frame, answers, len(answers), above)
     to.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
-    clear_answers(to.recording)
+    clear_answers(to)
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
@@ -182,15 +170,14 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
             yield edges(geometry.apply(points_from_camera, corners))
 
 
-def _log_image(recording: rr.RecordingStream, camera: Camera, answers: Sequence[Answer]) -> None:
-    """Log the image boxes of the subjects over a camera's image."""
-    boxes, names = [], []
+def _image_layer(camera: Camera, answers: Sequence[Answer]) -> Layer:
+    """Return the image boxes of the subjects over a camera's image."""
+    boxes, names = list[F32](), list[str]()
     for number, subject in enumerate(answer.subject for answer in answers):
         image_box = subject.xyxy if subject.camera == camera.name else None
         box = projected_box(subject.box, camera) if subject.box is not None else image_box
         if box is not None:
             boxes.append(box)
             names.append("" if number else subject.name)
-    if boxes:
-        image_boxes = boxes2d(np.array(boxes), names, colors=[_SUBJECT], draw_order=40.0)
-        _log(recording, f"{camera.name}/place", image_frame(camera.name), image_boxes)
+    path, style = entities.WHY_PART.path(f"{camera.name}/place"), Style(_SUBJECT, order=40.0)
+    return Layer(path, np.array(boxes, np.float32).reshape(-1, 4), style, names, frame=camera.name)
