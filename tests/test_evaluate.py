@@ -21,7 +21,7 @@ from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, Sc
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.matching import ObjectScore
 from bevviz.evaluate.tracking_score import ClassTracks
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import Boxes3D, ImageLabels
 from bevviz.model.results import Objects
@@ -70,7 +70,7 @@ def average_precision(kitti_case: dict[str, Any]) -> dict[tuple[str, float, str,
         names = tuple(map(str, case["label_name"][rows]))
         none = frozenset[str]()
         truth = Truth(labels, names, (none,) * len(rows), np.ones(len(rows), bool), image=image)
-        above, volume = geometry.box_iou(kitti_boxes(case, mine, "found"), labels)
+        above, volume = box_overlap.box_iou(kitti_boxes(case, mine, "found"), labels)
         xyxy = case["found_bbox"][mine]
         overlaps = {"bev": above, "3d": volume, "image": geometry.iou(xyxy, image.xyxy)}
         low = np.maximum(xyxy[:, None, :2], image.dont_care[None, :, :2])
@@ -382,7 +382,7 @@ def test_false_boxes_in_any_frame_lower_the_precision() -> None:
             for x, y in places
         ]
         for objects, truth in frames:
-            above, _ = geometry.box_iou(objects.boxes, truth.boxes)
+            above, _ = box_overlap.box_iou(objects.boxes, truth.boxes)
             height = np.full(len(objects), np.inf, np.float32)
             precision.add(ScoredObjects(objects.names, objects.score, height, {"bev": above}, {}), truth)
         return {name: value for (_, overlap, name, _), value in precision.results().items() if overlap == 0.5}

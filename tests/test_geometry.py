@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D, Intrinsics
 
@@ -228,7 +228,7 @@ places = st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.5, 5), st.flo
 @given(places, places, st.floats(-4, 4), st.floats(-60, 60))
 def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn: float, shift: float) -> None:
     boxes = upright(a, b)
-    value = geometry.bev_iou(boxes, boxes)
+    value = box_overlap.bev_iou(boxes, boxes)
     np.testing.assert_allclose(np.diag(value), 1, atol=1e-4)
     assert value[0, 1] == pytest.approx(value[1, 0], abs=1e-4)
     # As fine as the two boxes are small: their edges may run along a row of the grid.
@@ -247,7 +247,7 @@ def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn:
     # The same wherever the two are, and however they are turned together.
     c, s = np.cos(turn), np.sin(turn)
     moved = [(c * x - s * y + shift, s * x + c * y, w, h, angle + turn) for x, y, w, h, angle in (a, b)]
-    assert geometry.bev_iou(upright(moved[0]), upright(moved[1]))[0, 0] == pytest.approx(
+    assert box_overlap.bev_iou(upright(moved[0]), upright(moved[1]))[0, 0] == pytest.approx(
         value[0, 1], abs=1e-3
     )
 
@@ -263,11 +263,11 @@ def test_bev_iou_counts_points(a: tuple[float, ...], b: tuple[float, ...], turn:
     ],
 )
 def test_bev_iou_equals_shapely(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
-    assert geometry.bev_iou(upright(a), upright(b))[0, 0] == pytest.approx(expected, abs=1e-5)
+    assert box_overlap.bev_iou(upright(a), upright(b))[0, 0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_bev_iou_of_no_boxes_is_empty() -> None:
-    assert geometry.bev_iou(Boxes3D.empty(), upright((0, 0, 1, 1, 0))).shape == (0, 1)
+    assert box_overlap.bev_iou(Boxes3D.empty(), upright((0, 0, 1, 1, 0))).shape == (0, 1)
 
 
 @settings(max_examples=30, deadline=None)

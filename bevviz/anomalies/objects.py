@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bevviz.config import AnomaliesConfig
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, Bool, Boxes3D
 from bevviz.model.results import Anomaly, CameraResult, FrameResult, Tracks
 from bevviz.stages.fusion import clusters_in_view
@@ -254,7 +254,7 @@ def _empty(result: FrameResult, tracks: Tracks, visibility: _Visibility, row: in
     if result.obstacles is None or geometry.inside(result.obstacles, visibility.boxes, row).sum() > EMPTY:
         return False
     others = np.flatnonzero(tracks.cluster >= 0)
-    return not geometry.bev_iou(visibility.boxes.chosen([row]), visibility.boxes.chosen(others)).any()
+    return not box_overlap.bev_iou(visibility.boxes.chosen([row]), visibility.boxes.chosen(others)).any()
 
 
 def _rank(visibility: _Visibility, row: int, strange: float) -> float:

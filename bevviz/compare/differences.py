@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 
 from bevviz.evaluate import Truth, judge, position_text
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, Bool, Boxes3D
 from bevviz.model.results import FrameResult, Objects
 from bevviz.stages.fusion import assign
@@ -154,7 +154,7 @@ def compare_objects(a: SideResult, b: SideResult) -> tuple[Difference, ...]:
     A pair of one class has moved if its centres are more than 0.2 m apart.
     """
     distance = np.linalg.norm(a.boxes.center[:, None, :2] - b.boxes.center[None, :, :2], axis=2)
-    iou = geometry.bev_iou(a.boxes, b.boxes)
+    iou = box_overlap.bev_iou(a.boxes, b.boxes)
     other_class = _names_differ(a.names, b.names)
     allowed = np.where(other_class, iou >= MIN_BEV_IOU, distance <= MAX_PAIR_DISTANCE)
     cost = np.where(allowed, np.minimum(distance / MAX_PAIR_DISTANCE, 1) + (1 - iou) + other_class, np.inf)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bevviz.evaluate.ground_truth import Truth
 from bevviz.evaluate.matching import AcceptedNames, accepts
-from bevviz.model import geometry
+from bevviz.model import box_overlap
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import FrameResult
 from bevviz.support.numba_kernel import kernel
@@ -66,7 +66,7 @@ def scored_objects(result: FrameResult, truth: Truth) -> ScoredObjects:
     """Compare the fused objects of a frame with the ground truth."""
     objects = result.objects
     assert objects is not None
-    above, volume = geometry.box_iou(objects.boxes, truth.boxes)
+    above, volume = box_overlap.box_iou(objects.boxes, truth.boxes)
     detections = {camera.camera.name: camera.detections for camera in result.cameras}
     height = np.full(len(objects), np.inf, np.float32)
     for j, (camera, row) in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):

@@ -1,4 +1,4 @@
-"""Rigid transforms, camera projection, boxes and their overlap as plain functions of arrays."""
+"""Rigid transforms, camera projection and boxes as plain functions of arrays."""
 
 from __future__ import annotations
 
@@ -292,70 +292,3 @@ def inside(points: F32, boxes: Boxes3D, k: int) -> Bool:
     local = np.column_stack([c * x + s * y, c * y - s * x, z])
     is_inside[near] = (np.abs(local) <= boxes.size[k] / 2).all(axis=1)
     return is_inside
-
-
-def bev_iou(a: Boxes3D, b: Boxes3D) -> F32:
-    """Return the (A, B) intersection over union of A and B upright boxes of any yaw, seen from above."""
-    shared = _shared_area(a, b)
-    return _ratio(shared, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - shared)
-
-
-def box_iou(a: Boxes3D, b: Boxes3D) -> tuple[F32, F32]:
-    """Return the (A, B) intersection over union of A and B upright boxes, seen from above and as volumes."""
-    area = _shared_area(a, b)
-    (low_a, high_a), (low_b, high_b) = (
-        (boxes.center[:, 2] - boxes.size[:, 2] / 2, boxes.center[:, 2] + boxes.size[:, 2] / 2)
-        for boxes in (a, b)
-    )
-    height = np.minimum(high_a[:, None], high_b[None]) - np.maximum(low_a[:, None], low_b[None])
-    volume = area * np.clip(height, 0, None)
-    return (
-        _ratio(area, _product(a.size[:, :2])[:, None] + _product(b.size[:, :2])[None] - area),
-        _ratio(volume, _product(a.size)[:, None] + _product(b.size)[None] - volume),
-    )
-
-
-def _shared_area(a: Boxes3D, b: Boxes3D) -> F64:
-    """Return the (A, B) square metres that two boxes share, seen from above."""
-    shared = np.zeros((len(a), len(b)))
-    reach_a, reach_b = (np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 for boxes in (a, b))
-    away = np.linalg.norm(a.center[:, None, :2] - b.center[None, :, :2], axis=2)
-    outlines_a, outlines_b = (np.asarray(corners(boxes)[:, :4, :2], np.float64) for boxes in (a, b))
-    for i, j in np.argwhere(away < reach_a[:, None] + reach_b[None, :]):
-        shared[i, j] = _area(_clip(outlines_a[i], outlines_b[j]))
-    return shared
-
-
-def _product(sides: F32) -> F64:
-    """Return the (K,) products of the sides of boxes, in float64."""
-    return np.asarray(np.prod(sides, axis=1, dtype=np.float64))
-
-
-def _ratio(part: F64, whole: F64) -> F32:
-    """Return the quotient, zero where the whole is zero."""
-    return np.divide(part, whole, out=np.zeros(part.shape), where=whole > 0).astype(np.float32)
-
-
-def _clip(polygon: F64, window: F64) -> F64:
-    """Return the part of a convex polygon inside a counter-clockwise window (Sutherland and Hodgman 1974)."""
-    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
-        if len(polygon) == 0:
-            break
-        (dx, dy), offset = end - start, polygon - start
-        inside = dx * offset[:, 1] - dy * offset[:, 0]  # distance to the left, times the edge's length
-        kept: list[F64] = []
-        for k in range(len(polygon)):
-            before = k - 1
-            if (inside[k] >= 0) != (inside[before] >= 0):
-                t = inside[before] / (inside[before] - inside[k])
-                kept.append(polygon[before] + t * (polygon[k] - polygon[before]))
-            if inside[k] >= 0:
-                kept.append(polygon[k])
-        polygon = np.array(kept).reshape(-1, 2)
-    return polygon
-
-
-def _area(polygon: F64) -> float:
-    """Return the area of a counter-clockwise polygon (shoelace formula)."""
-    x, y = polygon.T
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

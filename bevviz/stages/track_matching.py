@@ -6,10 +6,8 @@ import math
 
 import numpy as np
 
-from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, I32, Bool
 from bevviz.stages.fusion import assign
-from bevviz.stages.rotated_boxes import shared_area
 from bevviz.support.numba_kernel import kernel
 
 SIZE_WEIGHT = 1.0  # cost of a box that is e times larger or smaller, relative to the distance of the gate
@@ -77,39 +75,3 @@ def match(cost: F64) -> I32:
     chosen = assign(cost[np.ix_(rows, columns)], unmatched=2.0)
     column[rows] = np.where(chosen >= 0, np.append(columns, -1)[chosen], -1)
     return column
-
-
-def overlaps(a: Boxes3D, b: Boxes3D) -> tuple[F64, F64]:
-    """Return the (A, B) intersection over union, and the share of the smaller box that lies in the other."""
-    shared = _shared_areas(_outlines(a), _outlines(b))
-    area_a, area_b = (boxes.size[:, 0].astype(np.float64) * boxes.size[:, 1] for boxes in (a, b))
-    union = area_a[:, None] + area_b - shared
-    smaller = np.minimum(area_a[:, None], area_b)
-    return shared / np.maximum(union, 1e-9), shared / np.maximum(smaller, 1e-9)
-
-
-def _outlines(boxes: Boxes3D) -> F64:
-    """Return the (K, 4, 2) corners on the ground, counter-clockwise."""
-    return np.ascontiguousarray(geometry.corners(boxes)[:, :4, :2], np.float64)
-
-
-@kernel
-def _shared_areas(a: F64, b: F64) -> F64:
-    """Return the (A, B) areas that two outlines share."""
-    shared = np.zeros((len(a), len(b)))
-    for i in range(len(a)):
-        reach_a = _diagonal(a[i])
-        for j in range(len(b)):
-            x, y = (
-                a[i, 0, 0] + a[i, 2, 0] - b[j, 0, 0] - b[j, 2, 0],
-                a[i, 0, 1] + a[i, 2, 1] - b[j, 0, 1] - b[j, 2, 1],
-            )
-            if math.hypot(x, y) < reach_a + _diagonal(b[j]):
-                shared[i, j] = shared_area(a[i], b[j])
-    return shared
-
-
-@kernel
-def _diagonal(outline: F64) -> float:
-    """Return the length of the diagonal of a rectangle."""
-    return math.hypot(outline[2, 0] - outline[0, 0], outline[2, 1] - outline[0, 1])

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from bevviz.config import TrackingConfig
 from bevviz.model import geometry
+from bevviz.model.box_overlap import bev_iou_and_share
 from bevviz.model.frame import F32, F64, I32, I64, Bool, Boxes3D, Frame
 from bevviz.model.results import Clusters, Objects, Tracks
-from bevviz.stages.track_matching import SAME_PLACE, costs, extents, match, overlaps
+from bevviz.stages.track_matching import SAME_PLACE, costs, extents, match
 
 INITIAL_SPEED = 5.0  # m/s, one sigma of the speed of a new track
 SHAPE_GAIN = 0.2  # share of the newest box in the smoothed size and heading
@@ -187,8 +188,8 @@ class Tracker:
         expected = self._boxes()
         large = np.flatnonzero(expected.size[:, :2].max(axis=1) >= LONG)
         overlap = np.zeros((2, len(state), len(boxes)))
-        overlap[0, large], inside = overlaps(expected.chosen(large), seen)
-        overlap[1, large], _ = overlaps(expected.chosen(large), boxes)
+        overlap[0, large], inside = bev_iou_and_share(expected.chosen(large), seen)
+        overlap[1, large], _ = bev_iou_and_share(expected.chosen(large), boxes)
         gate = self._gate(config)
         sight = state.mean[:, 0, :2] - pose[:2, 3]
         sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
@@ -291,7 +292,7 @@ class Tracker:
         length = state.size[:, :2].max(axis=1)
         hosts = np.flatnonzero(shown & (length >= LONG))
         boxes = self._boxes()
-        iou, share = overlaps(boxes.chosen(hosts), boxes)
+        iou, share = bev_iou_and_share(boxes.chosen(hosts), boxes)
         best = state.votes.argmax(1) if len(self._classes) else np.zeros(len(state), np.int64)
         alike = (best[hosts, None] == best) | (state.sightings == 0) | (length >= LONG)
         doubles = (share >= SAME_OBJECT) & alike & (hosts[:, None] < np.arange(len(state)))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE, Truth
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import DATA_SETS
 from bevviz.model.reasons import Reason, ReasonKind, scored
 from bevviz.model.results import Decision, FrameResult, Objects
@@ -102,7 +102,7 @@ def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
     values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
     better = np.flatnonzero(objects.score > objects.score[row])
     better = better[[objects.names[other] == objects.names[row] for other in better]]
-    overlap = geometry.bev_iou(single_box(objects.boxes, row), objects.boxes)[0]
+    overlap = box_overlap.bev_iou(single_box(objects.boxes, row), objects.boxes)[0]
     doubles = better[overlap[better] >= DOUBLE]
     if len(doubles):
         other = scored(objects, int(doubles[overlap[doubles].argmax()]))

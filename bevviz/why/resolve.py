@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.config import BevConfig
 from bevviz.errors import UserError
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
 from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
@@ -270,7 +270,7 @@ def _contradicted_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
         return
     real = Boxes3D.joined([subject.box for subject in traces.truth if subject.box is not None])
     false = false_reasons(traces)  # subjects themselves
-    in_truth = geometry.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
+    in_truth = box_overlap.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
     for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
         if not in_truth[row] and row not in false and camera in ("", opinions.camera[row]):
             yield object_subject(traces, row)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, I64
 from bevviz.model.results import CameraResult, Decision, DetectionState, FrameResult, Fusion
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
@@ -282,7 +282,7 @@ def _objects_at_place(subject: Subject, traces: FrameIndex) -> Iterator[int]:
     )
     overlap = np.zeros(len(objects))
     if subject.box is not None and len(objects):
-        overlap = geometry.bev_iou(subject.box, objects.boxes)[0]
+        overlap = box_overlap.bev_iou(subject.box, objects.boxes)[0]
     for row in np.argsort(-(share + overlap), kind="stable").tolist():
         if share[row] >= HELD or overlap[row] >= OVERLAP:
             yield row

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bevviz.model import geometry
+from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D, Frame
 from bevviz.model.results import Tracks
 from bevviz.stages.fusion import assign
@@ -148,9 +148,9 @@ class IdentityCounter:
         """Add the next frame."""
         rows = np.flatnonzero(tracks.confirmed & (tracks.cluster >= 0))
         boxes, ids = tracks.boxes.chosen(rows), tracks.id[rows]
-        overlap = geometry.bev_iou(self._last[0], boxes)
+        overlap = box_overlap.bev_iou(self._last[0], boxes)
         self.shown += len(rows)
         self.switches += int(((overlap > 0.3) & (self._last[1][:, None] != ids)).sum())
         self._last = boxes, ids
         every = tracks.boxes.chosen(np.flatnonzero(tracks.confirmed))
-        self.doubles += int(np.triu(geometry.bev_iou(every, every) > 0.3, 1).sum())
+        self.doubles += int(np.triu(box_overlap.bev_iou(every, every) > 0.3, 1).sum())
