@@ -19,10 +19,10 @@ from benchmarks import kitti
 from benchmarks.pages import write_section
 from bevviz.config import Preset, load
 from bevviz.evaluate import MAX_DISTANCE, MIN_HITS, RANGE, pair_in_order
+from bevviz.extras.demo.drive import Snapshot, SyntheticSource
 from bevviz.model.geometry import iou
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.synthetic import Snapshot, SyntheticSource
 from tests.support.track_metrics import Tallies, TrackTally, add_tracks, moved, truth_of, without_pose
 
 PRESETS: tuple[Preset, ...] = ("reference", "default")

@@ -29,11 +29,18 @@ from bevviz.agents.drives import AskedDrive
 from bevviz.agents.server import make_server
 from bevviz.agents.tools import AgentTools
 from bevviz.config import load
+from bevviz.extras.demo.bag import BagWriter
+from bevviz.extras.demo.drive import (
+    CAMERA_INFO_TOPIC,
+    IMAGE_TOPIC,
+    ODOMETRY_TOPIC,
+    PERIOD,
+    START,
+    SyntheticSource,
+)
+from bevviz.extras.demo.faults import FAULTS
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
-from bevviz.synthetic import FAULTS, SyntheticSource
-from bevviz.synthetic.bag import BagWriter
-from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, IMAGE_TOPIC, ODOMETRY_TOPIC, PERIOD, START
 from tests.support.mcp_client import Client, connected
 
 CALLS, BYTES, WANTED = 8, 12_000, 45

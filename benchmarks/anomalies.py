@@ -23,12 +23,12 @@ from benchmarks.sensor_faults import SensorTally, results
 from benchmarks.sensor_faults import measure as measure_sensors
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
+from bevviz.extras.demo.drive import Snapshot, SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import Bool, Camera, Frame
 from bevviz.model.results import Anomaly, Detections, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.synthetic import Snapshot, SyntheticSource
 from tests.support.sensor_plants import Results
 
 CHOSEN_ON = (2000, 2001, 2011)  # seeds that rules and limits were looked at on

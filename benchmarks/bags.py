@@ -10,8 +10,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from tqdm import tqdm
 
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.definitions import typestore
-from bevviz.synthetic import SyntheticSource, write_bag
 
 SECOND = 1_000_000_000
 

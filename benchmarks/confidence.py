@@ -20,11 +20,11 @@ from benchmarks.truth import Rule, scene_of
 from benchmarks.why import CLASSES, MIN_HEIGHT, MISTUNED
 from bevviz.config import Config, load
 from bevviz.evaluate import MIN_HITS, RANGE
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import F64, I64, Bool
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
-from bevviz.synthetic import SyntheticSource
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.confidence import LIMIT, features_of, outcome_key
 from bevviz.why.confidence_table import COEFFICIENTS

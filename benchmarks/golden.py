@@ -558,9 +558,9 @@ def _hash_of(message: Any) -> str:
 def _live(folder: Path) -> Results:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
     from bevviz.config.reloading import ReloadableConfig
+    from bevviz.extras.demo.drive import SyntheticSource
     from bevviz.live.runtime import Live, Outputs
     from bevviz.live.status import Notes
-    from bevviz.synthetic import SyntheticSource
     from tests.support.replay import Replay
 
     path = folder / f"live_{time.time_ns()}.rrd"

@@ -19,12 +19,12 @@ from benchmarks.kitti import DATA
 from benchmarks.pages import write_section
 from bevviz.config import Config, load
 from bevviz.evaluate.evaluation import GROUND_LABELS
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Bool, Boxes3D
 from bevviz.stages.clustering import cluster
 from bevviz.stages.ground import segment_ground
 from bevviz.stages.voxel import voxel_grid
-from bevviz.synthetic import SyntheticSource
 from tests.support.kitti_accuracy import shots
 
 INTRO = """## Ground against Patchwork++

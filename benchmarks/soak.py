@@ -18,9 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.runtime import Live, Outputs, Status
 from bevviz.live.status import Notes
-from bevviz.synthetic import SyntheticSource
 from tests.support.replay import Replay
 
 WARM = 10.0  # seconds at the start that are left out: kernels are loaded, buffers fill

@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.evaluate import judge, truth_of
+from bevviz.extras.demo.drive import IMAGE_DELAY, START, TRUTH_RANGE, Snapshot, SyntheticSource
+from bevviz.extras.demo.mesh import Material, Mesh, merge
+from bevviz.extras.demo.sensors import Caster, Lidar, RaycastView
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, I64
 from bevviz.model.reasons import ReasonKind
@@ -24,10 +27,6 @@ from bevviz.model.results import (
     FrameResult,
     Fusion,
 )
-from bevviz.synthetic import Snapshot, SyntheticSource
-from bevviz.synthetic.drive import IMAGE_DELAY, START, TRUTH_RANGE
-from bevviz.synthetic.mesh import Material, Mesh, merge
-from bevviz.synthetic.sensors import Caster, Lidar, RaycastView
 
 IN_VIEW = 0.1  # share of an object's surface that lies in the direction of the image
 FEW = 3  # points that are as good as none

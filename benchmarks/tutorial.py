@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bevviz.extras.demo.sensors import load_open3d
 from bevviz.model.results import Objects
-from bevviz.synthetic.sensors import load_open3d
 
 
 def read_points(message: Any) -> Iterator[tuple[float, float, float]]:

@@ -21,10 +21,10 @@ from benchmarks.pages import write_section
 from benchmarks.truth import Cause, Rule, Scene, scene_of
 from bevviz.config import Config, changed_config, load
 from bevviz.evaluate import MIN_HITS, RANGE
+from bevviz.extras.demo.drive import Snapshot, SyntheticSource
 from bevviz.model.reasons import ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.synthetic import Snapshot, SyntheticSource
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.verdict import HOPELESS
 

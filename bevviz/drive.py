@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -22,6 +22,7 @@ from bevviz.pipeline.run import RunEnd, iterate_results, run
 from bevviz.pipeline.session import Session
 from bevviz.stages.odometry import Odometry, place
 from bevviz.support.contexts import Closable
+from bevviz.support.extensions import find
 from bevviz.support.python_words import errors_about_arguments, python_words
 
 if TYPE_CHECKING:
@@ -468,11 +469,8 @@ def simulate(
     Raises:
         UserError: no such fault, an unknown parameter, or a model that cannot be used.
     """
-    from bevviz.synthetic import SyntheticSource
-
-    return Drive(
-        SyntheticSource(frames, seed, plant=plant), load(_path(config), _all_settings(model, set), preset)
-    )
+    simulator: Callable[..., FrameSource] = find("simulators", "demo")
+    return Drive(simulator(frames, seed, plant=plant), load(_path(config), _all_settings(model, set), preset))
 
 
 def _all_settings(model: str | PathLike[str], settings: Settings) -> list[str]:

@@ -8,8 +8,11 @@ import tomllib
 from itertools import pairwise
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/architecture.md").read_text()
+EXTRAS = sorted(path.parent.name for path in ROOT.glob("bevviz/extras/*/__init__.py"))
 MAX_NAME = 60  # characters of the name of a test
 TESTS_OF_BENCHMARKS = ("test_benchmarks.py", "test_torture_benchmark.py")
 
@@ -60,6 +63,18 @@ def test_every_package_has_a_sentence_that_says_what_it_holds() -> None:
             assert re.fullmatch(r'"""[A-Z].*\.(""")?', first), package.name
 
 
+def test_every_extra_is_registered_tested_and_described() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    values = [value for group in project["entry-points"].values() for value in group.values()]
+    (everything,) = (Requirement(entry) for entry in project["optional-dependencies"]["all"])
+    for name in EXTRAS:
+        assert any(value.startswith(f"bevviz.extras.{name}.") for value in values), name
+        assert name in project["optional-dependencies"] and name in everything.extras
+        assert list((ROOT / "tests/extras" / name).glob("test_*.py")), name
+        assert (ROOT / "docs/extras" / f"{name}.md").exists()
+        assert f"| [`{name}`](extras/{name}.md) |" in (ROOT / "docs/extras.md").read_text()
+
+
 def imported_modules(path: Path) -> set[str]:
     """Return the modules, and the names in modules, that a file imports anywhere."""
     names: set[str] = set()
@@ -85,7 +100,7 @@ def test_test_files_import_helpers_from_support_only() -> None:
 
 
 def test_names_of_tests_are_short_enough_to_read() -> None:
-    for path in (ROOT / "tests").glob("test_*.py"):
+    for path in (ROOT / "tests").rglob("test_*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
                 assert len(node.name) < MAX_NAME, f"{path.name}: {node.name} has {len(node.name)} characters"

@@ -19,11 +19,11 @@ from bevviz.calib.solve import FIT
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import PERIOD, START, SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, U8, Camera, Cloud, Frame, Image, Intrinsics
 from bevviz.stages.edges import cloud_edges
-from bevviz.synthetic import SyntheticSource, write_bag
-from bevviz.synthetic.drive import PERIOD, START
 from tests.support import bags, documented_json
 from tests.support.miscalibrated_drives import Drive, Kitti, stated_wrongly
 from tests.support.recordings import Recording, verify

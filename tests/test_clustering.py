@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bevviz.config import ClusteringConfig
+from bevviz.extras.demo.sensors import load_open3d
 from bevviz.model.frame import F32, I32, Bool
 from bevviz.model.results import ClusterState
 from bevviz.stages.clustering import MIN_SIZE, cluster, dbscan
-from bevviz.synthetic.sensors import load_open3d
 
 # --- DBSCAN ------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -80,6 +81,18 @@ def test_without_arguments_the_help_is_shown(capsys: Capture) -> None:
 # --- loud and quiet, in colour and without ----------------------------------------------------------
 
 
+def test_a_broken_package_costs_its_own_command_only(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = EntryPoint("lost", "no_such_package.command", "bevviz.commands")
+    monkeypatch.setattr("bevviz.cli.registered", lambda kind: {"lost": broken})
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = capsys.readouterr()
+    assert "recover" in shown.out and "lost" not in shown.out
+    assert shown.err.startswith("bevviz: warning: the command 'lost' (no_such_package.command) cannot be")
+
+
 def test_quiet_leaves_results_and_warnings(tmp_path: Path, capsys: Capture) -> None:
     items = [item for item in bags.small_items(scans=4) if item.topic != bags.INFO]
     bags.write(tmp_path / "drive", items)
@@ -111,7 +124,7 @@ def test_a_run_without_a_display_names_the_viewer_command(
     monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """The line is typed as it stands. Without the workbench, the demo is such a run."""
-    monkeypatch.setattr("bevviz.cli.demo.find_spec", lambda name: None)
+    monkeypatch.setattr("bevviz.extras.demo.command.find_spec", lambda name: None)
     monkeypatch.setenv("BEVVIZ_MODEL", "absent.onnx")
     monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr("sys.argv", [str(Path(sys.executable).with_name("bevviz"))])

@@ -28,6 +28,8 @@ from bevviz.compare.sides import published_result, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import transform
 from bevviz.model.results import FrameResult
@@ -36,7 +38,6 @@ from bevviz.pipeline.session import Session, Variants, check_same_frames, withou
 from bevviz.pipeline.stage_log import Memo
 from bevviz.recording import entities
 from bevviz.stages import detector
-from bevviz.synthetic import SyntheticSource, write_bag
 from tests.support import bags, documented_json
 from tests.support.recordings import Recording, verify
 

@@ -155,7 +155,7 @@ def test_every_command_and_option_on_a_page_exists() -> None:
     program, _ = _parser()
     (commands,) = (a.choices for a in program._actions if isinstance(a, argparse._SubParsersAction))
     wrong = []
-    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         for command, _ in examples(str(path.relative_to(ROOT))):
             words = command.split(" #")[0].split()
             if words[0] != "bevviz" or len(words) < 2 or words[1].startswith("-"):

@@ -13,9 +13,10 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
+from bevviz.extras.demo.bag import BagWriter
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.results import FrameResult
 from bevviz.support.python_words import python_words
-from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Selection
 from tests.support.recordings import Recording, verify
 

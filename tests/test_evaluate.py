@@ -21,12 +21,13 @@ from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, Sc
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.matching import ObjectScore
 from bevviz.evaluate.tracking_score import ClassTracks
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import Boxes3D, ImageLabels
 from bevviz.model.results import Objects
 from bevviz.stages.robot_results import in_points_frame
-from bevviz.synthetic import SyntheticSource, write_bag
 from tests.support import bags, documented_json
 from tests.support.recordings import Recording, verify
 

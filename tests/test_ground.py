@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import GroundConfig
+from bevviz.extras.demo.sensors import load_open3d
 from bevviz.model.frame import F32, F64, Bool
 from bevviz.model.results import Ground
 from bevviz.stages.clustering import dbscan
 from bevviz.stages.ground import RING_COUNT, RING_SCALE, _sort_into_bins, segment_ground
-from bevviz.synthetic.sensors import load_open3d
 
 Terrain = Callable[[F64, F64], F64]
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.decisions import mask_evidence
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import Detections, FrameResult, Fusion, Masks
@@ -22,7 +23,6 @@ from bevviz.report.fingerprints import digest, pack, unpack
 from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
 from bevviz.stages.mask_lookup import is_covered
-from bevviz.synthetic import SyntheticSource
 from tests.support.fusion_scenes import (
     CAMERA,
     CAMERA_FROM_LIDAR,

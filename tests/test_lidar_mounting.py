@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import load
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.encode import encode_boxes_3d, encode_cloud
 from bevviz.messages.roles import Roles, find_roles
@@ -27,7 +28,6 @@ from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.sync.gravity import _least_turn, ground_normal
 from bevviz.sync.synchronizer import Synchronizer
-from bevviz.synthetic import SyntheticSource
 
 LIDAR, BASE, ODOM, IMU = "rslidar", "base_link", "odom", "imu_link"
 ROLES = Roles(lidars=("/points",), lidar_names=(LIDAR,))

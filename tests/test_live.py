@@ -26,6 +26,8 @@ from bevviz.anomalies import AnomalyDetector
 from bevviz.config import load
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.live.encoder import WHOLE, Encoder, Packet
 from bevviz.live.files import RecordingSaver, unused_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
@@ -47,8 +49,6 @@ from bevviz.pipeline.session import Session
 from bevviz.recording import blueprints
 from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.support.live_sessions import run_beside
 from tests.support.recordings import Recording, verify
 from tests.support.replay import Replay

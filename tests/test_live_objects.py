@@ -17,11 +17,11 @@ from rosbags.typesys.store import Typestore
 
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import PERIOD, TRUTH_TOPIC
 from bevviz.messages import definitions
 from bevviz.messages.definitions import store_of, typestore
 from bevviz.messages.encode import encode_cloud
 from bevviz.model.frame import Cloud
-from bevviz.synthetic.drive import PERIOD, TRUTH_TOPIC
 from tests.support import bags
 from tests.support.object_messages import (
     AUTOWARE,

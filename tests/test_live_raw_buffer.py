@@ -23,6 +23,7 @@ from bevviz.bags.mcap_writer import McapWriter
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import LIDAR_TOPIC
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.bag_info import describe_bag
@@ -31,7 +32,6 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import read_origin
 from bevviz.report.fingerprints import compare, digest
 from bevviz.support.files import write_all
-from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.support.played_drive import drive_of
 from tests.support.recordings import Recording, verify_when_indexed
 from tests.support.ros_player import Play

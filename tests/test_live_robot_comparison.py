@@ -9,11 +9,11 @@ import pytest
 
 from bevviz.compare.differences import Change
 from bevviz.config import load
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.live.robot_comparison import WAITING, RobotComparison
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult, Objects
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.sensors import Lidar, PinholeCamera
 
 TOPIC = "/detection/fused_3d"
 CONFIG = load(settings=["live.robot_time=0.3 s"])

@@ -22,6 +22,7 @@ from mcap.reader import make_reader
 from bevviz.cli import main
 from bevviz.config import Config, keys, load
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import LIDAR_TOPIC
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
@@ -32,7 +33,6 @@ from bevviz.model.results import CameraResult, Detections, FrameResult, Objects
 from bevviz.pipeline.session import Session
 from bevviz.recording.sinks import HEADER_BYTES, MESSAGE_HEADER
 from bevviz.support.files import unfinished_files
-from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.support import kept_drives
 from tests.support.commands import Capture, environment, error_of
 from tests.support.played_drive import drive_of

@@ -16,10 +16,10 @@ import pytest
 
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
 from bevviz.messages.encode import encode_boxes_3d, encode_cloud
 from bevviz.model.frame import Boxes3D, Cloud, Frame
 from bevviz.pipeline.run import DropPolicy, run
-from bevviz.synthetic.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
 from tests.support.played_drive import drive_of
 from tests.support.ros_player import Play
 from tests.support.waiting import until

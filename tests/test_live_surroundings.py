@@ -12,10 +12,10 @@ import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
+from bevviz.extras.demo.drive import TRUTH_TOPIC
 from bevviz.messages.definitions import typestore
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
-from bevviz.synthetic.drive import TRUTH_TOPIC
 from tests.support.recordings import Recording
 from tests.support.waiting import until
 

@@ -10,13 +10,13 @@ import pytest
 
 import bevviz
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.buffers import PageState
 from bevviz.workbench.live_buffer import AHEAD, WHOLE
 from bevviz.workbench.running_robot import RunningRobot

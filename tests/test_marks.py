@@ -12,11 +12,11 @@ import rerun as rr
 from bevviz.config import load
 from bevviz.evaluate import judge, truth_of
 from bevviz.evaluate.marks import MarkRecorder
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.recording.images import unexplained_detections
 from bevviz.recording.recorder import Recorder
-from bevviz.synthetic import SyntheticSource
 from tests.support.recordings import Recording
 
 SEED = 5

@@ -17,8 +17,8 @@ from bevviz.agents.server import make_server
 from bevviz.agents.tools import LIMIT, AgentTools, fitted
 from bevviz.config import TUTORIAL_NAMES, keys, load
 from bevviz.errors import UserError
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.bag import write_bag
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 from tests.support.mcp_client import connected
 
 MISTUNED = "detector.conf_threshold=0.9"

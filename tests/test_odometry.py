@@ -14,6 +14,7 @@ import bevviz
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import StageError
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.runtime import LiveSession
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame
@@ -21,7 +22,6 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session, SessionGroup
 from bevviz.recording import entities
 from bevviz.stages.odometry import ESTIMATED, Odometry, place
-from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support.recordings import Recording
 from tests.support.track_metrics import IdentityCounter, without_pose

@@ -22,14 +22,16 @@ NOTICES = (ROOT / "THIRD_PARTY_NOTICES.md").read_text()
 
 
 def requirements() -> Iterator[Requirement]:
-    """Every requirement of the package, its build, its extras and its dependency groups."""
+    """Every requirement of the package, its build, its extras and its dependency groups on others."""
     lists = [
         PROJECT["build-system"]["requires"],
         PROJECT["project"]["dependencies"],
         *PROJECT["project"]["optional-dependencies"].values(),
         *PROJECT["dependency-groups"].values(),
     ]
-    yield from (Requirement(entry) for entries in lists for entry in entries if isinstance(entry, str))
+    for entry in (entry for entries in lists for entry in entries if isinstance(entry, str)):
+        if (requirement := Requirement(entry)).name != PROJECT["project"]["name"]:
+            yield requirement
 
 
 def constraints_of(python: str) -> dict[str, Requirement]:

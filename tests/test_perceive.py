@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Frame
 from bevviz.pipeline.session import Session
-from bevviz.synthetic import SyntheticSource
 
 
 @pytest.fixture(scope="module")

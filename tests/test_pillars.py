@@ -20,6 +20,7 @@ from bevviz.config import config_yaml, load, object_network_params
 from bevviz.config.descriptions import describe_parameters
 from bevviz.config.pillars import Feature, PillarParams
 from bevviz.errors import UserError
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.pipeline.perceive import perceive
@@ -29,7 +30,6 @@ from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.pillars.group import Pillars, group, scatter
 from bevviz.stages.pillars.heads import anchor_boxes, decode_boxes
 from bevviz.stages.rotated_boxes import survivors
-from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.page_messages import controls
 from tests.support.onnx_networks import FLOAT, node, save
 from tests.support.pillar_networks import (

@@ -15,10 +15,10 @@ from bevviz import UserError
 from bevviz.datasets.cloud_files import are_doubles, count_columns, read_cloud
 from bevviz.datasets.folder import Folder
 from bevviz.datasets.stamps import group_by_sensor
+from bevviz.extras.demo.sensors import load_open3d
 from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
 from bevviz.model.geometry import has_distortion
-from bevviz.synthetic.sensors import load_open3d
 from tests.support.datasets import cloud, kitti_raw
 
 

@@ -23,7 +23,8 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.errors import UserError
-from bevviz.synthetic import SyntheticSource, write_bag
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 
 pytest.importorskip("aiohttp", reason="needs fsspec's HTTP: pip install 'bevviz[remote]'")
 

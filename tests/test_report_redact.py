@@ -18,13 +18,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from bevviz.bags.bag import Recording as Bag
 from bevviz.cli import main
 from bevviz.config import DetectorConfig
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.images import decode_compressed_image, decode_image
 from bevviz.model.frame import F32, U8
 from bevviz.report.pictures import shrink
 from bevviz.report.redact import CELLS, ImageFinder, Redactor, _encoded, grow_boxes, hide_boxes
 from bevviz.report.summary import STRIP_WIDTH
-from bevviz.synthetic import SyntheticSource
 from tests.support import bags, videos
 from tests.support.commands import Capture, error_of
 from tests.support.recordings import Recording, verify

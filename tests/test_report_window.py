@@ -18,6 +18,7 @@ from bevviz.bags.bag import Recording
 from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.extras.demo.bag import _qos
 from bevviz.pipeline.session import Session
 from bevviz.report.bag_window import (
     CutContent,
@@ -31,7 +32,6 @@ from bevviz.report.bag_window import (
     unchanged,
 )
 from bevviz.report.fingerprints import StageDigest, compare, digest
-from bevviz.synthetic.bag import _qos
 from tests.support import bags
 from tests.support.waiting import PATIENCE
 

@@ -18,6 +18,7 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.config import Config, load
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
 from bevviz.pipeline import result_store
@@ -26,7 +27,6 @@ from bevviz.pipeline.result_store import ResultStore, StoredDetector, open_store
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector.session import NetworkSession
 from bevviz.support import progress
-from bevviz.synthetic import SyntheticSource
 from tests.support.onnx_networks import answer, image_input
 from tests.support.pillar_networks import Reference
 from tests.support.small_disk import small_disk

@@ -12,6 +12,8 @@ import pytest
 import rerun as rr
 
 from bevviz.config import SourceConfig, load
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_cloud, encode_image
@@ -23,8 +25,6 @@ from bevviz.model.frame import ComponentStatus, Frame, Image, PlacedShape, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.sync.buffers import MANY, SAMPLES, SurroundingsBuffer
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.support.recordings import Recording
 
 

@@ -18,13 +18,14 @@ from bevviz.config import load
 from bevviz.datasets.kitti_files import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import apply as move
 from bevviz.model.geometry import corners, project
 from bevviz.model.results import Objects
 from bevviz.sweep import Parameter, Sweep, combine, parse
 from bevviz.sweep.log import HEIGHT, WIDTH, axis_scale
-from bevviz.synthetic import SyntheticSource, write_bag
 from tests.support import bags
 from tests.support.kitti_labels import labels
 from tests.support.recordings import Recording, verify

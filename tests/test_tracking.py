@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 import bevviz
 from bevviz.config import TrackingConfig, load
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.results import Clusters, Objects, Tracks
 from bevviz.pipeline.session import Session
 from bevviz.stages.tracking import Tracker
-from bevviz.synthetic import SyntheticSource
-from bevviz.synthetic.sensors import Lidar, PinholeCamera
 from tests.support.track_metrics import IdentityCounter, Tallies, TrackTally, Truth, add_tracks, truth_of
 from tests.support.tracking_scenes import CAR, PERSON, scene
 

@@ -24,6 +24,7 @@ from bevviz.config import Config, changes, config_yaml, keys, load, plugins
 from bevviz.config.project import named_code
 from bevviz.config.trust import grant_trust
 from bevviz.errors import StageError, UserError
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.encode import (
     encode_boxes_2d,
     encode_boxes_3d,
@@ -38,7 +39,6 @@ from bevviz.model.results import ClusterState, DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.stages import user_stages
 from bevviz.stages.robot_results import detect
-from bevviz.synthetic import SyntheticSource
 from tests.support import bags
 from tests.support.modules import forget_modules
 from tests.support.waiting import PATIENCE

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bevviz.config import VoxelConfig
+from bevviz.extras.demo.sensors import load_open3d
 from bevviz.model.frame import F32
 from bevviz.stages.voxel import voxel_grid
-from bevviz.synthetic.sensors import load_open3d
 
 clouds = hnp.arrays(
     np.float32, st.tuples(st.integers(1, 200), st.just(3)), elements=st.floats(-20, 20, width=32)

@@ -15,12 +15,13 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.extras.demo.bag import BagWriter
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, LabelledBoxes3D
 from bevviz.model.reasons import Limit, ReasonKind
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.synthetic import BagWriter, SyntheticSource
 from bevviz.why import Answer, FrameExplainer, Selection, why
 from bevviz.why.answer_text import summary_line
 from bevviz.why.confidence import Outcome, features_of

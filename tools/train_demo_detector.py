@@ -32,10 +32,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
+from bevviz.extras.demo.sensors import Caster, PinholeCamera, RaycastView, optical
+from bevviz.extras.demo.world import SECTION, World
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, U8
-from bevviz.synthetic.sensors import Caster, PinholeCamera, RaycastView, optical
-from bevviz.synthetic.world import SECTION, World
 
 NAMES = ("person", "car", "cyclist")
 WIDTH, HEIGHT = 640, 384  # of the exported input

@@ -22,7 +22,6 @@ from bevviz.cli import (
     completion,
     config,
     cut,
-    demo,
     evaluate,
     export,
     fix,
@@ -39,13 +38,15 @@ from bevviz.cli import (
     why,
     workbench,
 )
-from bevviz.cli.options import follow_recording, join_negative_numbers
+from bevviz.cli.options import Commands, follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
+from bevviz.support.extensions import load, registered
 from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
     from logging import Logger
 
 EPILOG = """examples:
@@ -94,12 +95,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     if arguments is None:
         interrupts.install()
     try:
-        parser, commands = _parser()
-        if "_ARGCOMPLETE" in os.environ:
-            completion.complete(parser)
         command_line = join_json_option(
             join_negative_numbers(sys.argv[1:] if arguments is None else arguments)
         )
+        parser, commands = _parser(command_line[0] if command_line else "")
+        if "_ARGCOMPLETE" in os.environ:
+            completion.complete(parser)
         if not command_line:
             parser.print_help()
             return 2
@@ -144,8 +145,11 @@ def _main(arguments: Sequence[str] | None) -> int:
                 gc.freeze()  # A last search for cycles would take a third of a second.
 
 
-def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
-    """Return the parser and the names of the commands."""
+def _parser(command: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """Return the parser, and the commands by name.
+
+    Registered commands are left out for a ``command`` of the core, because finding them takes 20 ms.
+    """
     parser = Parser(
         prog="bevviz",
         description="See what a LiDAR-camera perception pipeline saw, made and decided, in Rerun.",
@@ -154,7 +158,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     commands = parser.add_subparsers(required=True, metavar=COMMAND)
-    for command in (
+    for module in (
         workbench,
         bag,
         batch,
@@ -170,7 +174,6 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
         report,
         recover,
         cut,
-        demo,
         live,
         mcp,
         config,
@@ -178,7 +181,11 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
         trust,
         completion,
     ):
-        command.add(commands)
+        module.add(commands)
+    if command not in commands.choices:
+        for point in registered("commands").values():
+            if point.name not in commands.choices:
+                _add_registered(point, commands)
     for command_parser in commands.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"
@@ -187,6 +194,14 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
             "--quiet", action="store_true", help="no progress and no notes: only results, and what is wrong"
         )
     return parser, commands.choices
+
+
+def _add_registered(point: EntryPoint, commands: Commands) -> None:
+    """Add a registered command. A broken package costs its own command only."""
+    try:
+        load(point).add(commands)
+    except UserError as error:
+        outputs.warn([str(error)])
 
 
 def _log() -> Logger:

@@ -21,7 +21,21 @@ def registered(kind: Kind) -> Mapping[str, EntryPoint]:
     points = sorted(
         entry_points(group=f"bevviz.{kind}"), key=lambda point: not point.value.startswith(EXTRAS)
     )
-    return {point.name: point for point in reversed(points)}
+    named: dict[str, EntryPoint] = {}
+    for point in points:
+        named.setdefault(point.name, point)
+    return named
+
+
+def find(kind: Kind, name: str) -> Any:
+    """Import what is registered by a name.
+
+    Raises:
+        UserError: nothing is, or it cannot be imported.
+    """
+    if (point := registered(kind).get(name)) is None:
+        raise UserError(f"this installation of bevviz lacks '{name}': pip install 'bevviz[{name}]'")
+    return load(point)
 
 
 def load(point: EntryPoint) -> Any:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from bevviz.config import load
+from bevviz.extras.demo.drive import LIDAR_TOPIC
 from bevviz.live import graph, graph_info, inputs, raw_recorder, source
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live
@@ -25,7 +26,6 @@ from bevviz.live.typesupport import message_type
 from bevviz.messages.decoders import read_header
 from bevviz.messages.definitions import store_of
 from bevviz.model.frame import Frame
-from bevviz.synthetic.drive import LIDAR_TOPIC
 from tests.support.played_drive import drive_of
 from tests.support.ros_player import Play
 from tests.support.waiting import until

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 
 from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
-from bevviz.synthetic import SyntheticSource
 from bevviz.workbench.running_robot import RunningRobot
 from tests.support.replay import Replay
 

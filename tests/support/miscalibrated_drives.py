@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from bevviz.calib import Calibration, calibrate, gather
 from bevviz.calib.result import TIME, error_pose
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics
-from bevviz.synthetic import SyntheticSource
 
 EVERY = 3  # frames of the synthetic drive from one that is taken to the next
 

@@ -7,9 +7,10 @@ from functools import cache
 import numpy as np
 
 from bevviz.config import load
+from bevviz.extras.demo.drive import Snapshot, SyntheticSource
+from bevviz.extras.demo.faults import FAULTS
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.synthetic import FAULTS, Snapshot, SyntheticSource
 
 
 @cache

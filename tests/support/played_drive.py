@@ -11,8 +11,8 @@ import numpy as np
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
+from bevviz.extras.demo.drive import START
 from bevviz.messages.definitions import typestore
-from bevviz.synthetic.drive import START
 from tests.support.kept_drives import BAG
 from tests.support.ros_player import PERIOD, Drive, Play, shifted
 

@@ -81,8 +81,8 @@ def main() -> int:
     """Run ``bevviz live`` on scans of the synthetic drive in place of a robot."""
     from bevviz.cli import live
     from bevviz.cli import main as run_command
+    from bevviz.extras.demo.drive import SyntheticSource
     from bevviz.live.publish import Publisher
-    from bevviz.synthetic import SyntheticSource
 
     count, *arguments = sys.argv[1:]
 

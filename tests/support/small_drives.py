@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from bevviz.config import Config
+from bevviz.extras.demo.drive import Snapshot, SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.model import geometry
 from bevviz.model.frame import F32, Camera
 from bevviz.model.results import Detections, DetectionState
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader, Stages
-from bevviz.synthetic import Snapshot, SyntheticSource
-from bevviz.synthetic.sensors import Lidar, PinholeCamera
 
 APART = 3  # every third frame of the street is taken, so that a short drive shows more of it
 LIDARS = ((24, 700), (32, 900), (40, 1000))  # beams and azimuths

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bevviz.extras.demo.drive import START, Snapshot, SyntheticSource
 from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D, Frame
 from bevviz.model.results import Tracks
 from bevviz.stages.fusion import assign
-from bevviz.synthetic import Snapshot, SyntheticSource
-from bevviz.synthetic.drive import START
 
 MAX_DISTANCE = 2.0  # metres between the centres, on the ground plane, of a track and its object
 SETTLED = 1.0  # seconds from which on a track's speed is measured

@@ -11,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.errors import UserError
+from bevviz.extras.demo.faults import find_faults
+from bevviz.extras.demo.mesh import Material
+from bevviz.extras.demo.sensors import Caster, Lidar, PinholeCamera, RaycastView, Scan, optical
+from bevviz.extras.demo.world import World, bounds
 from bevviz.model import geometry
 from bevviz.model.frame import (
     F64,
@@ -26,10 +30,6 @@ from bevviz.model.frame import (
     LabelledBoxes3D,
     Scene,
 )
-from bevviz.synthetic.faults import find_faults
-from bevviz.synthetic.mesh import Material
-from bevviz.synthetic.sensors import Caster, Lidar, PinholeCamera, RaycastView, Scan, optical
-from bevviz.synthetic.world import World, bounds
 
 LIDAR_TOPIC = "/rslidar_points"
 IMAGE_TOPIC = "/zed2/zed/rgb/image_rect_color"
@@ -73,7 +73,7 @@ class SyntheticSource:
     Args:
         frames: number of frames of the drive.
         seed: seed of street, traffic, light and sensor noise.
-        plant: names of faults to plant, see ``bevviz.synthetic.faults``.
+        plant: names of faults to plant, see ``bevviz.extras.demo.faults``.
         weave: whether the vehicle swerves, brakes and speeds up, as for the calibration of its sensors.
         camera_error: (4, 4) true_camera_from_stated_camera, the error of the stated camera mounting.
         image_late: seconds by which the stamps of the images are late.

@@ -14,10 +14,10 @@ from itertools import chain
 
 import numpy as np
 
+from bevviz.extras.demo import models
+from bevviz.extras.demo.mesh import Material, Mesh, grid, merge
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64
-from bevviz.synthetic import models
-from bevviz.synthetic.mesh import Material, Mesh, grid, merge
 
 SPEED = 8.0  # metres per second, mean speed of the ego vehicle
 MARGIN = 140.0  # metres of street before and after a section: more than the range of any sensor

@@ -62,5 +62,5 @@ def test_the_synthetic_drive_says_in_one_line_what_it_lacks(tmp_path: Path) -> N
     done = run(tmp_path, "demo", "--frames", "1", "-o", "drive.mcap", "--quiet")
     assert done.returncode != 0
     assert done.stderr.startswith("bevviz: error: the synthetic drive needs Open3D, which cannot be imported")
-    assert "pip install open3d" in done.stderr and done.stderr.count("\n") == 1
+    assert "pip install 'bevviz[demo]'" in done.stderr and done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz.cli import demo, main
+from bevviz.cli import main
 from bevviz.errors import UserError
+from bevviz.extras.demo import command
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.faults import FAULTS, SENSOR_FAULTS
 from bevviz.model.frame import I32
 from bevviz.model.results import Decision
-from bevviz.synthetic import FAULTS, SENSOR_FAULTS, SyntheticSource
 from tests.support.planted_faults import at, drive, planted, run
 
 
@@ -91,7 +93,7 @@ def test_an_impossible_fault_is_one_line(name: str, frames: int, message: str) -
 def test_demo_teaches_and_plants_every_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    taught = [line.split()[0] for line in demo.PLANTS.splitlines() if line.startswith("  ")]
+    taught = [line.split()[0] for line in command.PLANTS.splitlines() if line.startswith("  ")]
     assert taught == [*FAULTS, *SENSOR_FAULTS]
     monkeypatch.chdir(tmp_path)
     assert main(["demo", "--frames", "11", "--plant", "hidden_person", "-o", "a.mcap"]) == 0

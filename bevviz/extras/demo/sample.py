@@ -1,4 +1,4 @@
-"""Write the drive that ships with bevviz: ``python -m bevviz.synthetic.sample bevviz/data/demo.mcap``.
+"""Write the drive that ships with bevviz: ``python -m bevviz.extras.demo.sample bevviz/data/demo.mcap``.
 
 Few scans, positions in steps of 1/128 m and images as JPEG keep it below 8 MB. There is a child in it whom
 the reference preset takes for ground.
@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bevviz.extras.demo.bag import write_bag
+from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.demo.sensors import Lidar
 from bevviz.model.frame import Frame
-from bevviz.synthetic.bag import write_bag
-from bevviz.synthetic.drive import SyntheticSource
-from bevviz.synthetic.sensors import Lidar
 
 FRAMES = 16
 PLANT = ("small_child",)

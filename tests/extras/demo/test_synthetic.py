@@ -15,16 +15,15 @@ from rosbags.highlevel import AnyReader
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, DetectorConfig, load
 from bevviz.errors import UserError
+from bevviz.extras.demo.bag import TOPICS, BagWriter, write_bag
+from bevviz.extras.demo.drive import PERIOD, START, Snapshot, SyntheticSource
+from bevviz.extras.demo.world import SECTION
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
 from bevviz.model.protocols import Items
 from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
 from bevviz.stages.detector import Detector
-from bevviz.synthetic import BagWriter, Snapshot, SyntheticSource, write_bag
-from bevviz.synthetic.bag import TOPICS
-from bevviz.synthetic.drive import PERIOD, START
-from bevviz.synthetic.world import SECTION
 
 
 @pytest.fixture(scope="module")

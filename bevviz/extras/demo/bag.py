@@ -22,6 +22,8 @@ from rosbags.interfaces import (
 
 from bevviz.bags.mcap_writer import McapWriter
 from bevviz.errors import UserError
+from bevviz.extras.demo import drive
+from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
     encode_boxes_3d,
@@ -34,8 +36,6 @@ from bevviz.messages.encode import (
 )
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
-from bevviz.synthetic import drive
-from bevviz.synthetic.drive import SyntheticSource
 
 TOPICS = {
     drive.LIDAR_TOPIC: "sensor_msgs/msg/PointCloud2",

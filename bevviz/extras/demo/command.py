@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import bevviz
 from bevviz.cli.options import Commands, add_config, add_keep, add_output, positive
 from bevviz.cli.outputs import Outputs, say
 from bevviz.cli.run import process
@@ -16,17 +17,17 @@ from bevviz.support.files import atomic_write, write_all
 
 if TYPE_CHECKING:
     from bevviz.config import Config, Preset
-    from bevviz.synthetic import SyntheticSource
+    from bevviz.extras.demo.drive import SyntheticSource
 
 FRAMES = 100
 BAG = Path("demo.mcap")  # drive of the workbench
-# The drive in the package, which bevviz/synthetic/sample.py made; the reference preset misses a child in it.
-SHIPPED = Path(__file__).parents[1] / "data" / "demo.mcap"
+# The drive in the package, which sample.py made; the reference preset misses a child in it.
+SHIPPED = Path(bevviz.__file__).parent / "data" / "demo.mcap"
 SHIPPED_FRAMES = 16
 SHIPPED_CHILD = 5  # frame in which the child is seen best
 FURTHER = 10  # frames of a simulated drive after those in which its faults are seen best
 
-# A test compares this text with bevviz.synthetic.faults. Importing that module would slow down --help.
+# A test compares this text with bevviz.extras.demo.faults. Importing that module would slow down --help.
 PLANTS = """faults to --plant:
   hidden_person   at 1 s: a person hidden behind a parked van: no point, no pixel
   flat_car        at 3 s: a car half a metre high, which the reference preset takes for ground
@@ -113,7 +114,7 @@ def _config(options: argparse.Namespace, preset: Preset | None) -> Config:
 
 def _simulated(options: argparse.Namespace, frames: int) -> SyntheticSource:
     """Return the simulated drive; ``frames`` is its length if none is stated."""
-    from bevviz.synthetic import SyntheticSource
+    from bevviz.extras.demo.drive import SyntheticSource
 
     return SyntheticSource(options.frames or frames, options.seed, plant=options.plant, weave=options.weave)
 
@@ -128,7 +129,7 @@ def _make_bag(options: argparse.Namespace, path: Path, frames: int = FRAMES) -> 
         with atomic_write(path, "drive") as unfinished:
             write_all(unfinished.handle, SHIPPED.read_bytes())
         return SHIPPED_FRAMES
-    from bevviz.synthetic import write_bag
+    from bevviz.extras.demo.bag import write_bag
 
     source = _simulated(options, frames)
     write_bag(source, path, progress.bar(source, total=source.total, unit="scan", desc="simulate"))
@@ -168,6 +169,6 @@ def _frame_of_interest(options: argparse.Namespace) -> int:
     """Return the frame in which the first planted fault is seen best."""
     if not _is_simulated(options):
         return SHIPPED_CHILD
-    from bevviz.synthetic.faults import FAULTS
+    from bevviz.extras.demo.faults import FAULTS
 
     return next((round(10 * FAULTS[name].time) for name in options.plant if name in FAULTS), 0)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bevviz.extras.demo.mesh import Material, Mesh, box, ellipsoid, grid, loft, merge, tube, wheel_rim
 from bevviz.model.frame import F64
-from bevviz.synthetic.mesh import Material, Mesh, box, ellipsoid, grid, loft, merge, tube, wheel_rim
 
 Color = tuple[int, int, int]  # BGR
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.errors import UserError, first_line
+from bevviz.extras.demo.mesh import Material, Mesh
+from bevviz.extras.demo.world import Light
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, U8, Intrinsics
-from bevviz.synthetic.mesh import Material, Mesh
-from bevviz.synthetic.world import Light
 
 # Share of the emitted light that is reflected, and amplitude of the texture.
 _SURFACE: Mapping[Material, tuple[float, float]] = {
@@ -47,7 +47,7 @@ def load_open3d() -> Any:
     except (ImportError, OSError) as error:  # OSError: a shared library that does not load
         raise UserError(
             f"the synthetic drive needs Open3D, which cannot be imported ({first_line(error)}): "
-            "pip install open3d libusb-package; bags and data sets need neither"
+            "pip install 'bevviz[demo]'; bags and data sets do not need it"
         ) from error
     return open3d
 

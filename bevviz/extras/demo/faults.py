@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.errors import UserError
+from bevviz.extras.demo import models
+from bevviz.extras.demo.world import SceneArea
 from bevviz.support.text import did_you_mean
-from bevviz.synthetic import models
-from bevviz.synthetic.world import SceneArea
 
 
 @dataclass(frozen=True, slots=True)
