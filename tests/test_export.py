@@ -163,7 +163,7 @@ def test_a_full_disk_leaves_no_folder(tmp_path: Path, make: type[FolderExport]) 
         assert not list(small.iterdir())
 
 
-def test_a_killed_export_leaves_another_name_that_the_next_one_deletes(tmp_path: Path) -> None:
+def test_the_next_export_deletes_what_a_killed_one_left(tmp_path: Path) -> None:
     script = (
         "import os, signal, sys; from pathlib import Path\n"
         "from bevviz.support.unfinished_folder import UnfinishedFolder\n"

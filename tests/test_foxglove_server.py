@@ -118,7 +118,7 @@ def test_a_client_gets_what_it_subscribes_to(server: FoxgloveServer) -> None:
         until(lambda: not server.wants(FIRST))
 
 
-def test_a_client_that_reads_nothing_delays_neither_the_robot_nor_the_end() -> None:
+def test_a_client_that_reads_nothing_delays_nobody() -> None:
     before = threading.active_count()
     with (
         FoxgloveServer(0) as server,

@@ -117,7 +117,7 @@ def test_no_parameter_takes_a_name_from_an_agent(tmp_path: Path, monkeypatch: py
                 assert "no such file" not in str(caught.value)
 
 
-def test_parameters_of_a_network_and_of_a_function_count_by_their_declaration(
+def test_parameters_of_networks_and_functions_are_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -105,7 +105,7 @@ def test_files_that_the_notices_name_exist() -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
-def test_notices_name_the_gpl_libraries_that_the_image_passes_on() -> None:
+def test_notices_name_the_gpl_libraries_of_the_image() -> None:
     """The wheel of PyAV says BSD. The terms of its libraries have to be read off their files."""
     import av
 

@@ -343,7 +343,7 @@ def test_compiled_files_beside_a_trusted_source_do_not_run(received: Path) -> No
     assert has_run(received) and not (received / "compiled").exists()
 
 
-def test_a_module_that_is_edited_after_the_check_does_not_run_in_a_worker(received: Path) -> None:
+def test_a_module_edited_after_the_check_runs_in_no_worker(received: Path) -> None:
     """A worker gets the configuration as a pickle, and imports the module later than the command has."""
     grant_trust(named_code(write_project(received)))
     sent = pickle.dumps(load(layers=read_project_layers(received, {})))
@@ -416,9 +416,7 @@ def test_no_import_of_a_trusted_module_leads_around_the_check(
     assert not Path("edited").exists()
 
 
-def test_modules_of_python_and_installed_ones_are_no_data_of_the_folder(
-    received: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_installed_modules_are_no_data_of_the_folder(received: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files named like modules of Python, folders of data, and an environment inside of the folder."""
     site = received / "venv" / "lib" / "site"
     (site / "drive_helper").mkdir(parents=True)
