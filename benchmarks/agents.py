@@ -25,9 +25,6 @@ from typing import Any
 import numpy as np
 from mcp.shared.memory import create_connected_server_and_client_session
 
-from bevviz.agents.drives import AskedDrive
-from bevviz.agents.server import make_server
-from bevviz.agents.tools import AgentTools
 from bevviz.config import load
 from bevviz.extras.demo.bag import BagWriter
 from bevviz.extras.demo.drive import (
@@ -39,6 +36,9 @@ from bevviz.extras.demo.drive import (
     SyntheticSource,
 )
 from bevviz.extras.demo.faults import FAULTS
+from bevviz.extras.mcp.drives import AskedDrive
+from bevviz.extras.mcp.server import make_server
+from bevviz.extras.mcp.tools import AgentTools
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
 from tests.support.mcp_client import Client, connected

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 import bevviz
-from bevviz.agents.drives import agent_config
 from bevviz.cli import importer, main
 from bevviz.config import changed_config, load, plugins
 from bevviz.config.project import named_code, read_project_layers
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import grant_trust
 from bevviz.errors import UserError
+from bevviz.extras.mcp.drives import agent_config
 from tests.support import bags
 from tests.support.modules import forget_modules
 

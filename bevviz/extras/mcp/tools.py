@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from bevviz.agents.drives import AskedDrive, agent_config
 from bevviz.bags.source import iso
 from bevviz.config import changes
 from bevviz.config.descriptions import describe_parameters
 from bevviz.config.keys import keys
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
+from bevviz.extras.mcp.drives import AskedDrive, agent_config
 from bevviz.fleet.summary import collect
 from bevviz.fleet.table import RunInfo
 from bevviz.pipeline.run import run

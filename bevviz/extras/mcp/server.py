@@ -15,8 +15,8 @@ from mcp.server.stdio import stdio_server
 from mcp.types import ToolAnnotations
 from pydantic import ValidationError
 
-from bevviz.agents.tools import AgentTools
 from bevviz.errors import UserError, first_line
+from bevviz.extras.mcp.tools import AgentTools
 
 INSTRUCTIONS = """Debugger for LiDAR-camera perception. Begin with `overview` (faults of the recording) and
 `findings` (what went wrong, by cause), ask `why` about one finding, and `try_values` or `compare` before you

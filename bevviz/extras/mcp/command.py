@@ -38,9 +38,9 @@ def add(commands: Commands) -> None:
 
 def _mcp(options: argparse.Namespace) -> int:
     try:
-        from bevviz.agents.drives import AskedDrive, batch_drives
-        from bevviz.agents.server import serve
-        from bevviz.agents.tools import AgentTools
+        from bevviz.extras.mcp.drives import AskedDrive, batch_drives
+        from bevviz.extras.mcp.server import serve
+        from bevviz.extras.mcp.tools import AgentTools
     except ImportError as error:
         raise UserError(
             f"an agent's server needs further packages ({error.name}): pip install 'bevviz[mcp]'"

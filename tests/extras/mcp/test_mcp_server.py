@@ -12,13 +12,13 @@ import pytest
 from mcp.server.fastmcp.exceptions import ToolError
 from mcp.types import TextContent
 
-from bevviz.agents.drives import AskedDrive, agent_config
-from bevviz.agents.server import make_server
-from bevviz.agents.tools import LIMIT, AgentTools, fitted
 from bevviz.config import TUTORIAL_NAMES, keys, load
 from bevviz.errors import UserError
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.mcp.drives import AskedDrive, agent_config
+from bevviz.extras.mcp.server import make_server
+from bevviz.extras.mcp.tools import LIMIT, AgentTools, fitted
 from tests.support.mcp_client import connected
 
 MISTUNED = "detector.conf_threshold=0.9"

@@ -1,1 +1,0 @@
-"""Tools of `bevviz mcp`, by which agents ask about a drive or a batch. Imports `workbench` and below."""

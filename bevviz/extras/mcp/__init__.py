@@ -1,0 +1,1 @@
+"""Server of `bevviz mcp`, by which agents ask about a drive or a batch."""
