@@ -70,7 +70,7 @@ def _config(module: str, clone: Path, session: Path) -> Path:
     name = re.compile(
         rf"{re.escape(dotted)}\b|{re.escape(dotted.rpartition('.')[0])} import .*\b{Path(module).stem}\b"
     )
-    tests = [path for path in sorted((clone / "tests").glob("test_*.py")) if name.search(path.read_text())]
+    tests = [path for path in sorted((clone / "tests").rglob("test_*.py")) if name.search(path.read_text())]
     tests = sorted(tests, key=lambda path: path.stat().st_size) or [clone / "tests/test_perceive.py"]
     command = shlex.join([sys.executable, "-m", "pytest", "-q", "-x", "-m", "not long", *map(str, tests)])
     path = session.with_suffix(".toml")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +14,21 @@ from hypothesis import strategies as st
 
 import bevviz
 from bevviz import UserError
+from bevviz.cli import main
+from bevviz.datasets import find_loader, loaders, open_dataset
 from bevviz.datasets.cloud_files import are_doubles, count_columns, read_cloud
 from bevviz.datasets.folder import Folder
 from bevviz.datasets.stamps import group_by_sensor
 from bevviz.extras.demo.sensors import load_open3d
 from bevviz.messages.camera_info import decode_camera_info
 from bevviz.messages.encode import encode_points
+from bevviz.model import geometry
 from bevviz.model.geometry import has_distortion
+from bevviz.support.extensions import registered
+from tests.support import datasets
 from tests.support.datasets import cloud, kitti_raw
+
+Capture = pytest.CaptureFixture[str]
 
 
 @given(st.integers(3, 7), st.integers(0, 1000), st.integers(500, 5000))
@@ -421,3 +430,211 @@ def test_a_piece_of_a_kitti_drive_is_a_plain_folder(tmp_path: Path) -> None:
         file.unlink()
     drive = bevviz.open(root)
     assert len(drive) == 3 and [camera.name for camera in drive.raw(0).cameras] == ["image_00", "image_02"]
+
+
+# --- whole drives ---------------------------------------------------------------------------
+
+
+def plain(root: Path) -> Path:
+    """Two clouds of three points in each format, and images."""
+    for folder in ("top", "front"):
+        (root / folder).mkdir(parents=True)
+    for i, stamp in enumerate(("1700000000.100000000", "1700000000.200000000")):
+        head = (
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\n"
+        )
+        if i == 0:
+            (root / f"top/{stamp}.pcd").write_text(head + "DATA ascii\n1 2 3 4\n5 6 7 8\n9 10 11 12\n")
+        else:
+            body = np.arange(1, 13, dtype="<f4").tobytes()
+            (root / f"top/{stamp}.pcd").write_bytes(head.encode() + b"DATA binary\n" + body)
+        datasets.image(root / f"front/{stamp}.png", 80 * i)
+    return root
+
+
+POINTS = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
+
+
+def test_a_folder_of_clouds_and_images_is_read(tmp_path: Path) -> None:
+    root = plain(tmp_path)
+    (root / "calibration.yaml").write_text(
+        "cameras:\n  front:\n    K: [100, 0, 62, 0, 100, 19, 0, 0, 1]\n"
+        "    pose: [0.5, 0, -0.2, -0.5, 0.5, -0.5, 0.5]\n"
+    )
+    (root / "poses.txt").write_text(
+        "# stamp\n".replace("# stamp\n", "") + "".join(f"1700000000.{i} {i} 0 0 0 0 0 1\n" for i in (1, 2))
+    )
+    with bevviz.open(root) as drive:
+        frames = [drive.raw(i) for i in range(len(drive))]
+        assert drive.warnings == []
+    for i, frame in enumerate(frames, 1):
+        assert frame.stamp == 1_700_000_000_000_000_000 + i * 100_000_000
+        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
+        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
+        (camera,) = frame.cameras
+        assert camera.name == "front"
+        assert camera.camera_from_points is not None
+        # Seen from half a metre ahead and 20 cm below: x ahead is z, left is -x, up is -y.
+        np.testing.assert_allclose(
+            geometry.apply(camera.camera_from_points, np.array([[10.5, 2, 0.8]])), [[-2, -1, 10]], atol=1e-5
+        )
+        np.testing.assert_allclose(frame.pose[:3, 3], [i, 0, 0])
+
+
+@pytest.mark.parametrize("form", ["bin", "npy", "ply", "ply-ascii"])
+def test_every_cloud_format_is_read(tmp_path: Path, form: str) -> None:
+    """Two frames by number; PLY as its document has it."""
+    for i in range(2):
+        file = tmp_path / f"{i:06d}.{form[:3]}"
+        if form == "bin":
+            POINTS.tofile(file)
+        elif form == "npy":
+            np.save(file, POINTS)
+        else:
+            kind = "ascii" if form == "ply-ascii" else "binary_little_endian"
+            head = f"ply\nformat {kind} 1.0\nelement vertex 3\n"
+            head += (
+                "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity")) + "end_header\n"
+            )
+            body = b"1 2 3 4\n5 6 7 8\n9 10 11 12\n" if form == "ply-ascii" else POINTS.tobytes()
+            file.write_bytes(head.encode() + body)
+    with bevviz.open(tmp_path) as drive:
+        frames = [drive.raw(i) for i in range(len(drive))]
+        assert any("taken for frame numbers, at 10 a second" in warning for warning in drive.warnings)
+    assert [frame.stamp for frame in frames] == [1_000_000_000, 1_100_000_000]
+    for frame in frames:
+        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
+        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
+
+
+def test_stamps_come_from_a_table_or_from_names(tmp_path: Path, capsys: Capture) -> None:
+    for name in "ab":
+        POINTS.tofile(tmp_path / f"{name}.bin")
+    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\nb.bin,1700000000600000000\n")
+    with bevviz.open(tmp_path) as drive:
+        assert [drive.raw(i).stamp for i in (0, 1)] == [
+            1_700_000_000_500_000_000,
+            1_700_000_000_600_000_000,
+        ]
+    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\n")
+    assert main(["info", str(tmp_path)]) == 2
+    assert "stamps.csv: no stamp for b.bin" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: {front: {K: [1, 2]}}", "camera front: K needs 9 numbers"),
+        ("cameras: {front: {pose: [1, 2, 3]}}", "pose of front: 3 numbers; expected x y z qx qy qz qw"),
+        ("cameras: {front: {K: [7, 0, 0, 0, 7, 0, 4, 3, 1]}}", "row by row (the last 0 0 1)"),
+        ("cameras: {front: {pose: [1, 2, 3, 0, 0, 1, 1]}}", "its quaternion has the length 1.41, not 1"),
+        (
+            "lidars: {top: {pose: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}}",
+            "last row is not 0 0 0 1",
+        ),
+        ("lidars: {top: {pose: [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}}", "is no rotation"),
+        ("lidars: {top: {fields: [x, y, i]}}", "is no list with x, y and z in it"),
+        ("cameras: {rear: {}}", "no rear among the cameras; there are front"),
+        ("camera: {}", "camera is not known; there are D, K, cameras"),
+        ("cameras: [", "is not valid YAML"),
+    ],
+)
+def test_a_wrong_calibration_is_one_line(tmp_path: Path, text: str, message: str, capsys: Capture) -> None:
+    root = plain(tmp_path)
+    (root / "calibration.yaml").write_text(text)
+    assert main(["info", str(root)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert "calibration.yaml" in line
+
+
+def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Capture) -> None:
+    root = plain(tmp_path)
+    (root / "top/1700000000.300000000.pcd").write_bytes(b"no cloud")
+    with bevviz.open(root) as drive:
+        frames = list(drive.frames)
+        assert len(frames) == 2
+        (told,) = [w for w in drive.warnings if "1700000000.300000000.pcd" in w or "/top/points" in w]
+        assert "1700000000.300000000.pcd: cannot be read as a cloud" in told
+    assert capfd.readouterr().out == ""
+
+
+def test_two_drives_in_one_folder_are_two(tmp_path: Path, capsys: Capture) -> None:
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            datasets.scan(number).tofile(tmp_path / name / f"{number:06}.bin")
+            datasets.image(tmp_path / name / f"{number:06}.png", 60)
+    assert main(["info", str(tmp_path)]) == 2
+    assert "2 drives; choose with --sequence NAME; there are monday, tuesday" in capsys.readouterr().err
+    assert main(["info", str(tmp_path), "--sequence", "tuesday"]) == 0
+    (tmp_path / "calibration.yaml").write_text("rate: 10")  # says that the folders are sensors of one drive
+    capsys.readouterr()
+    assert main(["info", str(tmp_path)]) == 0
+    assert "/monday/points" in capsys.readouterr().out
+
+
+# --- what packages register ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
+    """Return a function that installs a package: the source of its module, and its entry points."""
+
+    def install(source: str, points: str) -> None:
+        (tmp_path / "my_sets-1.0.dist-info").mkdir()
+        (tmp_path / "my_sets-1.0.dist-info/METADATA").write_text("Name: my_sets\nVersion: 1.0\n")
+        (tmp_path / "my_sets-1.0.dist-info/entry_points.txt").write_text(points)
+        (tmp_path / "my_sets.py").write_text(source)
+        monkeypatch.syspath_prepend(tmp_path)
+        registered.cache_clear()
+        loaders.cache_clear()
+
+    yield install
+    sys.modules.pop("my_sets", None)
+    registered.cache_clear()
+    loaders.cache_clear()
+
+
+def test_a_package_registers_its_data_set(tmp_path: Path, package: Callable[[str, str], None]) -> None:
+    source = """
+from bevviz.datasets.folder import Folder
+
+class Mine(Folder):
+    name, about, expects, any_folder = "mine", "our data set", "mine.txt", False
+
+    @classmethod
+    def fits(cls, path):
+        return (path / "mine.txt").is_file()
+"""
+    package(source, "[bevviz.datasets]\nmine = my_sets:Mine\n")
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    cloud(4).tofile(drive / "000000.bin")
+    assert find_loader(drive) is Folder
+    (drive / "mine.txt").touch()
+    opened = open_dataset(drive)
+    assert opened and opened.about == "our data set" and len(opened.streams[0].times) == 1
+
+
+def test_what_is_no_data_set_is_one_line(package: Callable[[str, str], None]) -> None:
+    package("Mine = 5", "[bevviz.datasets]\nmine = my_sets:Mine\n")
+    with pytest.raises(UserError, match=r"^the dataset 'mine' \(my_sets:Mine\) .*repair or uninstall"):
+        loaders()
+
+
+def test_a_package_reads_its_calibrations(tmp_path: Path, package: Callable[[str, str], None]) -> None:
+    source = """
+from bevviz.datasets.folder import FoundCalibration
+
+def find(path, lidars, cameras):
+    K = [float(number) for number in (path / "ours.cal").read_text().split()]
+    return FoundCalibration(cameras={name: {"K": K} for name in cameras}, files=[path / "ours.cal"])
+"""
+    package(source, "[bevviz.calibrations]\nmine = my_sets:find\n")
+    root = plain(tmp_path / "drive")
+    (root / "ours.cal").write_text("100 0 62 0 100 19 0 0 1")
+    folder = Folder(root, "")
+    assert "calibrated by ours.cal" in folder.warnings
+    assert "/front/camera_info" in [stream.topic for stream in folder.streams]

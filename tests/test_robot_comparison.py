@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from bevviz.bags.source import BagSource
 from bevviz.config import OpinionsConfig, changed_config, load
 from bevviz.config.trust import USER
-from bevviz.datasets.kitti_files import label_files, read_labels
+from bevviz.datasets.kitti_labels import label_files, read_labels
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.datasets.kitti_files import label_files, read_labels
+from bevviz.datasets.kitti_labels import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
 from bevviz.extras.demo.bag import write_bag

@@ -14,7 +14,7 @@ import pytest
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, SourceConfig
-from bevviz.datasets.kitti_files import read_labels
+from bevviz.datasets.kitti_labels import read_labels
 from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
 from bevviz.messages.encode import encode_boxes_3d

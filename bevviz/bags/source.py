@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from bevviz.bags.message import RawMessage
 from bevviz.bags.remote import address_of
 from bevviz.config import Config, stage_topics
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error
-from bevviz.datasets.result_files import ResultFile, open_results
 from bevviz.errors import UserError
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.guard import guard
@@ -29,6 +29,9 @@ from bevviz.support.contexts import Closable
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import LARGE_LOSS, UnusableMessages, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
+
+if TYPE_CHECKING:
+    from bevviz.datasets.result_files import ResultFile
 
 SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
@@ -373,6 +376,8 @@ class BagSource(Closable):
         results = self.config.source.results
         if not results:
             return []
+        from bevviz.datasets.result_files import open_results
+
         driver = find_roles(self.recording.topics, self.config.source).driver
         scans = len(self.recording.scan_times(driver)) if driver else 0
         return open_results(results, self.recording.folder, scans, self.recording.sample_stamps)

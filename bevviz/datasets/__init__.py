@@ -1,15 +1,14 @@
-"""Readers of data set folders as streams of messages. Imports `sync` and the layers below it."""
+"""Readers of folders as streams of messages, and of result files. Imports `sync` and the layers below it."""
 
 from __future__ import annotations
 
 import difflib
 from functools import cache
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, Dataset, describe_error, subfolders
 from bevviz.errors import UserError
+from bevviz.support.extensions import load_class, registered
 
 LEVELS = 2  # of subfolders in which drives are looked for
 MAX_SUBFOLDERS = 200  # that are examined in each folder
@@ -17,10 +16,11 @@ MAX_SUBFOLDERS = 200  # that are examined in each folder
 
 @cache
 def loaders() -> dict[str, type[Dataset]]:
-    """Return all loaders by name. The loader of any folder is last."""
-    for module in iter_modules(__path__):
-        import_module(f"{__name__}.{module.name}")
-    classes = sorted(Dataset.__subclasses__(), key=lambda loader: (loader.any_folder, loader.name))
+    """Return the registered loaders and that of plain folders by name. The loader of any folder is last."""
+    from bevviz.datasets.folder import Folder
+
+    classes = [*(load_class(point, Dataset) for point in registered("datasets").values()), Folder]
+    classes.sort(key=lambda loader: (loader.any_folder, loader.name))
     return {loader.name: loader for loader in classes}
 
 

@@ -85,7 +85,7 @@ class Stream:
 
 
 class Dataset:
-    """One drive of a data set. A subclass in a module of this package is a loader; it registers itself.
+    """One drive of a data set. A subclass is a loader; the entry points ``bevviz.datasets`` register it.
 
     Attributes:
         name: name for ``--dataset``.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bevviz.config.files import parse_yaml
-from bevviz.datasets.calibrations import find_calibrations
 from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_cloud, why_no_points
 from bevviz.datasets.dataset import (
     BASE,
@@ -33,6 +33,7 @@ from bevviz.errors import UserError
 from bevviz.messages.encode import encode_points
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
+from bevviz.support.extensions import load, registered
 from bevviz.support.files import CONFIG_LIMIT, TABLE_LIMIT, read_lines, read_text
 
 MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
@@ -61,6 +62,26 @@ MAX_OFFSET = 100  # metres; sensors of one vehicle are closer together
 MIN_FRAMES = 5  # Fewer frames say nothing about a rate.
 MIN_RATE = 1e-6  # frames per second
 FRAME_RATIO = 1.5  # ratio of frame counts that another rate explains
+
+
+@dataclass(slots=True)
+class FoundCalibration:
+    """Statements of calibration files, as ``calibration.yaml`` has them: by kind of sensor and name.
+
+    The functions that the entry points ``bevviz.calibrations`` name return it. Their arguments are the folder
+    and the names of its LiDARs and of its cameras.
+
+    Attributes:
+        lidars: pose of each LiDAR.
+        cameras: pose, K, D, distortion_model and size of each camera.
+        files: files that state them.
+        warnings: problems of files, one sentence each.
+    """
+
+    lidars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 class Folder(Dataset):
@@ -152,21 +173,21 @@ class Folder(Dataset):
         stated = about.get("cameras", {})
         if all({"K", "pose"} <= stated.get(name, {}).keys() for name in cameras):
             return about, ()
-        found = find_calibrations(self.path, lidars, cameras)
-        for text in found.warnings:
-            self.warn(text)
-        if found.files:
-            files = ", ".join(str(file.relative_to(self.path)) for file in found.files[:3])
-            more = f" and {len(found.files) - 3} more" if len(found.files) > 3 else ""
-            self.warn(f"calibrated by {files}{more}")
-        merged = {
-            kind: {
-                name: {**sensors.get(name, {}), **about.get(kind, {}).get(name, {})}
-                for name in {*sensors, *about.get(kind, {})}
-            }
-            for kind, sensors in (("lidars", found.lidars), ("cameras", found.cameras))
-        }
-        return {**about, **{kind: sensors for kind, sensors in merged.items() if sensors}}, found.files
+        files = list[Path]()
+        for point in registered("calibrations").values():
+            found: FoundCalibration = load(point)(self.path, lidars, cameras)
+            for text in found.warnings:
+                self.warn(text)
+            files += found.files
+            for kind, sensors in (("lidars", found.lidars), ("cameras", found.cameras)):
+                known = about.get(kind, {})
+                merged = {name: {**sensors.get(name, {}), **known.get(name, {})} for name in sensors | known}
+                about = {**about, kind: merged} if merged else about
+        if files:
+            first = ", ".join(str(file.relative_to(self.path)) for file in files[:3])
+            more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+            self.warn(f"calibrated by {first}{more}")
+        return about, files
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""

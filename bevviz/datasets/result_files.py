@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
-from bevviz.datasets.kitti_files import Calibration, labelled_boxes
-from bevviz.datasets.nuscenes import pose_of
+from bevviz.datasets.kitti_labels import Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
 from bevviz.messages.topics import Topic
 from bevviz.model import geometry
@@ -238,10 +237,11 @@ class NuScenesResults(ResultFile):
         rows = self._by_stamp.get(frame.stamp)
         if rows is None:
             return None
+        turns = [geometry.yaw(geometry.transform_wxyz(row["translation"], row["rotation"])) for row in rows]
         boxes = Boxes3D(
             np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3),
             np.array([row["size"] for row in rows], np.float32).reshape(-1, 3)[:, [1, 0, 2]],
-            np.array([geometry.yaw(pose_of(row)) for row in rows], np.float32),
+            np.array(turns, np.float32),
         )
         labels = [NUSCENES_CLASSES.get(row["detection_name"], row["detection_name"]) for row in rows]
         scores = [row.get("detection_score", 1.0) for row in rows]

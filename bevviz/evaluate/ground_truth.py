@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from bevviz.datasets.kitti_files import label_files, read_labels
+from bevviz.datasets.kitti_labels import label_files, read_labels
 from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles

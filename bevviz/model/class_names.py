@@ -35,14 +35,6 @@ VIEW_OF_DELFT = {  # Palffy et al. 2022, classes that COCO lacks
     "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
     "motor": frozenset({"motor", "motorcycle"}),
 }
-ARGOVERSE_CLASSES = {  # category of Argoverse 2 (Wilson et al. 2021) -> class; others in small letters
-    "REGULAR_VEHICLE": "car",
-    **dict.fromkeys(("LARGE_VEHICLE", "BOX_TRUCK", "TRUCK", "TRUCK_CAB"), "truck"),
-    **dict.fromkeys(("BUS", "SCHOOL_BUS", "ARTICULATED_BUS"), "bus"),
-    "VEHICULAR_TRAILER": "trailer",
-    **dict.fromkeys(("PEDESTRIAN", "OFFICIAL_SIGNALER"), "pedestrian"),
-    "CONSTRUCTION_CONE": "traffic_cone",
-}
 NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which omits the other categories
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
@@ -59,19 +51,6 @@ NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which
     "human.pedestrian.construction_worker": "pedestrian",
     "human.pedestrian.police_officer": "pedestrian",
 }
-NUSCENES_WITHOUT_CLASS = frozenset(  # categories of nuScenes that belong to no class of the detection task
-    {
-        "animal",
-        "human.pedestrian.personal_mobility",
-        "human.pedestrian.stroller",
-        "human.pedestrian.wheelchair",
-        "movable_object.debris",
-        "movable_object.pushable_pullable",
-        "static_object.bicycle_rack",
-        "vehicle.emergency.ambulance",
-        "vehicle.emergency.police",
-    }
-)
 DATA_SETS = (KITTI, NUSCENES, SEMANTIC_KITTI, VIEW_OF_DELFT)
 ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
 

@@ -47,6 +47,12 @@ def transform(translation: Iterable[float], quaternion_xyzw: Iterable[float]) ->
     )
 
 
+def transform_wxyz(translation: Iterable[float], quaternion_wxyz: Iterable[float]) -> F64:
+    """Return the (4, 4) matrix of a translation and a quaternion w, x, y, z, as ``transform`` does."""
+    w, x, y, z = quaternion_wxyz
+    return transform(translation, (x, y, z, w))
+
+
 def rotations(axis: int, angles: FloatArray) -> F64:
     """Return (N, 3, 3) rotations by (N,) angles in radians about x (0), y (1) or z (2)."""
     a, b = (axis + 1) % 3, (axis + 2) % 3

@@ -5,14 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 from bevviz.errors import UserError, first_line
 
 EXTRAS = "bevviz.extras."
 Kind: TypeAlias = Literal[
-    "commands", "datasets", "decoders", "exports", "rescuers", "simulators", "stages", "watches"
+    "calibrations",
+    "commands",
+    "datasets",
+    "decoders",
+    "exports",
+    "rescuers",
+    "simulators",
+    "stages",
+    "watches",
 ]
+T = TypeVar("T")
 
 
 @cache
@@ -55,6 +64,19 @@ def load(point: EntryPoint) -> Any:
         raise UserError(f"{point.name} needs the package {missing}: pip install 'bevviz[{extra}]'") from None
     except Exception as error:  # A package may raise anything when it is imported.
         raise _unusable(point, error) from error
+
+
+def load_class(point: EntryPoint, base: type[T]) -> type[T]:
+    """Import the subclass of ``base`` that an entry point names.
+
+    Raises:
+        UserError: it cannot be imported, or it is no such class.
+    """
+    target = load(point)
+    if not isinstance(target, type) or not issubclass(target, base):
+        expected = f"{base.__module__}.{base.__name__}"
+        raise _unusable(point, TypeError(f"it is no subclass of {expected}"))
+    return target
 
 
 def _unusable(point: EntryPoint, error: Exception) -> UserError:

@@ -29,6 +29,9 @@ IMU_TR += "3.195559e-01 2.024406e-03 1.482454e-02 9.998881e-01 -7.997231e-01"
 PLACES = [(49.0110 + 1e-5 * i, 8.4230 + 3e-5 * i, 112.8 + 0.01 * i) for i in range(4)]
 TURNS = [(0.02, 0.01 * i, -1.2 + 0.05 * i) for i in range(4)]
 
+# What Git leaves in the place of a large file that was not fetched.
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 1234567\n"
+
 # YAML whose aliases stand for more than any memory holds.
 LAUGHS = "a0: &a0 [x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12)

@@ -23,7 +23,6 @@ from bevviz.datasets.dataset import (
 from bevviz.errors import UserError, first_line
 from bevviz.messages.encode import encode_labels, encode_points
 from bevviz.model import geometry
-from bevviz.model.class_names import ARGOVERSE_CLASSES
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
 
 LIDAR, CAMERAS = "sensors/lidar", "sensors/cameras"
@@ -34,6 +33,14 @@ POSITION = ("tx_m", "ty_m", "tz_m")
 # Columns of a scan and their names here.
 FIELDS = {"x": "x", "y": "y", "z": "z", "intensity": "intensity", "laser_number": "ring", "offset_ns": "time"}
 FORMATS = {"intensity": "u1", "ring": "u1"}
+CLASSES = {  # category -> class; others in small letters
+    "REGULAR_VEHICLE": "car",
+    **dict.fromkeys(("LARGE_VEHICLE", "BOX_TRUCK", "TRUCK", "TRUCK_CAB"), "truck"),
+    **dict.fromkeys(("BUS", "SCHOOL_BUS", "ARTICULATED_BUS"), "bus"),
+    "VEHICULAR_TRAILER": "trailer",
+    **dict.fromkeys(("PEDESTRIAN", "OFFICIAL_SIGNALER"), "pedestrian"),
+    "CONSTRUCTION_CONE": "traffic_cone",
+}
 Table = dict[str, NDArray[Any]]
 
 
@@ -131,7 +138,7 @@ class Argoverse2(Dataset):
                 np.array([geometry.yaw(_pose(table, int(row))) for row in rows], np.float32),
             )
             names = [str(table["category"][row]) for row in rows]
-            labels = [ARGOVERSE_CLASSES.get(name, name.lower()) for name in names]
+            labels = [CLASSES.get(name, name.lower()) for name in names]
             ids = [str(table["track_uuid"][row]) for row in rows]
             return encode_labels(int(times[number]), BASE, boxes, labels, ids)
 

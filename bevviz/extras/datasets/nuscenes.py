@@ -32,7 +32,7 @@ from bevviz.datasets.dataset import (
 from bevviz.errors import UserError, first_line
 from bevviz.messages.encode import encode_labels, encode_points
 from bevviz.model import geometry
-from bevviz.model.class_names import NUSCENES_CLASSES, NUSCENES_WITHOUT_CLASS
+from bevviz.model.class_names import NUSCENES_CLASSES
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
 from bevviz.support import progress
 from bevviz.support.files import open_regular
@@ -42,6 +42,19 @@ FIELDS = ("x", "y", "z", "intensity", "ring")
 READ_SIZE = 1 << 22  # characters read at once; the largest table has a gigabyte
 MAX_ROW = 1 << 24  # characters; a row usually has a thousand
 MAX_TABLE_BYTES = 1 << 33  # bytes of a table
+WITHOUT_CLASS = frozenset(  # categories that belong to no class of the detection task
+    {
+        "animal",
+        "human.pedestrian.personal_mobility",
+        "human.pedestrian.stroller",
+        "human.pedestrian.wheelchair",
+        "movable_object.debris",
+        "movable_object.pushable_pullable",
+        "static_object.bicycle_rack",
+        "vehicle.emergency.ambulance",
+        "vehicle.emergency.police",
+    }
+)
 Record = Mapping[str, Any]
 
 
@@ -106,7 +119,7 @@ class NuScenes(Dataset):
         key_stamps: dict[str, int] = {}  # stamp of the key scan by sample
         for channel, rows in sorted(rows_by_channel.items()):
             calibration = mounted[rows[0]["calibrated_sensor_token"]]
-            pose = pose_of(calibration)
+            pose = geometry.transform_wxyz(calibration["translation"], calibration["rotation"])
             times = 1000 * np.array([row["timestamp"] for row in rows], np.int64)
             files = [_resolve_file(root, row["filename"]) for row in rows]
             if sensors[calibration["sensor_token"]]["modality"] == "lidar":
@@ -213,9 +226,7 @@ class NuScenes(Dataset):
                 for row in labelled[sample]
             ]
             labelled_rows = [
-                (row, NUSCENES_CLASSES.get(name, name))
-                for row, name in rows
-                if name not in NUSCENES_WITHOUT_CLASS
+                (row, NUSCENES_CLASSES.get(name, name)) for row, name in rows if name not in WITHOUT_CLASS
             ]
             boxes = Boxes3D(
                 np.array([_numbers(row["translation"], 3) for row, _ in labelled_rows]).reshape(-1, 3),
@@ -234,13 +245,12 @@ def _pose_stream(poses: Sequence[Record]) -> Stream:
     """Return the stream of vehicle poses by stamp."""
     pose_rows = {1000 * int(row["timestamp"]): row for row in poses}
     times = np.array(sorted(pose_rows), np.int64)
-    return pose_stream(times, BASE, lambda row: pose_of(pose_rows[int(times[row])]))
 
+    def pose(number: int) -> F64:
+        row = pose_rows[int(times[number])]
+        return geometry.transform_wxyz(row["translation"], row["rotation"])
 
-def pose_of(row: Record) -> F64:
-    """Return the (4, 4) pose of a translation and a quaternion w, x, y, z."""
-    w, x, y, z = row["rotation"]
-    return geometry.transform(row["translation"], (x, y, z, w))
+    return pose_stream(times, BASE, pose)
 
 
 def _numbers(values: Any, count: int) -> F64:
@@ -253,9 +263,8 @@ def _numbers(values: Any, count: int) -> F64:
 
 def _yaw(rotation: Any) -> float:
     """Return the rotation about z of a quaternion w, x, y, z; NaN if it is no rotation."""
-    w, x, y, z = _numbers(rotation, 4)
     try:
-        return geometry.yaw(geometry.transform(np.zeros(3), (x, y, z, w)))
+        return geometry.yaw(geometry.transform_wxyz(np.zeros(3), _numbers(rotation, 4)))
     except ValueError:
         return math.nan
 

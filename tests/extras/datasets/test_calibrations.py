@@ -13,7 +13,7 @@ import bevviz
 from bevviz.cli import main
 from bevviz.datasets import find_loader
 from bevviz.datasets.folder import Folder
-from bevviz.datasets.kitti_drives import KittiObject
+from bevviz.extras.datasets.kitti_drives import KittiObject
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera
 from tests.support import datasets
@@ -278,7 +278,7 @@ def test_images_belong_to_the_clouds_of_their_names(tmp_path: Path) -> None:
 
 
 def test_a_rotation_with_few_digits_is_made_one() -> None:
-    from bevviz.datasets.calibrations import _rigid
+    from bevviz.extras.datasets.calibrations import _rigid
 
     rounded = np.round(CAMERA_FROM_LIDAR @ geometry.transform(np.zeros(3), (0, 0, 0.0998, 0.995)), 2)
     rotation = _rigid(rounded)[:3, :3]

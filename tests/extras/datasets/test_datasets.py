@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,9 @@ from bevviz.fleet.jobs import find_bags
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Boxes3D, Frame
 from tests.support import datasets
+from tests.support.commands import environment
+from tests.support.kept_drives import BAG
+from tests.support.waiting import PATIENCE
 
 Capture = pytest.CaptureFixture[str]
 STILL = {"sync.motion_compensation": False}
@@ -214,7 +219,7 @@ def test_a_missed_object_is_asked_about(shared: Path, capsys: Capture) -> None:
 
 def test_a_nuscenes_scene_equals_what_its_devkit_reads(tmp_path: Path) -> None:
     """The reference is what nuscenes-devkit 1.2.0 makes of the same folder, see references/README.md."""
-    expected = json.loads((Path(__file__).parent / "references/metrics/nuscenes_devkit.json").read_text())
+    expected = json.loads((Path(__file__).parents[2] / "references/metrics/nuscenes_devkit.json").read_text())
     root = datasets.nuscenes(tmp_path)
     with bevviz.open(root, set={"source.sequence": "scene-0061"}) as drive:
         frames = frames_of(drive)
@@ -288,131 +293,6 @@ def test_nuscenes_is_evaluated(tmp_path: Path, capsys: Capture) -> None:
     )
     assert json.loads(report.read_text())["metrics"]["missed"] == 2  # no image shows one
     assert "2 frames, 1 without truth left out" in capsys.readouterr().out
-
-
-# --- a plain folder ----------------------------------------------------------------------------
-
-
-def plain(root: Path) -> Path:
-    """Two clouds of three points in each format, and images."""
-    for folder in ("top", "front"):
-        (root / folder).mkdir(parents=True)
-    for i, stamp in enumerate(("1700000000.100000000", "1700000000.200000000")):
-        head = (
-            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-            "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\n"
-        )
-        if i == 0:
-            (root / f"top/{stamp}.pcd").write_text(head + "DATA ascii\n1 2 3 4\n5 6 7 8\n9 10 11 12\n")
-        else:
-            body = np.arange(1, 13, dtype="<f4").tobytes()
-            (root / f"top/{stamp}.pcd").write_bytes(head.encode() + b"DATA binary\n" + body)
-        datasets.image(root / f"front/{stamp}.png", 80 * i)
-    return root
-
-
-POINTS = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
-
-
-def test_a_folder_of_clouds_and_images_is_read(tmp_path: Path) -> None:
-    root = plain(tmp_path)
-    (root / "calibration.yaml").write_text(
-        "cameras:\n  front:\n    K: [100, 0, 62, 0, 100, 19, 0, 0, 1]\n"
-        "    pose: [0.5, 0, -0.2, -0.5, 0.5, -0.5, 0.5]\n"
-    )
-    (root / "poses.txt").write_text(
-        "# stamp\n".replace("# stamp\n", "") + "".join(f"1700000000.{i} {i} 0 0 0 0 0 1\n" for i in (1, 2))
-    )
-    with bevviz.open(root) as drive:
-        frames = frames_of(drive)
-        assert drive.warnings == []
-    for i, frame in enumerate(frames, 1):
-        assert frame.stamp == 1_700_000_000_000_000_000 + i * 100_000_000
-        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
-        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
-        (camera,) = frame.cameras
-        assert camera.name == "front"
-        assert camera.camera_from_points is not None
-        # Seen from half a metre ahead and 20 cm below: x ahead is z, left is -x, up is -y.
-        np.testing.assert_allclose(
-            geometry.apply(camera.camera_from_points, np.array([[10.5, 2, 0.8]])), [[-2, -1, 10]], atol=1e-5
-        )
-        np.testing.assert_allclose(frame.pose[:3, 3], [i, 0, 0])
-
-
-@pytest.mark.parametrize("form", ["bin", "npy", "ply", "ply-ascii"])
-def test_every_cloud_format_is_read(tmp_path: Path, form: str) -> None:
-    """Two frames by number; PLY as its document has it."""
-    for i in range(2):
-        file = tmp_path / f"{i:06d}.{form[:3]}"
-        if form == "bin":
-            POINTS.tofile(file)
-        elif form == "npy":
-            np.save(file, POINTS)
-        else:
-            kind = "ascii" if form == "ply-ascii" else "binary_little_endian"
-            head = f"ply\nformat {kind} 1.0\nelement vertex 3\n"
-            head += (
-                "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity")) + "end_header\n"
-            )
-            body = b"1 2 3 4\n5 6 7 8\n9 10 11 12\n" if form == "ply-ascii" else POINTS.tobytes()
-            file.write_bytes(head.encode() + body)
-    with bevviz.open(tmp_path) as drive:
-        frames = frames_of(drive)
-        assert any("taken for frame numbers, at 10 a second" in warning for warning in drive.warnings)
-    assert [frame.stamp for frame in frames] == [1_000_000_000, 1_100_000_000]
-    for frame in frames:
-        np.testing.assert_array_equal(frame.points, POINTS[:, :3])
-        np.testing.assert_array_equal(frame.fields["intensity"], POINTS[:, 3])
-
-
-def test_stamps_come_from_a_table_or_from_names(tmp_path: Path, capsys: Capture) -> None:
-    for name in "ab":
-        POINTS.tofile(tmp_path / f"{name}.bin")
-    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\nb.bin,1700000000600000000\n")
-    with bevviz.open(tmp_path) as drive:
-        assert [f.stamp for f in frames_of(drive)] == [1_700_000_000_500_000_000, 1_700_000_000_600_000_000]
-    (tmp_path / "stamps.csv").write_text("file,stamp\na.bin,1700000000.5\n")
-    assert main(["info", str(tmp_path)]) == 2
-    assert "stamps.csv: no stamp for b.bin" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("cameras: {front: {K: [1, 2]}}", "camera front: K needs 9 numbers"),
-        ("cameras: {front: {pose: [1, 2, 3]}}", "pose of front: 3 numbers; expected x y z qx qy qz qw"),
-        ("cameras: {front: {K: [7, 0, 0, 0, 7, 0, 4, 3, 1]}}", "row by row (the last 0 0 1)"),
-        ("cameras: {front: {pose: [1, 2, 3, 0, 0, 1, 1]}}", "its quaternion has the length 1.41, not 1"),
-        (
-            "lidars: {top: {pose: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}}",
-            "last row is not 0 0 0 1",
-        ),
-        ("lidars: {top: {pose: [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}}", "is no rotation"),
-        ("lidars: {top: {fields: [x, y, i]}}", "is no list with x, y and z in it"),
-        ("cameras: {rear: {}}", "no rear among the cameras; there are front"),
-        ("camera: {}", "camera is not known; there are D, K, cameras"),
-        ("cameras: [", "is not valid YAML"),
-    ],
-)
-def test_a_wrong_calibration_is_one_line(tmp_path: Path, text: str, message: str, capsys: Capture) -> None:
-    root = plain(tmp_path)
-    (root / "calibration.yaml").write_text(text)
-    assert main(["info", str(root)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-    assert "calibration.yaml" in line
-
-
-def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Capture) -> None:
-    root = plain(tmp_path)
-    (root / "top/1700000000.300000000.pcd").write_bytes(b"no cloud")
-    with bevviz.open(root) as drive:
-        frames = list(drive.frames)
-        assert len(frames) == 2
-        (told,) = [w for w in drive.warnings if "1700000000.300000000.pcd" in w or "/top/points" in w]
-        assert "1700000000.300000000.pcd: cannot be read as a cloud" in told
-    assert capfd.readouterr().out == ""
 
 
 # --- many drives -------------------------------------------------------------------------------
@@ -518,16 +398,13 @@ def test_a_drive_below_wins_over_crops_of_its_objects(tmp_path: Path, capsys: Ca
     assert main(["info", str(root / "kitti_gt_database")]) == 0  # who asks for the crops gets them
 
 
-def test_two_drives_in_one_folder_are_two(tmp_path: Path, capsys: Capture) -> None:
-    for name in ("monday", "tuesday"):
-        (tmp_path / name).mkdir()
-        for number in range(2):
-            datasets.scan(number).tofile(tmp_path / name / f"{number:06}.bin")
-            datasets.image(tmp_path / name / f"{number:06}.png", 60)
-    assert main(["info", str(tmp_path)]) == 2
-    assert "2 drives; choose with --sequence NAME; there are monday, tuesday" in capsys.readouterr().err
-    assert main(["info", str(tmp_path), "--sequence", "tuesday"]) == 0
-    (tmp_path / "calibration.yaml").write_text("rate: 10")  # says that the folders are sensors of one drive
-    capsys.readouterr()
-    assert main(["info", str(tmp_path)]) == 0
-    assert "/monday/points" in capsys.readouterr().out
+def test_a_bag_needs_no_loader_of_data_sets() -> None:
+    script = (
+        "import sys; from bevviz.cli import main; main(['info', sys.argv[1]])\n"
+        "loaders = 'bevviz.extras.datasets', 'bevviz.datasets.folder'\n"
+        "print([name for name in sys.modules if name.startswith(loaders)], file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", script, str(BAG)]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0
+    assert done.stderr.splitlines()[-1] == "[]"

@@ -16,16 +16,10 @@ import numpy as np
 
 from bevviz.config.files import parse_yaml
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in, subfolders
-from bevviz.datasets.kitti_files import (
-    MIN_FOCAL,
-    Calibration,
-    named_rows,
-    read_rigid,
-    rectified_camera,
-    split_projection,
-)
-from bevviz.datasets.nuscenes import pose_of
+from bevviz.datasets.folder import FoundCalibration
+from bevviz.datasets.kitti_labels import MIN_FOCAL, Calibration, named_rows, split_projection
 from bevviz.errors import UserError
+from bevviz.extras.datasets.kitti_files import read_rigid, rectified_camera
 from bevviz.model import geometry
 from bevviz.model.frame import F64
 from bevviz.support.files import read_text
@@ -63,16 +57,6 @@ class FoundSensor:
     sensor_from_lidar: F64 | None = None
     base_from_sensor: F64 | None = None
     is_lidar: bool = False
-
-
-@dataclass(slots=True)
-class FoundCalibration:
-    """Statements of all files, as ``calibration.yaml`` has them: by kind of sensor and name."""
-
-    lidars: dict[str, dict[str, Any]] = field(default_factory=dict)
-    cameras: dict[str, dict[str, Any]] = field(default_factory=dict)
-    files: list[Path] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
 
 
 def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[str]) -> FoundCalibration:
@@ -355,7 +339,7 @@ def _named_sensors(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
     for key, about in tree.items():
         if not (isinstance(about, dict) and {"translation", "rotation"} <= about.keys()):
             continue
-        pose = pose_of(about)
+        pose = geometry.transform_wxyz(about["translation"], about["rotation"])
         intrinsic = about.get("camera_intrinsic") or about.get("intrinsic")
         lens = {"K": _square(_flat(intrinsic))} if intrinsic else {}
         if D := _flat(about.get("camera_distortion") or ()):

@@ -32,12 +32,11 @@ from bevviz.datasets.dataset import (
     read_table,
     subfolders,
 )
-from bevviz.datasets.kitti_files import (
-    Calibration,
+from bevviz.datasets.kitti_labels import Calibration, named_rows, read_labels
+from bevviz.errors import UserError
+from bevviz.extras.datasets.kitti_files import (
     boxes_of,
-    named_rows,
     poses_of_oxts,
-    read_labels,
     read_rigid,
     read_semantics,
     read_timestamps,
@@ -45,7 +44,6 @@ from bevviz.datasets.kitti_files import (
     read_tracklets,
     rectified_camera,
 )
-from bevviz.errors import UserError
 from bevviz.messages.encode import encode_labels, encode_points, encode_transforms
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D

@@ -16,11 +16,11 @@ import pytest
 
 import bevviz
 from bevviz.cli import main
-from bevviz.datasets.kitti_files import read_labels
+from bevviz.datasets.kitti_labels import read_labels
 from bevviz.errors import UserError
 from bevviz.export.folder import FolderExport, rectify
-from bevviz.export.kitti import KittiExport, label_lines
-from bevviz.export.nuscenes import TABLES, VERSION, NuScenesExport
+from bevviz.extras.datasets.kitti_export import KittiExport, label_lines
+from bevviz.extras.datasets.nuscenes_export import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D, Intrinsics
 from bevviz.model.protocols import Observer

@@ -1,0 +1,1 @@
+"""KITTI, nuScenes, T4 and Argoverse: loaders, calibrations of other tools, and exports."""
