@@ -39,13 +39,13 @@ docs: $(VENV)/.tested
 	@echo "build/site/index.html; '$(BIN)/mkdocs serve' shows it while it is written"
 
 bench: $(VENV)/.installed
-	$(BIN)/python -m benchmarks.performance --write docs/performance.md
+	$(BIN)/python -m benchmarks.performance --write benchmarks/RESULTS.md
 
 accuracy: $(VENV)/.tested
-	$(BIN)/python -m benchmarks.accuracy --write docs/performance.md
-	$(BIN)/python -m benchmarks.why --write docs/performance.md
-	$(BIN)/python -m benchmarks.ground --write docs/performance.md
-	$(BIN)/python -m benchmarks.anomalies --write docs/performance.md
+	$(BIN)/python -m benchmarks.accuracy --write benchmarks/RESULTS.md
+	$(BIN)/python -m benchmarks.why --write benchmarks/RESULTS.md
+	$(BIN)/python -m benchmarks.ground --write benchmarks/RESULTS.md
+	$(BIN)/python -m benchmarks.anomalies --write benchmarks/RESULTS.md
 
 # Renew the versions. Commit the result when make test and make check pass with it.
 constraints: .venv-release/.installed

@@ -1,8 +1,8 @@
-"""Measure ``bevviz calib`` on planted errors: how near it gets, how often it is wrong (docs/performance.md).
+"""Measure ``bevviz calib`` on planted errors: how near it gets, how often it is wrong (benchmarks/RESULTS.md).
 
 On the synthetic drive, and on real frames of KITTI where they are beside the checkout (../shared/data).
 
-python -m benchmarks.calib --write docs/performance.md
+python -m benchmarks.calib --write benchmarks/RESULTS.md
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ COLUMNS = ("found within 2 m", "error, median m", "cars 0.7", "people 0.5", "wro
 
 
 def section(data: Path) -> str:
-    """Measure every case and format its section of docs/performance.md."""
+    """Measure every case and format its section of benchmarks/RESULTS.md."""
     shown: dict[str, Tally] = {}
     for frames, folder in (("0-11", "kitti"), ("12-23", "kitti_more")):
         tallies = measure(data / folder, cases(data))

@@ -3,7 +3,7 @@
 Makes a recording of so many gigabytes (the synthetic drive over and over, logged as `bevviz bag` logs), opens
 it without a window, goes through it to its end, and says when the first picture was there and how much memory
 the viewer took. Needs Vulkan, if only in software (mesa-vulkan-drivers). Prints a section of
-docs/performance.md.
+benchmarks/RESULTS.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How fast bevviz is, against what the tutorial's users run today and against Rerun's own converter.
 
 Both sides of each ratio process the same frames of the synthetic drive in this one run, in turns, and what
-they make is compared. Prints the tables of docs/performance.md.
+they make is compared. Prints the tables of benchmarks/RESULTS.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How large recordings are that keep everything, what an inspection needs, or what a report needs.
 
 Runs `bevviz bag --keep` on the synthetic drive, and on a real one where its path is given; counts what each
-recording has of what must not be missing. Prints a section of docs/performance.md.
+recording has of what must not be missing. Prints a section of benchmarks/RESULTS.md.
 """
 
 from __future__ import annotations

@@ -224,7 +224,7 @@ def main() -> None:
 
 
 def section_of(tallies: Mapping[str, Tally], what: str) -> str:
-    """Format the section of docs/performance.md."""
+    """Format the section of benchmarks/RESULTS.md."""
     visible = [reason for reason in ReasonKind if reason not in HOPELESS]
     mistuned = ", ".join(f"`{setting}`" for setting in MISTUNED)
     lines = [

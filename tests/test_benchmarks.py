@@ -104,7 +104,7 @@ def test_memory_is_that_of_the_program_alone() -> None:
 
 
 def test_why_is_right_about_objects_and_its_hints_hold() -> None:
-    """Two frames of a fixed drive, three configurations; the whole of it is in docs/performance.md."""
+    """Two frames of a fixed drive, three configurations; the whole of it is in benchmarks/RESULTS.md."""
     tallies = ask_all([1040], frames=31, every=30)
     every = [
         tally.of([reason for reason in ReasonKind if reason not in HOPELESS]) for tally in tallies.values()
@@ -147,7 +147,7 @@ def test_a_section_replaces_only_its_older_version(tmp_path: Path) -> None:
 
 
 def test_the_page_has_a_section_for_each_benchmark() -> None:
-    page = (Path(__file__).parents[1] / "docs/performance.md").read_text()
+    page = (Path(__file__).parents[1] / "benchmarks/RESULTS.md").read_text()
     for module in (calib, performance):
         assert page.count(module.BEGIN) == page.count(module.END) == 1
     headings = [text.strip().splitlines()[0] for text in (why.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]

@@ -350,7 +350,7 @@ def tally(shared: Path) -> Tally:
 
 
 def test_objects_of_labelled_frames(tally: Tally) -> None:
-    """Floors well below what was measured: docs/performance.md has the figures."""
+    """Floors well below what was measured: benchmarks/RESULTS.md has the figures."""
     assert len(tally.objects) == 30
     assert sum(v.distance <= 2 for v in tally.objects) >= 28
     assert sum(v.iou >= 0.5 for v in tally.objects) >= 23
