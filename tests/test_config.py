@@ -28,7 +28,7 @@ def test_a_printed_config_is_read_back(tmp_path: Path, preset: config.Preset) ->
 
 
 def test_every_parameter_is_explained() -> None:
-    assert all(text for key, text in config.keys().items() if key != "preset")
+    assert all(one.text for key, one in config.parameters().items() if key != "preset")
 
 
 def test_later_settings_win(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pytest
 from mcap.reader import make_reader
 
 from bevviz.cli import main
-from bevviz.config import Config, keys, load
+from bevviz.config import Config, load, parameters
 from bevviz.errors import UserError
 from bevviz.extras.demo.drive import LIDAR_TOPIC
 from bevviz.messages.clouds import decode_cloud
@@ -564,7 +564,7 @@ def test_parameters_set_the_configuration() -> None:
         orders.show(load(settings=["live.max_rate=5"], preset="reference"))
         assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
         assert not set_to("live.triggers", ["typhoon"]).successful
-        assert {name for name in keys() if not node.has_parameter(name)} == set()
+        assert {name for name in parameters() if not node.has_parameter(name)} == set()
 
         answer = orders._trigger(Trigger.Request(), Trigger.Response())
         assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")

@@ -158,10 +158,10 @@ def test_one_parameter_is_explained(capsys: Capture, project: Path) -> None:
 
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_every_parameter_can_be_explained(preset: str, project: Path, capsys: Capture) -> None:
-    from bevviz.config import keys
+    from bevviz.config import parameters
     from bevviz.config.descriptions import describe_parameters
 
     config = load(preset=preset)  # type: ignore[arg-type]
-    for key in keys():
+    for key in parameters():
         text = describe_parameters(key, config)
         assert text.startswith(f"{key} = ") and "stated by" in text and "None" not in text, text

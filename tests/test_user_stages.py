@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as hnp
 
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
-from bevviz.config import Config, changes, config_yaml, keys, load, plugins
+from bevviz.config import Config, changes, config_yaml, load, parameters, plugins
 from bevviz.config.project import named_code
 from bevviz.config.trust import grant_trust
 from bevviz.errors import StageError, UserError
@@ -279,7 +279,7 @@ def test_parameters_become_part_of_the_section(here: Path, monkeypatch: pytest.M
     monkeypatch.setenv("XDG_DATA_HOME", str(here / "data"))
     grant_trust(named_code(Path("c.yaml")))
     assert load("c.yaml") == config
-    assert "clustering.params.cell" in keys(config)
+    assert "clustering.params.cell" in parameters(config)
     assert {k: str(c) for k, c in changes(configured(method), config).items()} == {
         "clustering.params.height": "0.3 -> 0.5",
         "clustering.params.cell": "1.0 -> 2.0",

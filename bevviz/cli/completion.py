@@ -56,10 +56,10 @@ def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 def _keys(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
     """Return the keys of all parameters, with ``=`` if a value follows."""
-    from bevviz.config import TUTORIAL_NAMES, keys
+    from bevviz.config import TUTORIAL_NAMES, parameters
 
     sign = "=" if action.option_strings else ""
-    return [f"{key}{sign}" for key in (*keys(), *TUTORIAL_NAMES)]
+    return [f"{key}{sign}" for key in (*parameters(), *TUTORIAL_NAMES)]
 
 
 def _blueprints(**_: Any) -> list[str]:

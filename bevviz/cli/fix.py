@@ -61,13 +61,13 @@ def add(commands: Commands) -> None:
 
 
 def _fix(options: argparse.Namespace) -> int:
-    from bevviz.config import field_of
+    from bevviz.config import parameter
     from bevviz.fleet.fix import draw_samples, find_fix, keys_for
     from bevviz.support.files import save_text
 
     config, drives, keys = _of_batch(options) if _is_batch(options) else _of_drive(options)
     for key in options.parameter:
-        if field_of(key, config) is None:
+        if parameter(key, config) is None:
             raise UserError(f"--parameter {key}: unknown; 'bevviz config' lists all")
     with progress.bar(total=2 * options.sample, desc="read", unit="frame", leave=False) as bar:
         choosing, confirming, parts = draw_samples(

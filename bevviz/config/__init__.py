@@ -6,19 +6,6 @@ everywhere. A user-defined stage takes its parameters under ``SECTION.params``.
 """
 
 from bevviz.config.files import Layer, config_yaml, flat_yaml, read_layer, stated_lines
-from bevviz.config.keys import (
-    TUTORIAL_NAMES,
-    ParameterChange,
-    changes,
-    field_of,
-    flatten,
-    keys,
-    limits_of,
-    unit,
-    unit_spellings,
-    unknown_key,
-    values,
-)
 from bevviz.config.loading import changed_config, load, preset_differences, untrusted_layers
 from bevviz.config.methods import (
     BUILTIN_METHODS,
@@ -30,6 +17,7 @@ from bevviz.config.methods import (
     stage_topics,
     with_object_files,
 )
+from bevviz.config.parameters import TUTORIAL_NAMES, Parameter, parameter, parameters, unknown_key
 from bevviz.config.sections import (
     AnomaliesConfig,
     AnomalyKind,
@@ -50,6 +38,7 @@ from bevviz.config.sections import (
     VoxelConfig,
 )
 from bevviz.config.value_types import CLASS_SIZES
+from bevviz.config.values_by_key import ParameterChange, changes, flatten, values
 
 __all__ = [
     "BUILTIN_METHODS",
@@ -69,6 +58,7 @@ __all__ = [
     "LoggingConfig",
     "ObjectsConfig",
     "OpinionsConfig",
+    "Parameter",
     "ParameterChange",
     "Preset",
     "Section",
@@ -78,22 +68,19 @@ __all__ = [
     "changed_config",
     "changes",
     "config_yaml",
-    "field_of",
     "flat_yaml",
     "flatten",
-    "keys",
-    "limits_of",
     "load",
     "object_files",
     "object_network_params",
+    "parameter",
+    "parameters",
     "params_of",
     "plugin_of",
     "preset_differences",
     "read_layer",
     "stage_topics",
     "stated_lines",
-    "unit",
-    "unit_spellings",
     "unknown_key",
     "untrusted_layers",
     "values",

@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bevviz.config.keys import flatten, keys, unit
 from bevviz.config.methods import METHOD_KEYS
+from bevviz.config.parameters import Parameter, parameters
 from bevviz.config.plugins import is_user_function
 from bevviz.config.sections import Config
 from bevviz.config.trust import RECEIVED, NamedCode, Trust, trust_in
+from bevviz.config.values_by_key import flatten
 from bevviz.errors import UserError, first_line
 from bevviz.support.files import CONFIG_LIMIT, read_text
 
@@ -142,7 +143,7 @@ def read_toml(path: Path, problem: str) -> dict[str, Any]:
 
 def config_yaml(config: Config) -> str:
     """Return the configuration as YAML, with the unit and meaning of each parameter. ``load`` can read it."""
-    descriptions = keys(config)
+    table = parameters(config)
     lines = []
     for section, content in config.model_dump(mode="json").items():
         if not isinstance(content, dict):
@@ -151,7 +152,7 @@ def config_yaml(config: Config) -> str:
         lines.append(f"{section}:")
         params = content.pop("params", {})
         for name, value in content.items():
-            note = _note(f"{section}.{name}", descriptions)
+            note = _note(table[f"{section}.{name}"])
             if isinstance(value, dict) and value:
                 lines.append(f"  {name}:{note}")
                 lines += [f"    {json.dumps(key)}: {json.dumps(inner)}" for key, inner in value.items()]
@@ -160,13 +161,13 @@ def config_yaml(config: Config) -> str:
         if params:
             lines.append("  params:")
         for name, value in params.items():
-            lines.append(f"    {name}: {json.dumps(value)}{_note(f'{section}.params.{name}', descriptions)}")
+            lines.append(f"    {name}: {json.dumps(value)}{_note(table[f'{section}.params.{name}'])}")
     return "\n".join(lines) + "\n"
 
 
-def _note(key: str, descriptions: Mapping[str, str]) -> str:
-    """Return the comment with the unit and meaning of a dotted key."""
-    text = (f"in {unit(key)}; " if unit(key) else "") + descriptions.get(key, "")
+def _note(parameter: Parameter) -> str:
+    """Return the comment with the unit and meaning of a parameter."""
+    text = (f"in {parameter.unit}; " if parameter.unit else "") + parameter.text
     return f"  # {text}" if text else ""
 
 

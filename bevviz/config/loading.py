@@ -10,12 +10,13 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from bevviz.config.files import Layer, parse_yaml, read_layer
-from bevviz.config.keys import TUTORIAL_NAMES, field_of, flatten, keys, unit, unknown_key, values
 from bevviz.config.methods import METHOD_KEYS, names_function, params_model
 from bevviz.config.module_folder import ModuleFolder
+from bevviz.config.parameters import TUTORIAL_NAMES, parameter, parameters, unknown_key
 from bevviz.config.pillars import COMPLETE_SENTENCE, is_network_file
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
+from bevviz.config.values_by_key import flatten, values
 from bevviz.errors import UserError
 from bevviz.support.text import short_repr
 
@@ -99,7 +100,7 @@ def load(
         for section, model in param_models.items()
         for name, info in model.model_fields.items()
     }
-    known_keys = [*keys(), *params]
+    known_keys = [*parameters(), *params]
     tree: dict[str, Any] = {"preset": preset_name}
     for key, value in {**preset_values, **stated}.items():
         full = key
@@ -134,9 +135,10 @@ def load(
             ) from None
         is_complete = first["type"] in ("wrong_unit", "missing", COMPLETE_SENTENCE)
         value = f" (given: {short_repr(first['input'])})" if not is_complete else ""
-        description = keys().get(key) or params.get(key, "")
+        declared = parameter(key)
+        description = (declared.text if declared else "") or params.get(key, "")
         hint = f"; it is: {description}" if description else ""
-        stated_unit = f", in {unit(key)}" if unit(key) and not is_complete else ""
+        stated_unit = f", in {declared.unit}" if declared and declared.unit and not is_complete else ""
         raise UserError(f"{where}: {key} {_lower(first['msg'])}{stated_unit}{value}{hint}") from None
     before = base.stated if isinstance(base, Config) else {}
     loaded._stated = {
@@ -196,8 +198,8 @@ def _setting(text: str, trust: Trust, where: str = "") -> Layer:
     if not sep:
         raise UserError(f"--set {text}: expected key=value, for example --set clustering.eps=0.6")
     parsed = parse_yaml(value, f"--set {text}") if value.strip() else ""
-    info = field_of(key.strip())
-    if isinstance(parsed, int) and info is not None and info.annotation is str:
+    declared = parameter(key.strip())
+    if isinstance(parsed, int) and declared is not None and declared.annotation is str:
         parsed = value.strip()  # The text 0001 is a name, not the number 1.
     return Layer(where or f"--set {text}", {key.strip(): parsed}, trust)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.config import Config, field_of, limits_of, load, values
+from bevviz.config import Config, load, parameters, values
 
 Settings = Mapping[str, Any]  # dotted key -> value, of the parameters that differ from the start
 
@@ -34,8 +34,8 @@ def choices_of(present: Any, default: Any, key: str) -> list[Any]:
     if key in WORDS:
         listed = [*WORDS[key]]
         return listed + [value for value in (present,) if value not in listed]
-    info = field_of(key)
-    low, high = limits_of(info) if info is not None else (None, None)
+    declared = parameters()[key]
+    low, high = declared.low, declared.high
     whole = isinstance(present, int)
     tried = {present, default}
     for start in {present, default}:

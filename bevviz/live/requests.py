@@ -12,14 +12,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
 from bevviz.support.files import check_owned
 
 if TYPE_CHECKING:  # the client of the socket starts without the configuration
-    from bevviz.config import Config
+    from bevviz.config import Config, Parameter
 
 ANSWER = 5.0  # seconds that a healthy process needs at most to acknowledge a request
 PATIENCE = 120.0  # seconds that saving may take
@@ -237,23 +237,23 @@ class RosRequests:
         change: Callable[[list[str]], None],
         save: Callable[[], Path] | None = None,
     ) -> None:
-        from bevviz.config import TUTORIAL_NAMES, keys
+        from bevviz.config import TUTORIAL_NAMES, parameters
 
         self._node = node
         self.config = config
         self.change = change
         self.save = save
-        about = keys(config)
+        about = parameters(config)
         self._keys = {**{key: key for key in about}, **TUTORIAL_NAMES}  # parameter name -> key
-        parameters = [
-            node.declare_parameter(name, value, _descriptor(about[self._keys[name]]))
+        declared = [
+            node.declare_parameter(name, value, _descriptor(about[self._keys[name]].text))
             for name, value in self._parameters(config).items()
         ]
-        if settings := self._settings(parameters):
+        if settings := self._settings(declared):
             change(settings)
         # Ranges come after the first change, so that a wrong value given with ``-p`` gets our sentence.
         for name, key in self._keys.items():
-            if (descriptor := _descriptor_with_range(about[key], key, config)) is not None:
+            if (descriptor := _descriptor_with_range(about[key], config)) is not None:
                 node.set_descriptor(name, descriptor)
         node.add_on_set_parameters_callback(self._set)
         if save is not None:
@@ -335,18 +335,16 @@ def _descriptor(about: str) -> Any:
     return ParameterDescriptor(description=about, dynamic_typing=True)
 
 
-def _descriptor_with_range(about: str, key: str, config: Config) -> Any:
+def _descriptor_with_range(parameter: Parameter, config: Config) -> Any:
     """Return the descriptor of a number with a range, for the sliders of rqt. None: the key has no range."""
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange
 
-    from bevviz.config import field_of, limits_of, values
+    from bevviz.config import values
 
-    info, value = field_of(key, config), values(config)[key]
-    if info is None or isinstance(value, bool) or type(None) in get_args(info.annotation):
+    value, low, high = values(config)[parameter.key], parameter.low, parameter.high
+    if isinstance(value, bool) or parameter.optional or low is None or high is None:
         return None
-    descriptor, (low, high) = _descriptor(about), limits_of(info)
-    if low is None or high is None:
-        return None
+    descriptor = _descriptor(parameter.text)
     if isinstance(value, int):
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
     elif isinstance(value, float):

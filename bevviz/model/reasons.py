@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bevviz.config import BUILTIN_METHODS, METHOD_KEYS, Config, plugin_of, unit_spellings
+from bevviz.config import BUILTIN_METHODS, METHOD_KEYS, Config, parameters, plugin_of
 from bevviz.config.plugins import TOPIC
 from bevviz.errors import UserError
 
@@ -122,7 +122,7 @@ def limit(config: Config, key: str) -> Limit:
 @cache
 def _unit(key: str) -> str:
     """Return the symbol of a parameter's unit."""
-    return next(iter(unit_spellings(key)), "")
+    return next(iter(parameters()[key].spellings), "")
 
 
 def limit_of(kind: ReasonKind, config: Config) -> Limit | None:

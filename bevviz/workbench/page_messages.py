@@ -7,14 +7,9 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any
 
-from pydantic.fields import FieldInfo
-from pydantic_core import to_jsonable_python
-
-from bevviz.config import Config, unit, values
-from bevviz.config.keys import field_of, limits_of
+from bevviz.config import Config, Parameter, parameters, values
 from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.why import Answer
 from bevviz.why.robot_messages import FollowedObject, RobotQuestions, step_line
@@ -97,41 +92,25 @@ def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any
             the values of ``config``.
     """
     at_first = values(config if opened is None else opened)
+    current = values(config)
     return [
-        _control(key, at_first.get(key, _default(value, info)), info)
-        for key, value in values(config).items()
-        if "." in key and not key.startswith(UNSEEN) and (info := field_of(key, config)) is not None
+        _control(declared, at_first.get(key, current[key] if declared.required else declared.default))
+        for key, declared in parameters(config).items()
+        if "." in key and not key.startswith(UNSEEN)
     ]
 
 
-def _default(value: Any, info: FieldInfo) -> Any:
-    """Return the default of a parameter, or ``value`` if it has none."""
-    return value if info.is_required() else to_jsonable_python(info.get_default(call_default_factory=True))
-
-
-def _control(key: str, value: Any, info: FieldInfo) -> dict[str, Any]:
+def _control(declared: Parameter, value: Any) -> dict[str, Any]:
     """Return the control of one parameter as JSON for the page."""
     control: dict[str, Any] = {
-        "key": key,
+        "key": declared.key,
         "value": value,
-        "unit": unit(key),
-        "about": info.description or "",
-        "kind": _kind(info.annotation),
+        "unit": declared.unit,
+        "about": declared.text,
+        "kind": declared.kind,
     }
-    limits = zip(("low", "high"), limits_of(info), strict=True)
-    control |= {name: limit for name, limit in limits if limit is not None}
-    (choice, *_) = [*get_args(info.annotation), None] if control["kind"] == "list" else [info.annotation]
-    if get_origin(choice) is Literal:
-        control["choices"] = list(get_args(choice))
+    limits = {"low": declared.low, "high": declared.high}
+    control |= {name: limit for name, limit in limits.items() if limit is not None}
+    if declared.choices and declared.kind in ("choice", "list"):
+        control["choices"] = list(declared.choices)
     return control
-
-
-def _kind(annotation: Any) -> str:
-    """Return the kind of input for a type annotation: choice, list, switch, whole, number or text."""
-    if get_origin(annotation) is Literal:
-        return "choice"
-    if get_origin(annotation) in (list, tuple):
-        return "list"
-    united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
-    inner = {annotation, *united}
-    return "switch" if bool in inner else "whole" if int in inner else "number" if float in inner else "text"

@@ -13,12 +13,11 @@ from bevviz.config import (
     TUTORIAL_NAMES,
     Config,
     changed_config,
-    field_of,
-    keys,
+    parameter,
+    parameters,
     unknown_key,
     untrusted_layers,
 )
-from bevviz.config.keys import is_number_or_choice
 from bevviz.config.trust import MESSAGE
 from bevviz.drive import Drive
 from bevviz.errors import UserError
@@ -117,10 +116,10 @@ def agent_config(config: Config, settings: Sequence[str]) -> Config:
     for layer in untrusted_layers(settings, trust=MESSAGE):
         for stated, value in layer.values.items():
             key = TUTORIAL_NAMES.get(stated, stated)
-            info = field_of(key, config)
-            if info is None:
-                raise UserError(f"{layer.where}: {unknown_key(key, [*keys(config)])}")
-            if not is_number_or_choice(info, value):
+            declared = parameter(key, config)
+            if declared is None:
+                raise UserError(f"{layer.where}: {unknown_key(key, [*parameters(config)])}")
+            if not declared.is_number_or_choice(value):
                 raise UserError(
                     f"{key}: an agent states numbers, booleans and built-in choices; names, files, topics "
                     f"and functions are stated by the user: bevviz mcp --set {key}=..."

@@ -13,9 +13,8 @@ import numpy as np
 from pydantic_core import to_json
 
 from bevviz.bags.source import iso
-from bevviz.config import changes
+from bevviz.config import changes, parameters
 from bevviz.config.descriptions import describe_parameters
-from bevviz.config.keys import keys
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
 from bevviz.extras.mcp.drives import AskedDrive, agent_config
@@ -252,11 +251,10 @@ class AgentTools:
     def parameters(self, words: str, drive: str = "") -> str:
         """Explain a parameter or section (`clustering.eps`), or find some by words of their meaning."""
         config = self._drive(drive).drive.config
-        known = [key for key in keys(config) if words == key or key.startswith(f"{words}.")]
+        table = parameters(config)
+        known = [key for key in table if words == key or key.startswith(f"{words}.")]
         wanted = words.lower().split()
-        found = [
-            key for key, text in keys(config).items() if all(w in f"{key} {text}".lower() for w in wanted)
-        ]
+        found = [key for key, one in table.items() if all(w in f"{key} {one.text}".lower() for w in wanted)]
         lines = [describe_parameters(key, config) for key in (known or found)]
         return fitted({"command": f"bevviz config {words if known else ''}".strip(), "parameters": lines})
 

@@ -12,7 +12,7 @@ import pytest
 from mcp.server.fastmcp.exceptions import ToolError
 from mcp.types import TextContent
 
-from bevviz.config import TUTORIAL_NAMES, keys, load
+from bevviz.config import TUTORIAL_NAMES, load, parameters
 from bevviz.errors import UserError
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
@@ -110,7 +110,13 @@ def test_no_parameter_takes_a_name_from_an_agent(tmp_path: Path, monkeypatch: py
     Path("near.onnx").touch()
     config = load()
     for name in ("near.onnx", "missing.onnx"):
-        for key in [*keys(), *TUTORIAL_NAMES, "objects.params.encoder", "objects.encoder", "objects.params"]:
+        for key in [
+            *parameters(),
+            *TUTORIAL_NAMES,
+            "objects.params.encoder",
+            "objects.encoder",
+            "objects.params",
+        ]:
             for value in (name, f"[{name}]", f"{{a: {name}}}", f"{{{name}: 1}}"):
                 with pytest.raises(UserError) as caught:
                     agent_config(config, [f"{key}={value}"])
