@@ -1,4 +1,4 @@
-"""Measure ``bevviz calib`` on planted errors: how near it gets, how often it is wrong (benchmarks/RESULTS.md).
+"""Measure ``bevviz calib`` on planted errors: how near it gets, how often it is wrong.
 
 On the synthetic drive, and on real frames of KITTI where they are beside the checkout (../shared/data).
 
