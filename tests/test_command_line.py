@@ -9,14 +9,15 @@ import subprocess
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from urllib.parse import unquote
 from urllib.request import urlopen
 
 import pytest
 
-from bevviz.cli import main
+from bevviz.cli import main, outputs
 from bevviz.cli.outputs import join_json_option, program, set_up_notes
 from tests.support import bags, documented_json
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, until
 
 Capture = pytest.CaptureFixture[str]
 
@@ -213,3 +214,32 @@ def test_a_shell_completes_names(monkeypatch: pytest.MonkeyPatch, capsys: Captur
     assert completed("bevviz bag d --set clustering.ep") == ["clustering.eps="]
     assert main(["completion", "bash"]) == 0
     assert "bevviz" in capsys.readouterr().out
+
+
+def test_the_arguments_of_a_browser_hold_no_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every user can read them. A private file leads to the page, and is deleted."""
+    addresses: list[str] = []
+    monkeypatch.setattr("webbrowser.open", addresses.append)
+    monkeypatch.setattr(outputs, "BROWSER_START", 0.2)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("DISPLAY", ":0")
+    outputs.announce("workbench", "http://127.0.0.1:9880/?token=s3cret#view=bev")
+    outputs.announce("viewer", "http://127.0.0.1:9090/")
+    first, second = addresses
+    assert first.startswith("file://") and second == "http://127.0.0.1:9090/"
+    file = Path(unquote(first.removeprefix("file://")))
+    assert "s3cret" not in first and "/." not in str(file.relative_to(tmp_path))
+    assert (file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+    assert 'content="0; url=http://127.0.0.1:9880/?token=s3cret#view=bev"' in file.read_text()
+    until(lambda: not file.parent.exists())
+
+
+def test_the_browser_of_a_remote_editor_gets_no_token(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("BROWSER", "helper")
+    monkeypatch.setattr("webbrowser.open", lambda address: pytest.fail("no browser is started"))
+    outputs.announce("workbench", "http://127.0.0.1:9880/?token=s3cret")
+    assert "workbench at http://127.0.0.1:9880/?token=s3cret" in capsys.readouterr().err

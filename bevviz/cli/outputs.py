@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import html
 import math
 import os
 import re
@@ -10,8 +12,11 @@ import shlex
 import shutil
 import socket
 import sys
+import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from getpass import getuser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,6 +33,9 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.model.frame import Scene
     from bevviz.recording.sinks import OpenRecording
+
+TOKEN = "token="  # in the address of a page that needs one
+BROWSER_START = 60.0  # seconds until the file that leads a browser to such a page is deleted
 
 
 class Outputs(NamedTuple):
@@ -167,7 +175,8 @@ def announce(what: str, address: str, browser: bool = True) -> None:
     say(f"{what} at {address}", always=True)
     ports = [str(port) for port in re.findall(r":(\d+)", unquote(address))]
     over_ssh = " ".join(f"-L {port}:localhost:{port}" for port in ports)
-    opens = browser and (has_display() or has_browser())
+    # The browser of a remote editor reads no file of this machine, see ``open_browser``.
+    opens = browser and (has_display() or (has_browser() and TOKEN not in address))
     if os.environ.get("SSH_CONNECTION") or not opens:
         say(f"from another machine, there first: ssh -N {over_ssh} {getuser()}@{socket.gethostname()}")
     if opens:
@@ -192,10 +201,37 @@ def has_browser() -> bool:
 
 
 def open_browser(address: str) -> None:
-    """Open a page in the browser."""
+    """Open a page in the browser.
+
+    Other users can read the arguments of a process. So the browser gets the name of a private file that leads
+    to the page, and not the token in its address. The file lies in the home folder, under a name without a
+    dot: browsers in a sandbox (Snap) read neither hidden nor temporary folders.
+    """
     import webbrowser
 
-    webbrowser.open(address)
+    from bevviz.support import cleanup
+
+    if TOKEN not in address:
+        webbrowser.open(address)
+        return
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="bevviz-page-", dir=Path.home()))  # only this user may enter it
+    except (OSError, RuntimeError):  # RuntimeError: there is no home folder.
+        folder = Path(tempfile.mkdtemp(prefix="bevviz-page-"))
+    delete = partial(shutil.rmtree, folder, ignore_errors=True)
+    cleanup.register(folder, delete)
+    atexit.register(delete)
+    file = folder / "open.html"
+    file.touch(mode=0o600)
+    refresh = html.escape(f"0; url={address}")
+    file.write_text(
+        '<!doctype html><meta name="referrer" content="no-referrer">'
+        f'<meta http-equiv="refresh" content="{refresh}"><title>bevviz</title>\n'
+    )
+    webbrowser.open(file.as_uri())
+    timer = threading.Timer(BROWSER_START, delete)
+    timer.daemon = True
+    timer.start()
 
 
 def has_display() -> bool:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 
 import rerun as rr
+import rerun_bindings
 
 from bevviz.config import Config
 from bevviz.findings.frame_findings import Finding, find_findings
@@ -214,3 +215,8 @@ class DriveRecording(Closable):
         else:
             logger.log(result, log_more=log_more, cloud=cloud)
         self._layers[result.frame.index, settings] = layers[0]
+
+
+def end_unused_streams() -> None:
+    """End the threads of streams that nothing refers to. Rerun itself ends them at ``rerun.init`` alone."""
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()

@@ -84,11 +84,12 @@ class PageConnection:
                         break
                     self._take(message.get("text") or "")
             finally:
-                sender.cancel()
-                for task in self._tasks:
+                tasks = (sender, *self._tasks)
+                for task in tasks:
                     task.cancel()
                 self._stop_try()
                 self._tries.shutdown(wait=False)
+                await asyncio.gather(*tasks, return_exceptions=True)
                 if self._overlay is not None:
                     self._source.close_overlay(self._overlay)
 

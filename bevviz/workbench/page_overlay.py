@@ -67,6 +67,8 @@ class PageOverlay(Closable):
             for stream in (self._marks, self._attempt.stream):
                 stream.read()  # Rerun warns about a binary stream with unread data.
             self.buffer.close()
+            # Rerun keeps the threads of a stream as long as a reference to it exists.
+            del self.marker, self._marks, self._attempt
 
     def attempt(self) -> Attempt:
         """Return the attempt of the next try. It has a new logger if the last try was stopped."""

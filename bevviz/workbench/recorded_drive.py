@@ -34,7 +34,7 @@ from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_messages import RobotQuestions, object_topics
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
-from bevviz.workbench.drive_recording import DriveRecording
+from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
@@ -310,6 +310,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         with self._looking:
             self.lanes.pop(overlay.lane, None)
         overlay.close()
+        end_unused_streams()
 
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
