@@ -14,6 +14,7 @@ import pytest
 from bevviz.cli import main
 from bevviz.recording import entities
 from tests.support.recordings import Recording
+from tools import make_reference
 
 ROOT = Path(__file__).resolve().parents[1]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -166,3 +167,8 @@ def test_every_command_and_option_on_a_page_exists() -> None:
             options = [w.partition("=")[0] for w in words[1:] if re.match(r"--[a-z]", w)]
             wrong += [f"{path.name}: {command}: {o}" for o in options if o not in known]
     assert not wrong
+
+
+def test_the_page_of_reasons_and_parameters_is_that_of_the_code() -> None:
+    kept = make_reference.PAGE.read_text(encoding="utf-8")
+    assert kept == make_reference.text(), "run: python -m tools.make_reference"

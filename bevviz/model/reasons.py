@@ -82,6 +82,42 @@ PARAMETERS = {  # the parameter that decides
     ReasonKind.MISFIT: "fusion.min_rating",
 }
 
+MEANINGS = {  # of each reason that an answer can have, for the docs and the page
+    ReasonKind.SHARED_BOX: "the image box that names it names other clusters, too",
+    ReasonKind.BORROWED: "the image box of another object names it",
+    ReasonKind.SPLIT: "it is spread over several clusters; of a false object: it is a part of a labelled one",
+    ReasonKind.MERGED: "its cluster holds another object; the answer names the gap and the eps for it",
+    ReasonKind.MISNAMED: "a detection of another class names it",
+    ReasonKind.MISPLACED: "its object is farther off than evaluate allows",
+    ReasonKind.DUPLICATE: "false: another object is the same thing already",
+    ReasonKind.WRONG_DEPTH: "false: its image box is right, and its points are before or behind the thing",
+    ReasonKind.WALL: "false: its points are a part of something larger",
+    ReasonKind.DETECTOR_ERROR: "false: the detector sees something, and nothing is labelled there",
+    ReasonKind.FAILED: "a stage failed",
+    ReasonKind.OUT_OF_VIEW: "no camera sees it",
+    ReasonKind.HIDDEN: "fewer than three points; most returns in its direction end before it",
+    ReasonKind.NO_POINTS: "the LiDAR has fewer than three points there",
+    ReasonKind.GROUND: "most of it was removed as ground",
+    ReasonKind.NOISE: "no point has clustering.min_points neighbours within clustering.eps",
+    ReasonKind.NO_CLUSTER: "your function or the robot lost it",
+    ReasonKind.TOO_SMALL: "its cluster has too few points",
+    ReasonKind.TOO_LARGE: "its cluster has too many points",
+    ReasonKind.NOT_RUN: "no model, no image or no camera",
+    ReasonKind.NOT_DETECTED: "the detector has no candidate there",
+    ReasonKind.BELOW_THRESHOLD: "the detector's score is too low",
+    ReasonKind.SUPPRESSED: "a better detection overlaps it; the answer names it and the IoU",
+    ReasonKind.NOT_FUSED: "its camera lacks a calibration or a pose",
+    ReasonKind.LOW_OVERLAP: "its points cover too little of the image box",
+    ReasonKind.TOO_FEW_POINTS: "too few of its points are in the image box",
+    ReasonKind.TOO_FAR: "it is too far away, for `reference` too many pixels from the image box",
+    ReasonKind.TAKEN: "a better detection has its cluster",
+    ReasonKind.MISFIT: "no candidate in the frustum is rated high enough",
+    ReasonKind.OTHER_CLUSTER: "its detection has another cluster",
+    ReasonKind.CONTRADICTED: "your function or the robot has it, and a camera that sees the place does not",
+    ReasonKind.NOT_AMONG: "it is not among the objects of your function, of a 3D network or of the robot",
+    ReasonKind.LOST_IN_FUSION: "the robot has its cluster and its detection, and no object of them",
+}
+
 
 @lru_cache(typed=True)  # members of two enumerations are equal numbers
 def kind_of(state: IntEnum) -> ReasonKind:
