@@ -240,7 +240,7 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
         room -= len(data)
         written(file, data)
 
-    monkeypatch.setattr("bevviz.bags.rescue.completion.write_all", limited)
+    monkeypatch.setattr("bevviz.bags.completion.write_all", limited)
     random_bytes = np.random.default_rng(0).bytes
     with McapWriter(tmp_path / "x.mcap", define) as bag:
         with pytest.raises(UserError, match="No space left"):

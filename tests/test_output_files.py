@@ -18,8 +18,8 @@ from backports import zstd
 from mcap.reader import make_reader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
+from bevviz.bags.completion import complete
 from bevviz.bags.mcap_writer import McapWriter
-from bevviz.bags.rescue.completion import complete
 from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.support.files import atomic_write, claim_target, save_text, unfinished_files

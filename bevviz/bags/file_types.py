@@ -9,8 +9,10 @@ from pathlib import Path
 from rosbags.interfaces import Connection
 
 from bevviz.bags import mcap, pcap, ros1, sqlite
-from bevviz.bags.chunks import ChunkReader
+from bevviz.bags.chunks import ChunkFormat, ChunkReader
 from bevviz.bags.compression import ZSTD, unpack_file
+from bevviz.bags.damage import DamagedReader
+from bevviz.bags.prefix import PrefixChunkReader, PrefixSqliteReader
 from bevviz.bags.reader import (
     LAST_TIME,
     DamageError,
@@ -20,13 +22,12 @@ from bevviz.bags.reader import (
     megabytes,
 )
 from bevviz.bags.remote import address_of, name_of, open_bytes
-from bevviz.bags.rescue import rescue
-from bevviz.bags.rescue.report import RescuedReader
 from bevviz.bags.sqlite import SqliteReader
 from bevviz.datasets.cloud_files import CLOUDS
 from bevviz.datasets.dataset import IMAGES, UNREAD
 from bevviz.errors import UserError
 from bevviz.model.frame import I64
+from bevviz.support.extensions import load, registered
 from bevviz.support.files import LFS_HINT, LFS_POINTER
 from bevviz.support.loggers import logger
 from bevviz.support.scratch_folder import ScratchFolder
@@ -43,18 +44,30 @@ class FileFormat:
         magic: first bytes of a file.
         suffix: usual file suffix, by which rosbags knows the format.
         sound: opens a sound file. Its second argument is the same file under a name with that suffix.
+        damaged: opens a file up to its damage, where no extra of the group ``bevviz.rescuers`` is registered
+            for the suffix. None: no file that could be damaged.
     """
 
     name: str
     magic: bytes
     suffix: str
     sound: Callable[[Path, Path], Reader]
+    damaged: Callable[[Path, Path], DamagedReader] | None = None
 
 
-SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader)
+def _chunked(name: str, magic: bytes, suffix: str, form: ChunkFormat) -> FileFormat:
+    """Return a format whose files consist of chunks."""
+    return FileFormat(
+        *(name, magic, suffix),
+        sound=lambda path, _: ChunkReader(path, form),
+        damaged=lambda path, _: PrefixChunkReader(path, form),
+    )
+
+
+SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader, PrefixSqliteReader)
 FORMATS = (
-    FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path, _: ChunkReader(path, mcap.FORM)),
-    FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path, _: ChunkReader(path, ros1.FORM)),
+    _chunked("MCAP", mcap.MAGIC, ".mcap", mcap.FORM),
+    _chunked("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
     SQLITE,
     *(
         FileFormat("network capture", magic, ".pcap", lambda path, _: pcap.PcapReader(path))
@@ -74,13 +87,13 @@ OTHER_FORMATS = {
 
 
 class BagFile:
-    """One bag file. At the first damage its reader is replaced by that of ``rescue``.
+    """One bag file. At the first damage its reader is replaced by one of damaged files.
 
     Args:
         path: file.
         form: name of the format.
         sound: opens the reader of a sound file. Raises DamageError.
-        magic: first bytes of the format, see ``rescue``. Empty: no file that could be damaged.
+        damaged: opens the reader of the damaged file. None: it is not read.
 
     Attributes:
         rescued: reader of the damaged file; None: no damage met yet.
@@ -89,9 +102,15 @@ class BagFile:
         UserError: nothing of the file is left.
     """
 
-    def __init__(self, path: Path, form: str, sound: Callable[[], Reader], magic: bytes = b"") -> None:
-        self.path, self.format, self._magic = path, form, magic
-        self.rescued: RescuedReader | None = None
+    def __init__(
+        self,
+        path: Path,
+        form: str,
+        sound: Callable[[], Reader],
+        damaged: Callable[[], DamagedReader] | None = None,
+    ) -> None:
+        self.path, self.format, self._damaged = path, form, damaged
+        self.rescued: DamagedReader | None = None
         self._notes: list[str] = []
         self._opened: list[Reader] = []
         self._reader: Reader
@@ -186,18 +205,18 @@ class BagFile:
         for reader in self._opened:
             reader.close()
 
-    def _rescue_after(self, error: DamageError) -> RescuedReader:
+    def _rescue_after(self, error: DamageError) -> DamagedReader:
         """Open the damaged file. Messages that are being read from the former reader still come from it."""
         if self.rescued is None:
             _log.info("%s: %s: rescuing what is there", self.path, error, exc_info=error)
-            if not self._magic:
+            if self._damaged is None:
                 raise UserError(
                     f"{self.path}: {error}: download it, then what is there is rescued"
                 ) from error
             is_whole = isinstance(error, UnindexedError)
             how = "it is read from end to end" if is_whole else "what is there was rescued"
             self._notes.append(f"{error}: {how}")
-            self._reader = self.rescued = rescue(self.path, self._magic)
+            self._reader = self.rescued = self._damaged()
             self._opened.append(self.rescued)
         return self.rescued
 
@@ -275,7 +294,16 @@ def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
     if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
         public.symlink_to(path.resolve())
-    return BagFile(path, kind.name, lambda: kind.sound(path, public), kind.magic)
+    rescuer = registered("rescuers").get(kind.suffix.removeprefix("."))
+
+    def damaged() -> DamagedReader:
+        if rescuer is not None:
+            reader: DamagedReader = load(rescuer)(path)
+            return reader
+        assert kind.damaged is not None
+        return kind.damaged(path, public)
+
+    return BagFile(path, kind.name, lambda: kind.sound(path, public), damaged if kind.damaged else None)
 
 
 def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> Path:

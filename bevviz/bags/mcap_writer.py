@@ -23,7 +23,7 @@ from rosbags.interfaces import (
 )
 from ruamel.yaml import YAML
 
-from bevviz.bags.rescue.completion import McapOutput, resume, start_writer
+from bevviz.bags.completion import McapOutput, resume, start_writer
 from bevviz.errors import UserError
 from bevviz.support import cleanup
 from bevviz.support.files import claim_target, rename_new

@@ -46,13 +46,11 @@ class SqliteReader:
             raise DamageError(f"the file is damaged or its end is missing ({megabytes(missing)})")
         log = log_path(path)
         if log.exists() and log.stat().st_size > LOG_HEAD.size:
-            raise DamageError(f"the recorder did not close it: messages in {log.name} are read with it")
+            raise DamageError(f"the recorder did not close it, messages lie in {log.name}")
         self._public = PublicReader(public)
         with as_damage():
             self._public.open()
-            self._queries = apsw.Connection(
-                f"file:{public}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-            )
+            self._queries = open_database(public)
         self.connections: Sequence[Connection] = list(self._public.connections)
         self._check()
 
@@ -107,6 +105,13 @@ class SqliteReader:
         self._file.close()
         self._public.close()
         self._queries.close()
+
+
+def open_database(public: Path) -> apsw.Connection:
+    """Open a database without its log, so that nothing is written beside it."""
+    return apsw.Connection(
+        f"file:{public}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+    )
 
 
 def page_size_of(head: bytes) -> int | None:

@@ -13,8 +13,8 @@ from queue import SimpleQueue
 
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 
+from bevviz.bags.completion import CHUNK_SIZE, complete
 from bevviz.bags.mcap_writer import McapWriter
-from bevviz.bags.rescue.completion import CHUNK_SIZE, complete
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet

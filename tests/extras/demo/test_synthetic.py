@@ -289,7 +289,7 @@ def test_a_full_disk_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.Monke
         pytest.raises(UserError, match=r"drive\.mcap: cannot write the bag: No space left on device"),
         BagWriter(SyntheticSource(frames=1), tmp_path / "drive.mcap") as bag,
     ):
-        monkeypatch.setattr("bevviz.bags.rescue.completion.write_all", full)
+        monkeypatch.setattr("bevviz.bags.completion.write_all", full)
         bag.write(next(iter(SyntheticSource(frames=1))))
     assert not list(tmp_path.iterdir())
 

@@ -12,7 +12,9 @@ from bevviz.bags.mcap import (
     CHUNK,
     CHUNK_HEAD,
     CHUNK_INDEX,
+    COMPRESSIONS,
     DATA_END,
+    FIRST_PRIVATE,
     FOOTER,
     HEADER,
     MAGIC,
@@ -23,18 +25,17 @@ from bevviz.bags.mcap import (
     SCHEMA,
     STATISTICS,
     Channels,
+    chunk_at,
     read_strings,
 )
 from bevviz.bags.reader import LAST_TIME
-from bevviz.bags.rescue.chunks import RecordWalker
+from bevviz.extras.rescue.chunks import RecordWalker
 
 RECORD_START = re.compile(  # an opcode with a length below 2^40, or the start of a compressed chunk's content
     rb"(?=[\x01-\x0f].{5}\0\0\0|\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18)",
     re.DOTALL,
 )
-COMPRESSIONS = (b"", b"lz4", b"zstd")
 HOUR, DAY = 3600 * 10**9, 24 * 3600 * 10**9
-FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
 _SUMMARY = {CHUNK_INDEX, STATISTICS, 0x0A, 0x0C, 0x0D, 0x0E}
 
 
@@ -89,12 +90,9 @@ class McapWalker(RecordWalker[Record]):
 
     def chunk(self, record: Record) -> Chunk:
         """Return the chunk of a record, without messages."""
-        head = record.body + CHUNK_HEAD.size
-        first, last, size, _, name_size = CHUNK_HEAD.unpack(self._source.read(record.body, CHUNK_HEAD.size))
-        name, data = self._source.read(head, name_size).decode(), head + name_size + 8
-        packed = min(record.end, self._source.size) - data
-        cut = record.end > self._source.size
-        return Chunk(first, last, data, packed, size, name, {}, {}, record.body + 24, cut)
+        chunk = chunk_at(self._source, record.body, record.end)
+        assert chunk is not None  # ``_chunk`` has checked its head.
+        return chunk
 
     def listed(self, record: Record) -> tuple[int, int]:
         """Return the channel of a message index, and its number of messages."""
@@ -236,6 +234,6 @@ class McapWalker(RecordWalker[Record]):
         if ends[0] == ends[1]:
             return Record(CHUNK, offset, body, ends[0])
         for end in ends:
-            if body + at < end < size and self._at(end, searched=True) is not None:
+            if body + CHUNK_HEAD.size + 12 <= end < size and self._at(end, searched=True) is not None:
                 return Record(CHUNK, offset, body, end)
         return None

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition
 
+from bevviz.bags.damage import DamageReport
 from bevviz.bags.mcap import FORMATS, NO_DEFINITION
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message
-from bevviz.bags.rescue.report import DamageReport
 from bevviz.bags.sqlite import LOG_HEAD, PAGE_SIZES, log_path, page_size_of
 from bevviz.errors import UserError
 from bevviz.model.frame import I64

@@ -11,25 +11,15 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
-from rosbags.interfaces import Connection
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, ChunkReader, FileIndex, Item
+from bevviz.bags.damage import DamageReport
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, MemoryBytes
-from bevviz.bags.rescue.report import DamageReport
 from bevviz.model.frame import I64
 from bevviz.support import progress
 
 Times = Mapping[int, I64]
 """Log times by connection."""
-
-
-class Descriptions(Protocol):
-    """Connections of a file by the descriptions found so far."""
-
-    def __contains__(self, number: object) -> bool: ...
-
-    def connections(self, counts: Mapping[int, int]) -> list[Connection]:
-        """Return the connections with their message counts."""
 
 
 class Record(Protocol):

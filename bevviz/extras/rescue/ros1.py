@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 
 from bevviz.bags.chunks import Chunk
-from bevviz.bags.reader import LAST_TIME
-from bevviz.bags.rescue.chunks import RecordWalker
-from bevviz.bags.ros1 import LONGEST_HEADER, MAGIC, Connections, Record, is_sane, read_record
+from bevviz.bags.ros1 import LONGEST_HEADER, MAGIC, Connections, Record, chunk_of, is_sane, read_record
+from bevviz.extras.rescue.chunks import RecordWalker
 
 OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # Every header contains an opcode.
 SEARCH_BACK = 160  # bytes of a header before its opcode that are searched
@@ -29,10 +28,7 @@ class Ros1Walker(RecordWalker[Record]):
 
     def chunk(self, record: Record) -> Chunk:
         """Return the chunk of a record, without messages."""
-        compression = record.fields["compression"].decode(errors="replace")
-        packed, size = min(record.end, self._source.size) - record.body, record.number("size")
-        cut = record.end > self._source.size
-        return Chunk(LAST_TIME, -1, record.body, packed, size, compression, {}, cut=cut)
+        return chunk_of(record, self._source.size)
 
     def listed(self, record: Record) -> tuple[int, int]:
         """Return the connection of an index record, and its number of messages."""

@@ -19,64 +19,16 @@ from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
 from bevviz.bags.compression import LEAST, unpack
 from bevviz.bags.reader import DamageError, FileBytes
-from bevviz.bags.rescue.sqlite import checksum_of
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.extras.rescue.sqlite import checksum_of
 from bevviz.pipeline.bag_info import describe_bag, render_bag_info
-from tests.support.bag_formats import FORMATS, items
+from tests.support.bag_formats import FORMATS
 from tests.support.commands import error_of
+from tests.support.damaged_bags import Found, change, missing, read, records, whole
 from tests.support.foreign_readers import judges, taken
-
-Found = list[tuple[str, int, bytes]]
-
-
-def whole(name: str) -> Found:
-    """Return the messages that were written."""
-    return [(topic, time, data) for topic, _, time, data in items(name.startswith("ros1"))]
-
-
-def read(path: Path) -> tuple[Found, list[str]]:
-    """Every message, and what is said; counts, times and span are those of the messages."""
-    with Recording([path]) as recording:
-        names = [topic.name for topic in recording.topics]
-        found = [(m.topic, m.received, bytes(m.content())) for m in recording.messages(names)]
-        times = [time for _, time, _ in found]
-        assert times == sorted(times)
-        assert recording.message_count == len(found)
-        for name in names:
-            assert recording.times(name).tolist() == [time for topic, time, _ in found if topic == name]
-        return found, recording.warnings
-
-
-def missing(found: Found, name: str) -> int:
-    """How many messages are missing; there are none that were not written."""
-    assert not Counter(found) - Counter(whole(name))
-    return len(whole(name)) - len(found)
-
-
-def records(data: bytes, opcode: int) -> list[int]:
-    """Offsets of the records of a kind in an MCAP file, those in uncompressed chunks, too."""
-    found, at = [], 8
-    while at + 9 < len(data):
-        (size,) = struct.unpack_from("<Q", data, at + 1)
-        inner = at + 9 + 40 if data[at] == mcap.CHUNK else at + 9 + size
-        if data[at] == opcode:
-            found.append(at)
-        while inner < at + 9 + size and not data[at + 9 + 28]:
-            if data[inner] == opcode:
-                found.append(inner)
-            inner += 9 + struct.unpack_from("<Q", data, inner + 1)[0]
-        at += 9 + size
-    return found
-
-
-def change(path: Path, at: int, new: bytes) -> None:
-    data = bytearray(path.read_bytes())
-    data[at : at + len(new)] = new
-    path.write_bytes(data)
-
 
 # --- sound -------------------------------------------------------------------------------------
 
@@ -391,7 +343,7 @@ def test_the_log_beside_a_database_is_read(tmp_path: Path) -> None:
     before = path.read_bytes(), log.read_bytes(), sorted(tmp_path.rglob("*"))
     found, said = read(path)
     assert not missing(found, "sqlite3")
-    assert any("bag.db3-wal are read with it" in text for text in said)
+    assert any("messages lie in bag.db3-wal" in text for text in said)
     assert (path.read_bytes(), log.read_bytes(), sorted(tmp_path.rglob("*"))) == before
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     rows = sqlite3.connect(path).execute("SELECT count(*) FROM messages").fetchall()

@@ -1,4 +1,4 @@
-"""Report of the damage of a file, and the interface of the readers that give one."""
+"""Report of the damage of a file, and the interface of readers of damaged files."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Protocol
 from bevviz.bags.reader import Reader, megabytes
 
 REPAIR = "'bevviz recover' writes a sound copy"
+EXTRA = "the extra rescue reads more of it: pip install 'bevviz[rescue]'"
 
 
 @dataclass
@@ -29,6 +30,7 @@ class DamageReport:
     passed: int = 0  # bytes passed over in these places
     log_pages: int = 0  # pages of a database's log with a wrong checksum
     stated: int | None = None  # messages by the statistics of the file
+    is_partial: bool = False  # bytes after the damage or in a log were not read, see ``bags.prefix``
 
     @property
     def lost(self) -> int:
@@ -48,7 +50,8 @@ class DamageReport:
         if self.chunks:
             ((why, _),) = Counter(self.chunks.values()).most_common(1)
             doubt = f", {self.doubtful} that were kept may be wrong" if self.doubtful else ""
-            notes.append(f"{len(self.chunks)} damaged chunk(s), {why}: {self.missing} messages lost{doubt}")
+            lost = "what follows in them is" if self.is_partial else f"{self.missing} messages"
+            notes.append(f"{len(self.chunks)} damaged chunk(s), {why}: {lost} lost{doubt}")
         elif self.missing:
             notes.append(f"{self.missing} messages that the index of a chunk lists are not there: lost")
         if self.incomplete:
@@ -64,10 +67,12 @@ class DamageReport:
             notes.append(f"{self.unread} messages could no longer be read: lost")
         if self.read is not None and self.stated is not None and self.stated > self.read:
             notes.append(f"its statistics count {self.stated} messages: {self.stated - self.read} are lost")
+        if self.is_partial:
+            notes.append(EXTRA)
         return notes
 
 
-class RescuedReader(Reader, Protocol):
+class DamagedReader(Reader, Protocol):
     """Reader of a damaged file. It reads around damage and never raises DamageError."""
 
     report: DamageReport

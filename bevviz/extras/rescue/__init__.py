@@ -1,0 +1,1 @@
+"""Extra ``rescue``: read damaged bags beyond the damage."""
