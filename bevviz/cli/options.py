@@ -368,6 +368,8 @@ def result_settings(
     Raises:
         UserError: a file is missing or of no known kind, or a name comes twice.
     """
+    if not results:
+        return []
     from bevviz.datasets.result_files import RESULTS, results_are_2d
 
     named = dict[str, str]()
@@ -384,7 +386,7 @@ def result_settings(
         stages.setdefault(key, f"topic:{RESULTS}{name}")
     stated = {text.partition("=")[0] for text in settings} | {key for key, value in options.items() if value}
     chosen = [f"{key}={value}" for key, value in stages.items() if key not in stated]
-    return [f"source.results={json.dumps(named)}", *chosen] if named else []
+    return [f"source.results={json.dumps(named)}", *chosen]
 
 
 def load_config_from(

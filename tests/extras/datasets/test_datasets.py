@@ -401,7 +401,7 @@ def test_a_drive_below_wins_over_crops_of_its_objects(tmp_path: Path, capsys: Ca
 def test_a_bag_needs_no_loader_of_data_sets() -> None:
     script = (
         "import sys; from bevviz.cli import main; main(['info', sys.argv[1]])\n"
-        "loaders = 'bevviz.extras.datasets', 'bevviz.datasets.folder'\n"
+        "loaders = 'bevviz.extras.datasets', 'bevviz.datasets.folder', 'bevviz.datasets.result_files'\n"
         "print([name for name in sys.modules if name.startswith(loaders)], file=sys.stderr)"
     )
     command = [sys.executable, "-c", script, str(BAG)]
