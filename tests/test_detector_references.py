@@ -1,6 +1,6 @@
 """Foreign detectors, held to what their exporters' own code makes of the same image.
 
-The references are made by tools/make_detector_references.py, which says how.
+The references are made by tests/references/make_detector_references.py, which says how.
 """
 
 from __future__ import annotations

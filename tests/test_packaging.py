@@ -101,7 +101,7 @@ def test_notices_name_every_module_with_message_definitions() -> None:
 
 
 def test_files_that_the_notices_name_exist() -> None:
-    named = re.findall(r"`((?:bevviz|tools)/[^`]+)`", NOTICES)
+    named = re.findall(r"`((?:bevviz|tools|tests)/[^`]+)`", NOTICES)
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 

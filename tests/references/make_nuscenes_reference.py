@@ -3,7 +3,7 @@
 Needs an environment with nuscenes-devkit 1.2.0 (and its older NumPy), not that of bevviz::
 
     python -c "from pathlib import Path; from tests.support import datasets; datasets.nuscenes(Path('made'))"
-    DEVKIT/bin/python tools/make_nuscenes_reference.py made tests/references/metrics/nuscenes_devkit.json
+    DEVKIT/bin/python tests/references/make_nuscenes_reference.py made tests/references/metrics/nuscenes_devkit.json
 """
 
 from __future__ import annotations

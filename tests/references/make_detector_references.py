@@ -10,7 +10,7 @@ Besides bevviz this needs the exporters, in an environment of their own:
     python -m pip install torch torchvision ultralytics==8.4.190 onnx onnxruntime onnxslim rfdetr==1.11.2
     python -m pip install "setuptools<80" pandas seaborn requests fire loguru thop psutil tabulate pycocotools
     python -m pip install --no-deps --no-build-isolation yolox==0.3.0 yolov5==7.0.14
-    python tools/make_detector_references.py --work /tmp/references
+    python tests/references/make_detector_references.py --work /tmp/references
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 os.environ.update(YOLO_AUTOINSTALL="false", YOLO_OFFLINE="true")
 
-FOLDER = Path(__file__).parents[1] / "tests/references"
+FOLDER = Path(__file__).parent
 SIZE = (96, 128)  # height, width of the inputs where a family leaves the choice
 IMAGE = (113, 197)  # of the image: no multiples of anything, so that rounding shows
 CLASSES = 5

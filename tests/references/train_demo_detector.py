@@ -8,7 +8,7 @@ YOLOv8 uses it; and the ONNX file with the metadata and output layout of an Ultr
 Besides bevviz this needs PyTorch and onnx, which bevviz itself does not:
 
     python -m pip install torch onnx
-    python tools/train_demo_detector.py --work /tmp/demo_detector
+    python tests/references/train_demo_detector.py --work /tmp/demo_detector
 
 Images are kept in ``--work`` and made once. The figures for streets never seen before are printed at the end.
 """
@@ -352,7 +352,7 @@ def export(network: Network, path: Path) -> None:
         "stride": str(max(STRIDES)),
         "task": "detect",
         "imgsz": str([HEIGHT, WIDTH]),
-        "description": "bevviz synthetic drive, made by tools/train_demo_detector.py",
+        "description": "bevviz synthetic drive, made by tests/references/train_demo_detector.py",
     }
     onnx.helper.set_model_props(model, facts)
     onnx.checker.check_model(model)
