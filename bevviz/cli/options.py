@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from bevviz.errors import UserError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bevviz.recording.source_lookup import RecordingSource
     from bevviz.why import Selection
 
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 
 
 TIMES = """A time is in seconds from the start of the bag (12.5), since 1970 (1700000000.0) or

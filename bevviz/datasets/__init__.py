@@ -19,7 +19,8 @@ def loaders() -> dict[str, type[Dataset]]:
     """Return the registered loaders and that of plain folders by name. The loader of any folder is last."""
     from bevviz.datasets.folder import Folder
 
-    classes = [*(load_class(point, Dataset) for point in registered("datasets").values()), Folder]
+    classes: list[type[Dataset]] = [load_class(point, Dataset) for point in registered("datasets").values()]
+    classes.append(Folder)
     classes.sort(key=lambda loader: (loader.any_folder, loader.name))
     return {loader.name: loader for loader in classes}
 

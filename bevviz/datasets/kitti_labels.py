@@ -115,9 +115,9 @@ def labelled_boxes(
         np.array(dont_care, np.float32).reshape(-1, 4),
     )
     names = tuple(ids[index] for index in kept) if ids else ()
-    values = np.array(scores, np.float32)
+    confidences = np.array(scores, np.float32)
     return LabelledBoxes3D(
-        str(file), 0, "", boxes, tuple(labels), values, ids=names, image=image, unusable=tuple(unusable)
+        str(file), 0, "", boxes, tuple(labels), confidences, ids=names, image=image, unusable=tuple(unusable)
     )
 
 

@@ -3,7 +3,8 @@
 Needs an environment with nuscenes-devkit 1.2.0 (and its older NumPy), not that of bevviz::
 
     python -c "from pathlib import Path; from tests.support import datasets; datasets.nuscenes(Path('made'))"
-    DEVKIT/bin/python tests/references/make_nuscenes_reference.py made tests/references/metrics/nuscenes_devkit.json
+    cd tests/references
+    DEVKIT/bin/python make_nuscenes_reference.py ../../made metrics/nuscenes_devkit.json
 """
 
 from __future__ import annotations

@@ -254,7 +254,7 @@ def overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return iou, iou - (hull - union) / hull.clamp(min=1e-6)
 
 
-@torch.no_grad()  # type: ignore[untyped-decorator]
+@torch.no_grad()
 def assign(
     scores: Tensor, boxes: Tensor, centres: Tensor, xyxy: Tensor, kind: Tensor, top: int = 10
 ) -> tuple[Tensor, Tensor, Tensor]:
