@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Mapping
+from io import BytesIO
 from typing import Any, NamedTuple
 
 import cv2
@@ -192,23 +193,20 @@ def _size_of(encoded: bytes) -> tuple[int, int]:
             if at + 8 > len(encoded):
                 return 0, 0
         return int.from_bytes(encoded[16:20], "big"), int.from_bytes(encoded[20:24], "big")
-    at = 2
-    while at + 9 <= len(encoded):
-        marker, size = encoded[at + 1], int.from_bytes(encoded[at + 2 : at + 4], "big")
-        if encoded[at] != 0xFF or marker == 0xFF:  # any bytes may stand between segments
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
-            height, width = struct.unpack_from(">HH", encoded, at + 5)
-            return width, height
-        elif marker == 0xDA:  # start of the pixels
-            break
-        else:
-            at += 2 if marker in (0x01, *range(0xD0, 0xD9)) else 2 + max(size, 2)
-    return 0, 0
+    from PIL.JpegImagePlugin import JpegImageFile
+
+    try:
+        size: tuple[int, int] = JpegImageFile(BytesIO(encoded)).size
+    except Exception:  # Pillow raises errors of many kinds for damaged bytes.
+        return 0, 0
+    return size
 
 
 def _size_of_webp(encoded: bytes) -> tuple[int, int]:
-    """Return width and height from the header of a WebP (RFC 9649)."""
+    """Return width and height from the header of a WebP (RFC 9649).
+
+    Pillow would make a decoder, with memory for all pixels, before it knows them.
+    """
     if len(encoded) < max(30, 8 + int.from_bytes(encoded[4:8], "little")):
         return 0, 0
     first, bits = encoded[12:16], int.from_bytes(encoded[21:25], "little")
