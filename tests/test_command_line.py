@@ -86,7 +86,7 @@ def test_a_broken_package_costs_its_own_command_only(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken = EntryPoint("lost", "no_such_package.command", "bevviz.commands")
-    monkeypatch.setattr("bevviz.cli.registered", lambda kind: {"lost": broken})
+    monkeypatch.setattr("bevviz.support.extensions.registered", lambda kind: {"lost": broken})
     with pytest.raises(SystemExit):
         main(["--help"])
     shown = capsys.readouterr()

@@ -163,6 +163,7 @@ def test_every_command_and_option_on_a_page_exists() -> None:
                 continue
             parser = commands.get(words[1], commands["open"])
             assert isinstance(parser, Parser)
+            parser.complete()
             known = parser._option_string_actions
             options = [w.partition("=")[0] for w in words[1:] if re.match(r"--[a-z]", w)]
             wrong += [f"{path.name}: {command}: {o}" for o in options if o not in known]

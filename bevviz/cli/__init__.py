@@ -37,15 +37,14 @@ from bevviz.cli import (
     why,
     workbench,
 )
-from bevviz.cli.options import Commands, follow_recording, join_negative_numbers
+from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
-from bevviz.support.extensions import load, registered
+from bevviz.support.extensions import load_all
 from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
     from logging import Logger
 
 EPILOG = """examples:
@@ -181,9 +180,8 @@ def _parser(command: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, ar
     ):
         module.add(commands)
     if command not in commands.choices:
-        for point in registered("commands").values():
-            if point.name not in commands.choices:
-                _add_registered(point, commands)
+        for module in load_all("commands", lambda text: outputs.warn([text]), but=commands.choices):
+            module.add(commands)
     for command_parser in commands.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"
@@ -192,14 +190,6 @@ def _parser(command: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, ar
             "--quiet", action="store_true", help="no progress and no notes: only results, and what is wrong"
         )
     return parser, commands.choices
-
-
-def _add_registered(point: EntryPoint, commands: Commands) -> None:
-    """Add a registered command. A broken package costs its own command only."""
-    try:
-        load(point).add(commands)
-    except UserError as error:
-        outputs.warn([str(error)])
 
 
 def _log() -> Logger:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,11 +24,13 @@ from bevviz.cli.options import (
 from bevviz.cli.outputs import has_display, say, warn
 from bevviz.errors import UserError
 from bevviz.support import progress
+from bevviz.support.extensions import load_all
 
 if TYPE_CHECKING:
+    from bevviz.cli.parser import Parser
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.foxglove_server import FoxgloveServer
+    from bevviz.live.publish import ResultSink, Watch
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
@@ -55,22 +56,6 @@ def add(commands: Commands) -> None:
     )
     choice.add_argument(
         "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
-    )
-    choice.add_argument(
-        "--foxglove",
-        nargs="?",
-        type=port,
-        const=8765,
-        metavar="PORT",
-        help="serve the results to Foxglove on this machine (default: 8765)",
-    )
-    choice.add_argument(
-        "--foxglove-origin",
-        action="append",
-        type=_web_origin,
-        default=[],
-        metavar="ORIGIN",
-        help="further web site whose pages may connect to --foxglove, as http://localhost:8080",
     )
     choice.add_argument(
         "--diagnostics",
@@ -107,6 +92,7 @@ def add(commands: Commands) -> None:
     )
     add_ros_args(live)
     live.set_defaults(run=_live)
+    live.add_later(lambda: _add_watches(live, choice))
 
     snap = commands.add_parser(
         "snap",
@@ -117,6 +103,14 @@ def add(commands: Commands) -> None:
     snap.add_argument("path", nargs="?", type=Path, metavar="FILE.rrd", help="default: named by the time")
     snap.add_argument("--pid", type=int, metavar="PID", help="which process, where several run")
     snap.set_defaults(run=_snap)
+
+
+def _add_watches(live: Parser, group: argparse._ArgumentGroup) -> None:
+    """Add the options of what is registered to watch the results."""
+    watches = [*load_all("watches", lambda text: warn([text]))]
+    for watch in watches:
+        watch.add_options(group)
+    live.set_defaults(watches=watches)
 
 
 def _split(text: str) -> str:
@@ -146,8 +140,6 @@ def _live(options: argparse.Namespace) -> int:
     _files(options.save)
     if options.split is not None and not options.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
-    if options.observe and options.foxglove is not None:
-        raise UserError("--observe makes no results that --foxglove could serve: leave one of them out")
     if options.observe and options.publish:
         raise UserError("--observe makes no results that --publish could send: leave one of them out")
     if options.observe and options.robot is not None:
@@ -160,8 +152,10 @@ def _live(options: argparse.Namespace) -> int:
     if not options.observe:
         loader.load(settings.config)
     notes = Notes(say)
-    with _foxglove(options) as server:
-        return _run(settings, options, notes, loader, server)
+    with ExitStack() as open_sinks:
+        watches: list[Watch] = options.watches
+        sinks = [open_sinks.enter_context(sink) for watch in watches if (sink := watch.open_sink(options))]
+        return _run(settings, options, notes, loader, sinks)
 
 
 def _run(
@@ -169,7 +163,7 @@ def _run(
     options: argparse.Namespace,
     notes: Notes,
     loader: StageLoader,
-    server: FoxgloveServer | None,
+    sinks: Sequence[ResultSink],
 ) -> int:
     """Run beside a robot."""
     from bevviz.live.raw_recorder import RawRecorder
@@ -179,25 +173,7 @@ def _run(
     with LiveSource(
         settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.observe
     ) as robot:
-        return _watch_robot(robot, settings, options, notes, loader, raw, server)
-
-
-def _web_origin(text: str) -> str:
-    """Return the origin of a web site that an option names."""
-    if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no origin, such as http://localhost:8080")
-    return text
-
-
-def _foxglove(options: argparse.Namespace) -> AbstractContextManager[FoxgloveServer | None]:
-    """Return the server for Foxglove, if it is requested."""
-    if options.foxglove is None:
-        return nullcontext()
-    from bevviz.live.foxglove_server import FoxgloveServer
-
-    server = FoxgloveServer(options.foxglove, options.foxglove_origin, say)
-    say(f"Foxglove: open the connection {server.address}", always=True)
-    return server
+        return _watch_robot(robot, settings, options, notes, loader, raw, sinks)
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -224,10 +200,10 @@ def _watch_robot(
     notes: Notes,
     loader: StageLoader,
     raw: RawRecorder,
-    server: FoxgloveServer | None,
+    watching_sinks: Sequence[ResultSink],
 ) -> int:
     """Wait for the robot, then run. Publish results and take requests as the options say."""
-    from bevviz.live.publish import Publisher, ResultSink, RosTopics
+    from bevviz.live.publish import Publisher, RosTopics
     from bevviz.live.requests import Control, RosRequests, answer_sigusr1
     from bevviz.live.source_wrappers import warm_up
     from bevviz.live.status import Diagnostics
@@ -261,7 +237,7 @@ def _watch_robot(
         if ended.is_set():
             return 1
         sinks: list[ResultSink] = [RosTopics(source.node, notes.warn)] if options.publish else []
-        sinks += [server] if server is not None else []
+        sinks += watching_sinks
         publisher = Publisher(settings.config, sinks) if sinks else None
         diagnostics: Diagnostics | None = None
         if options.publish or options.diagnostics:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
-from typing import Any, Protocol
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Tracks
+
+if TYPE_CHECKING:
+    import argparse
 
 BEV = "/visualization/bev_image"
 OBSTACLES = "/lidar/points_no_ground"
@@ -54,6 +58,24 @@ class ResultSink(Protocol):
 
     def send(self, topic: str, data: bytes, stamp: int) -> None:
         """Send a message in CDR with its stamp in nanoseconds."""
+
+
+class ClosableSink(ResultSink, AbstractContextManager[Any], Protocol):
+    """Receiver of results that is closed at the end of a run."""
+
+
+class Watch(Protocol):
+    """Program beside a live run that shows the results, registered in the group ``bevviz.watches``."""
+
+    def add_options(self, group: argparse._ArgumentGroup) -> None:
+        """Add the options of ``bevviz live`` by which a user asks for it."""
+
+    def open_sink(self, options: argparse.Namespace) -> ClosableSink | None:
+        """Return what takes the results. None: the options do not ask for it.
+
+        Raises:
+            UserError: it cannot be started.
+        """
 
 
 class RosTopics:

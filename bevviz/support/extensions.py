@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, TypeAlias, TypeVar
@@ -77,6 +77,16 @@ def load_class(point: EntryPoint, base: type[T]) -> type[T]:
         expected = f"{base.__module__}.{base.__name__}"
         raise _unusable(point, TypeError(f"it is no subclass of {expected}"))
     return target
+
+
+def load_all(kind: Kind, tell: Callable[[str], object], but: Container[str] = ()) -> Iterator[Any]:
+    """Yield what is registered under other names than ``but``. Tell what cannot be imported."""
+    for point in registered(kind).values():
+        if point.name not in but:
+            try:
+                yield load(point)
+            except UserError as error:
+                tell(str(error))
 
 
 def _unusable(point: EntryPoint, error: Exception) -> UserError:

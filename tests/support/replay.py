@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import argparse
 
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.foxglove_server import FoxgloveServer
+    from bevviz.live.publish import ResultSink
     from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -91,11 +91,11 @@ def main() -> int:
         options: argparse.Namespace,
         notes: Notes,
         loader: StageLoader,
-        server: FoxgloveServer | None,
+        sinks: Sequence[ResultSink],
     ) -> int:
         simulated = SyntheticSource(int(count))
         source = Replay(list(simulated), simulated.scene)
-        publisher = Publisher(settings.config, [] if server is None else [server])
+        publisher = Publisher(settings.config, sinks)
         return live._watch(
             source, settings, options, notes, loader, publisher.publish, lambda _: publisher.configure
         )

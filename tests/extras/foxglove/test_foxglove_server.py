@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from bevviz.live.foxglove_server import FoxgloveServer
+from bevviz.extras.foxglove.server import FoxgloveServer
 from bevviz.recording.ports import free_port
 from tests.support import replay
 from tests.support.commands import environment

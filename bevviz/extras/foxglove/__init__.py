@@ -1,0 +1,1 @@
+"""Server of the results of a live run for Foxglove."""
