@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevviz.drivers import ouster
-from bevviz.messages.clouds import decode_cloud
+from bevviz.extras.lidars import ouster
 
 FILES = (  # of packets, and of metadata
     ("OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),
@@ -64,9 +63,8 @@ def _row(packets: Path, metadata: Path, python: Path) -> str:
     found = [(at, data) for at, data in _captured(packets) if len(data) == sensor.size]
     first = [(at, data) for at, data in found if sensor.number(data) == sensor.number(found[0][1])]
     started = time.perf_counter()
-    message = ouster.decode(sensor, first)
+    ours = ouster.decode(sensor, first)
     took = time.perf_counter() - started
-    ours = decode_cloud(message, "packets", 0)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "theirs.npz"
         subprocess.run([python, "-c", THEIRS, packets, metadata, out], check=True, capture_output=True)

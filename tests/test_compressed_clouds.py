@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
 import tracemalloc
-from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import MessageError
 from tests.support import bags
-from tests.support.compressed_clouds import DRACO, compressed, draco, messages, packed, points
+from tests.support.compressed_clouds import compressed, messages, packed, points
 
 
 def decoded(message: Any) -> Any:
@@ -68,25 +66,10 @@ def test_a_raw_cloud_is_preferred_to_its_compressed_copy(
     assert "/points/zstd: not used: the sensor of /points, by its frame or name" in said
 
 
-@pytest.mark.parametrize(("number", "off"), [(0, 0.0), (1, 0.005)])
-def test_draco_clouds_are_decoded(number: int, off: float) -> None:
-    pytest.importorskip("DracoPy")
-    cloud = decoded(draco(b64decode(DRACO[number])))
-    assert cloud.dropped == 0
-    order = np.argsort(cloud.xyz[:, 0])
-    i = np.arange(12)
-    np.testing.assert_allclose(cloud.xyz[order], np.stack([4 + i, i % 4 - 1.5, i / 16 - 1.5], 1), atol=off)
-    np.testing.assert_allclose(cloud.fields["intensity"][order], 10 * i, atol=off)
-    np.testing.assert_array_equal(cloud.fields["ring"][order], i % 3)
-    np.testing.assert_array_equal(cloud.fields["rgb"].view(np.uint32)[order], 0x102030 + i)
-
-
-def test_undecodable_clouds_state_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_undecodable_clouds_state_the_reason() -> None:
     made = messages()
     cloud = made.cloud(bags.START, points(0))
     whole = packed("zstd", cloud.data.tobytes())
-    some = draco(b64decode(DRACO[0]))
-    some.fields = some.fields[:5]
     for message, said in (
         (
             compressed(made, cloud, "lzma", whole),
@@ -96,21 +79,9 @@ def test_undecodable_clouds_state_the_reason(monkeypatch: pytest.MonkeyPatch) ->
         (compressed(made, cloud, "zstd", b"nothing of the kind"), "its compressed data is damaged"),
         (compressed(made, cloud, "zstd", whole[:-9]), "the end of its compressed data is missing"),
         (compressed(made, cloud, "zlib", whole), "its compressed data is damaged"),
-        (draco(b"DRACO" + bytes(40)), "its draco data is damaged"),
-        (some, "its draco data has 6 attributes of 12 points, but 5 fields"),
     ):
         with pytest.raises(MessageError, match=f"/points: not a {COMPRESSED}: .*{said}"):
             decoded(message)
-    real = builtins.__import__
-
-    def without(name: str, *given: Any, **named: Any) -> Any:
-        if name == "DracoPy":
-            raise ImportError(name)
-        return real(name, *given, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MessageError, match=r"which DracoPy reads: pip install 'bevviz\[draco\]'"):
-        decoded(draco(b64decode(DRACO[0])))
 
 
 @pytest.mark.parametrize("form", ["zstd", "zlib"])

@@ -17,6 +17,8 @@ from foxglove import channels, messages  # noqa: E402
 from bevviz.bags.source import BagSource  # noqa: E402
 from bevviz.cli import main  # noqa: E402
 from bevviz.config import load  # noqa: E402
+from bevviz.messages.decoders import find_decoder  # noqa: E402
+from bevviz.messages.foxglove import parse  # noqa: E402
 from bevviz.model import geometry  # noqa: E402
 from bevviz.model.frame import F32  # noqa: E402
 from bevviz.report.bag_window import choose_topics, cut_bag, find_window, open_window  # noqa: E402
@@ -242,9 +244,11 @@ def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: obje
 
 @pytest.mark.parametrize("kind", ["PointCloud", "CompressedImage", "RawImage"])
 def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
-    from bevviz.messages.foxglove import parse, to_ros
-
     name = f"foxglove.{kind}"
-    message = parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", "")
+    message, decoder = (
+        parse(b'{"data": 2147483648, "point_stride": 16}', name, "json", ""),
+        find_decoder(name),
+    )
+    assert decoder is not None and decoder.from_message is not None
     with pytest.raises(ValueError, match="the field 'data' is the number 2147483648"):
-        to_ros(message, name)
+        decoder.from_message(message)

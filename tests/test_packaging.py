@@ -85,7 +85,7 @@ def test_notices_name_every_file_that_is_not_python() -> None:
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
     ]
-    assert Path("bevviz/data/hesai_angles.csv") in carried
+    assert Path("bevviz/extras/lidars/hesai_angles.csv") in carried
     named = {Path(name) for name in re.findall(r"^\| `([^`]+)` \|", NOTICES, re.MULTILINE)}
     assert [path for path in carried if path not in named and path.parent not in named] == []
 

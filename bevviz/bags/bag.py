@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
@@ -27,15 +27,22 @@ from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
 from bevviz.datasets import find_loader, open_dataset
 from bevviz.datasets.dataset import DatasetReader, describe_unread
-from bevviz.drivers import ouster
-from bevviz.drivers.packets import read_calibration
 from bevviz.drivers.video import VideoPacket, decode_packet, is_video
 from bevviz.errors import UserError
-from bevviz.messages.decoders import MessageError, Serialization, reads_bytes
+from bevviz.messages.decoders import (
+    MessageError,
+    PacketStream,
+    Scan,
+    ScanDecoder,
+    Serialization,
+    decode_scan,
+    reads_bytes,
+)
 from bevviz.messages.definitions import deserialize_cdr
 from bevviz.messages.guard import decode_message, guard
+from bevviz.messages.packet_topics import open_calibrated, packet_stream
 from bevviz.messages.surroundings import decode_mark
-from bevviz.messages.topics import NOT_LIDAR, Topic
+from bevviz.messages.topics import Topic
 from bevviz.model.frame import I64
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
@@ -159,7 +166,7 @@ class Recording(Closable):
                 name,
                 normalized(first[name].msgtype),
                 counts[name],
-                ouster.FRAME
+                self._sensors[name]().frame_id
                 if name in self._sensors
                 else self._frame_id(name)
                 if counts[name] and self._has_header(first[name])
@@ -236,7 +243,7 @@ class Recording(Closable):
     ) -> Iterator[RawMessage]:
         """Yield messages as ``messages`` does, but collect the packets of a LiDAR into one message per scan.
 
-        A scan is received at the time of its last packet, see ``ouster.Scans``.
+        A scan is received at the time of its last packet.
         """
         single = [topic for topic in topics if topic in self._sensors]
         others = [topic for topic in topics if topic not in self._sensors]
@@ -244,26 +251,23 @@ class Recording(Closable):
         yield from heapq.merge(*parts, key=attrgetter("received"))
 
     def _scans(self, topic: str, start: int | None, stop: int | None) -> Iterator[RawMessage]:
-        sensor = self._sensors[topic]
+        decoder = self._sensors[topic]()
         low = None if start is None else start - LONGEST_SCAN
         high = None if stop is None else stop + LONGEST_SCAN
-        scans = ouster.ScanCollector(sensor)
         message: RawMessage | None = None
 
-        def given(found: Iterator[tuple[ouster.ReceivedPacket, ...]]) -> Iterator[RawMessage]:
-            for packets in found:
-                received = packets[-1][0]
+        def given(scans: Iterator[Scan]) -> Iterator[RawMessage]:
+            for scan in scans:
+                received = scan.received
                 if message and (start is None or start <= received) and (stop is None or received < stop):
-                    yield replace(message, data=b"", received=received, packets=packets)
+                    yield replace(message, data=b"", received=received, scan=scan)
 
         for message in self.messages([topic], low, high):
-            try:
-                packet = ouster.payload(message.content(), ros1=is_ros1(message.connection))
-            except zstd.ZstdError:
-                continue
-            if len(packet) == sensor.size:  # else the packet counts as lost
-                yield from given(scans.add(message.received, packet))
-        yield from given(scans.rest())
+            # A message that cannot be read, or is no packet of the sensor, counts as a lost packet.
+            with suppress(zstd.ZstdError, ValueError):
+                data, ros1 = message.content(), is_ros1(message.connection)
+                yield from given(decoder.add(message.received, data, ros1=ros1))
+        yield from given(decoder.rest())
 
     def scan_times(self, topic: str) -> I64:
         """Return the log times of the scans of a topic, as ``times`` does for messages.
@@ -278,38 +282,42 @@ class Recording(Closable):
         return self._scan_times[topic]
 
     @cached_property
-    def _sensors(self) -> Mapping[str, ouster.Sensor]:
-        """Sensor metadata of the topics whose messages are single LiDAR packets."""
+    def _sensors(self) -> Mapping[str, Callable[[], ScanDecoder]]:
+        """Functions that make a new decoder, by topic whose messages are single LiDAR packets."""
         found = {}
         for connection in {c.topic: c for f in self.files for c in self._typed(f)}.values():
-            if (
-                ouster.is_packet(connection.msgtype)
-                and (text := self._metadata(connection.topic)) is not None
-            ):
-                sensor = ouster.read_sensor(*text)
-                message = self.first(connection.topic)
-                if message and len(message.data) > ouster.SMALLEST:
-                    found[connection.topic] = sensor
+            topic, stream = connection.topic, packet_stream(connection.msgtype)
+            if stream is not None and (make_decoder := self._scan_decoder(topic, stream)) is not None:
+                message = self.first(topic)
+                if message and len(message.data) > stream.smallest:
+                    found[topic] = make_decoder
         return found
 
-    def _metadata(self, topic: str) -> tuple[str, str] | None:
-        """Return the metadata of an Ouster sensor and their origin; None if there are none."""
+    def _scan_decoder(self, topic: str, stream: PacketStream) -> Callable[[], ScanDecoder] | None:
+        """Return a function that makes a decoder by the sensor's metadata; None if there are none."""
         if file := self.calibrations.get(topic, ""):
-            return read_calibration(Path(file)), f"source.lidar_calibration: {file}"
-        name = ouster.metadata_topic(topic)
-        message = self.first(name)
-        try:
-            return (guard(message, decode_mark, self.decode(message)), name) if message else None
-        except MessageError:
-            return None
+            make_decoder = partial(open_calibrated, stream, file)
+        else:
+            name = stream.metadata_topic(topic)
+            message = self.first(name)
+            try:
+                text = guard(message, decode_mark, self.decode(message)) if message else None
+            except MessageError:
+                text = None
+            if text is None:
+                return None
+            make_decoder = partial(stream.open, text, name)
+        make_decoder()  # Raises the error of metadata that cannot be used.
+        return make_decoder
 
     def _lacks(self, connection: Connection) -> str:
-        """Return why the packets of an Ouster topic are not read. Empty: they are, or it is another topic."""
-        if not ouster.is_packet(connection.msgtype) or connection.topic in self._sensors:
+        """Return why the packets of a topic are not read. Empty: they are, or it is another topic."""
+        stream = packet_stream(connection.msgtype)
+        if stream is None or connection.topic in self._sensors:
             return ""
         message = self.first(connection.topic)
-        small = message is not None and len(message.data) <= ouster.SMALLEST
-        return NOT_LIDAR if small else ouster.NO_METADATA
+        small = message is not None and len(message.data) <= stream.smallest
+        return stream.imu if small else stream.lacks_metadata
 
     def first(self, topic: str) -> RawMessage | None:
         """Return the first message of a topic; None if it has none."""
@@ -343,14 +351,14 @@ class Recording(Closable):
     def decode(self, message: RawMessage) -> Any:
         """Decode a message into an object with the fields of its definition.
 
-        LiDAR packets and compressed clouds become a PointCloud2.
+        A message type with a decoder becomes what its decoder makes of it, such as a ``Cloud``.
 
         Raises:
             MessageError: the data does not fit the definition, or there is none.
             UserError: a file that the configuration names for the topic cannot be used.
         """
-        if message.packets:
-            return guard(message, partial(ouster.decode, self._sensors[message.topic]), message.packets)
+        if message.scan is not None:
+            return guard(message, decode_scan, message.scan)
         data = guard(message, RawMessage.content, message)
         if foxglove_encoding(message.connection):
             return decode_message(message, data, message.parsed, Serialization(message.type))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from rosbags.interfaces import Connection
 
-from bevviz.bags import mcap, pcap, ros1, sqlite
+from bevviz.bags import mcap, ros1, sqlite
 from bevviz.bags.chunks import ChunkFormat, ChunkReader
 from bevviz.bags.compression import ZSTD, unpack_file
 from bevviz.bags.damage import DamagedReader
@@ -69,10 +70,6 @@ FORMATS = (
     _chunked("MCAP", mcap.MAGIC, ".mcap", mcap.FORM),
     _chunked("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
     SQLITE,
-    *(
-        FileFormat("network capture", magic, ".pcap", lambda path, _: pcap.PcapReader(path))
-        for magic in (*pcap.MAGICS, pcap.NEXT_GENERATION)
-    ),
 )
 HEAD_SIZE = 16  # bytes read to recognise a format
 OTHER_FORMATS = {
@@ -84,6 +81,16 @@ OTHER_FORMATS = {
     LFS_POINTER[:HEAD_SIZE]: LFS_HINT,
     b"#ROSBAG V1": "a bag of ROS before 1.2: 'rosbag fix' converts it",
 }
+
+
+@cache
+def _all_formats() -> tuple[FileFormat, ...]:
+    """Return the formats of bags, then those that packages register in the entry point group bevviz.files.
+
+    Raises:
+        UserError: a registered format cannot be loaded.
+    """
+    return (*FORMATS, *(form for point in registered("files").values() for form in load(point)))
 
 
 class BagFile:
@@ -256,11 +263,12 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
         path = _unpack(path, scratch, warn)
         with path.open("rb") as file:
             head = file.read(HEAD_SIZE)
-    if kind := next((kind for kind in FORMATS if head.startswith(kind.magic)), None):
+    known = FORMATS if any(head.startswith(kind.magic) for kind in FORMATS) else _all_formats()
+    if kind := next((kind for kind in known if head.startswith(kind.magic)), None):
         return _open_as(kind, path, scratch)
     problem = next((text for magic, text in OTHER_FORMATS.items() if head.startswith(magic)), None)
     # The first bytes may be damaged. All messages of a database may still lie in its log.
-    kind = next((kind for kind in FORMATS if path.suffix == kind.suffix), None)
+    kind = next((kind for kind in known if path.suffix == kind.suffix), None)
     if not head and not (kind is SQLITE and sqlite.log_path(path).exists()):
         raise UserError(f"{path}: the file is empty")
     if kind and not problem:
@@ -272,8 +280,8 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
         problem = f"one cloud or image, no drive: give the folder that it is in ({path.parent})"
     if not problem and (hint := UNREAD.get(path.suffix.lower())):
         problem = f"{path.suffix.lower()} files are not read: {hint}"
-    known = ", ".join(dict.fromkeys(kind.name for kind in FORMATS))
-    raise UserError(f"{path}: {problem or f'not a bag: by its first bytes none of {known}'}")
+    names = ", ".join(dict.fromkeys(kind.name for kind in known))
+    raise UserError(f"{path}: {problem or f'not a bag: by its first bytes none of {names}'}")
 
 
 def _open_remote(path: Path) -> BagFile:

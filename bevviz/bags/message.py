@@ -20,7 +20,7 @@ from bevviz.bags.compression import LONGEST, ZSTD
 from bevviz.bags.reader import normalized
 from bevviz.errors import first_line
 from bevviz.messages import definitions, foxglove
-from bevviz.messages.decoders import MessageError, read_header
+from bevviz.messages.decoders import MessageError, Scan, read_header
 from bevviz.messages.guard import guard
 
 
@@ -33,14 +33,14 @@ class RawMessage:
         received: log time in nanoseconds.
         data: serialised message, possibly compressed with zstd.
         connection: connection that recorded the message.
-        packets: time in nanoseconds and bytes of each LiDAR packet of one scan; see ``Recording.scans``.
+        scan: scan made of packets, in place of ``data``; see ``Recording.scans``.
     """
 
     topic: str
     received: int
     data: bytes | memoryview
     connection: Connection
-    packets: tuple[tuple[int, bytes | memoryview], ...] = ()
+    scan: Scan | None = None
 
     @property
     def type(self) -> str:

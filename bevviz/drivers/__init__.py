@@ -1,1 +1,1 @@
-"""Decoders of LiDAR packets, compressed clouds and video. Imports `messages` and layers below it."""
+"""Decoders of Livox scans, compressed clouds and video. Imports `messages` and layers below it."""

@@ -1,55 +1,45 @@
-"""Decoder for CompressedPointCloud2 messages of point_cloud_transport: zstd, zlib and draco."""
+"""Decoder for CompressedPointCloud2 messages of point_cloud_transport: zstd, zlib, and formats of extras."""
 
 from __future__ import annotations
 
 import zlib
 from typing import Any
 
-import numpy as np
 from backports import zstd
 
 from bevviz.errors import first_line
-from bevviz.messages.clouds import MOST_POINTS, SCALARS
-from bevviz.messages.decoders import Decoder
-from bevviz.messages.encode import make
+from bevviz.messages.clouds import unpack_cloud
+from bevviz.messages.decoders import Decoder, decoders
+from bevviz.model.frame import Cloud
 
 LEAST, LONGEST = 1 << 24, 1 << 30  # limits in bytes of a decompressed cloud; its message may state any size
-DRACO = "which DracoPy reads: pip install 'bevviz[draco]'"
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 
 
-def decompress(msg: Any) -> Any:
-    """Decompress a CompressedPointCloud2 into a sensor_msgs/PointCloud2.
+def decompress(msg: Any) -> Cloud:
+    """Decode a CompressedPointCloud2.
 
     Raises:
         ValueError: the format is not supported, or the data are damaged.
     """
+    form = str(msg.format)
+    if decoder := decoders().get(f"{COMPRESSED}/{form}"):
+        if why := decoder.missing():
+            raise ValueError(f"it is compressed by {form}, {why}")
+        assert decoder.from_message is not None
+        cloud: Cloud = decoder.from_message(msg)
+        return cloud
     # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
     data = memoryview(msg.compressed_data).tobytes()
-    width, height = int(msg.width), int(msg.height)
-    size = height * max(int(msg.row_step), width * int(msg.point_step))
-    if msg.format == "zstd":
-        unpacked = np.frombuffer(_unpack(zstd.ZstdDecompressor(), data, size), np.uint8)
-    elif msg.format == "zlib":
+    size = int(msg.height) * max(int(msg.row_step), int(msg.width) * int(msg.point_step))
+    if form == "zstd":
+        return unpack_cloud(msg, _unpack(zstd.ZstdDecompressor(), data, size))
+    if form == "zlib":
         # 32 + 15: accepts headers of zlib and of gzip.
-        unpacked = np.frombuffer(_unpack(zlib.decompressobj(47), data, size), np.uint8)
-    elif msg.format == "draco":
-        unpacked = _from_draco(msg, data)
-        width, height = len(unpacked) // max(int(msg.point_step), 1), 1
-    else:
-        raise ValueError(f"a cloud compressed by '{msg.format}' is not read: zstd, zlib and draco are")
-    return make(
-        "sensor_msgs/msg/PointCloud2",
-        header=msg.header,
-        height=height,
-        width=width,
-        fields=msg.fields,
-        is_bigendian=msg.is_bigendian,
-        point_step=msg.point_step,
-        row_step=width * int(msg.point_step) if msg.format == "draco" else msg.row_step,
-        data=unpacked,
-        is_dense=msg.is_dense,
-    )
+        return unpack_cloud(msg, _unpack(zlib.decompressobj(47), data, size))
+    extras = [name.rpartition("/")[2] for name in decoders() if name.startswith(f"{COMPRESSED}/")]
+    *most, last = "zstd", "zlib", *extras
+    raise ValueError(f"a cloud compressed by '{form}' is not read: {', '.join(most)} and {last} are")
 
 
 def _unpack(stream: Any, data: bytes, size: int) -> bytes:
@@ -61,38 +51,6 @@ def _unpack(stream: Any, data: bytes, size: int) -> bytes:
     if not stream.eof:
         raise ValueError("the end of its compressed data is missing, or it is too long")
     return content
-
-
-def _from_draco(msg: Any, data: bytes) -> Any:
-    """Decompress draco data into (N * point_step,) bytes.
-
-    point_cloud_transport's plugin stores one attribute for each field, in their order.
-    """
-    try:
-        import DracoPy
-    except ImportError:
-        raise ValueError(f"it is compressed by draco, {DRACO}") from None
-    try:
-        attributes = DracoPy.decode(data).attributes
-    except Exception as error:  # exceptions of DracoPy, and others that its C++ extension raises
-        raise ValueError(f"its draco data is damaged ({first_line(error)})") from None
-    step, count = int(msg.point_step), len(attributes[0]["data"]) if attributes else 0
-    if len(attributes) != len(msg.fields) or count > MOST_POINTS or not 0 < step < 1 << 16:
-        raise ValueError(
-            f"its draco data has {len(attributes)} attributes of {count} points, but {len(msg.fields)} fields"
-        )
-    points = np.zeros(count * step, np.uint8)
-    for field, attribute in zip(msg.fields, attributes, strict=True):
-        values = np.asarray(attribute["data"]).reshape(count, -1)
-        kind = np.dtype(SCALARS.get(int(field.datatype), "u1"))
-        if values.dtype == np.uint8 and values.shape[1] == kind.itemsize:  # rgb is stored as four bytes
-            kind = np.dtype(np.uint8)
-        end = int(field.offset) + values.shape[1] * kind.itemsize
-        if end > step:
-            raise ValueError(f"its field {field.name} ends at byte {end} of {step}")
-        shape, steps = values.shape, (step, kind.itemsize)
-        np.ndarray(shape, kind, points, int(field.offset), steps)[...] = values
-    return points
 
 
 DEFINITIONS = {

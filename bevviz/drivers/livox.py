@@ -1,4 +1,4 @@
-"""Decoder for Livox's CustomMsg of livox_ros_driver and livox_ros_driver2 into a PointCloud2.
+"""Decoder for Livox's CustomMsg of livox_ros_driver and livox_ros_driver2 into a cloud.
 
 It reads the serialised message as an array. Deserialising up to 500,000 points a second as objects is slow.
 """
@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.drivers.packets import read_list_message
-from bevviz.messages.clouds import MOST_POINTS
-from bevviz.messages.decoders import Bytes, Decoder, Serialization
-from bevviz.messages.encode import encode_points
+from bevviz.messages.clouds import MOST_POINTS, make_cloud
+from bevviz.messages.decoders import Bytes, Decoder, Serialization, read_list_message
+from bevviz.model.frame import Cloud
 
 # Fields of a CustomPoint of both drivers. A definition in the bag takes precedence.
 FIELDS = (
@@ -29,11 +28,11 @@ FIELDS = (
 READ = {"reflectivity": "intensity"}
 
 
-def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[str, str]] = FIELDS) -> Any:
-    """Decode a serialised CustomMsg into a sensor_msgs/PointCloud2.
+def read_custom(data: Bytes, *, ros1: bool, fields: Sequence[tuple[str, str]] = FIELDS) -> Cloud:
+    """Decode a serialised CustomMsg.
 
-    The stamp is that of the header; ``offset_time`` of a point is in nanoseconds after the first point. The
-    width of the cloud also counts points that the message announces but does not hold.
+    The stamp is that of the header; ``offset_time`` of a point is in nanoseconds after the first point.
+    Points that the message announces but does not hold count as dropped.
 
     Args:
         data: message as serialised by ROS 1, or as CDR.
@@ -62,7 +61,7 @@ def read_custom(data: bytes | memoryview, *, ros1: bool, fields: Sequence[tuple[
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
     )
     rows = np.ndarray((complete,), point, data, at, (step,))
-    return encode_points(message.stamp, message.frame_id, _to_points(rows), count)
+    return make_cloud(message.stamp, message.frame_id, _to_points(rows), count)
 
 
 def _to_points(rows: Any) -> Any:
@@ -95,7 +94,7 @@ def fields_of(definitions: Mapping[str, Any], msgtype: str) -> Sequence[tuple[st
     return point_fields
 
 
-def read_message(data: Bytes, serialization: Serialization) -> Any:
+def read_message(data: Bytes, serialization: Serialization) -> Cloud:
     """Decode a CustomMsg, by the definition of the bag if there is one."""
     fields = fields_of(serialization.definitions, serialization.type)
     return read_custom(data, ros1=serialization.ros1, fields=fields)

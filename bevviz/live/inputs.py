@@ -11,14 +11,14 @@ from statistics import median
 from typing import Any, Literal
 
 from bevviz.config import Config, SourceConfig, stage_topics
-from bevviz.drivers import ouster
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic
-from bevviz.live.live_message import LiveMessage, OusterSensors
+from bevviz.live.live_message import LiveMessage
 from bevviz.messages import surroundings
 from bevviz.messages.decoders import declared_decoder
 from bevviz.messages.foreign_boxes import holds_boxes
 from bevviz.messages.guard import guard
+from bevviz.messages.packet_topics import PacketTopics, packet_stream
 from bevviz.messages.roles import STAGE_KINDS, Roles, find_roles
 from bevviz.messages.topics import CLOUDS, Topic, unsupported_reason
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
@@ -170,7 +170,7 @@ class Inputs:
         self.handlers: dict[str, Handler[LiveMessage]] = {}
         self.frame_ids: dict[str, str] = {}  # topic -> frame id of its first message
         self.changed = time.monotonic()  # seconds, last change of roles
-        self._ousters = OusterSensors()
+        self._packets = PacketTopics()
 
     @cached_property
     def stated(self) -> dict[str, tuple[str, tuple[str, ...]]]:
@@ -231,8 +231,9 @@ class Inputs:
 
     def candidates(self, topics: Mapping[str, PublishedTopic]) -> dict[str, PublishedTopic]:
         """Return the topics that may have a role, or may hold sensor data in an unsupported form."""
-        packets = [name for name, topic in topics.items() if ouster.is_packet(topic.type)]
-        besides = {self._source.boxes.get("topic"), *map(ouster.metadata_topic, packets)}
+        streams = {name: packet_stream(topic.type) for name, topic in topics.items()}
+        metadata = (stream.metadata_topic(name) for name, stream in streams.items() if stream is not None)
+        besides = {self._source.boxes.get("topic"), *metadata}
         return {name: topic for name, topic in topics.items() if name in besides or _concerns(topic)}
 
     def assign(self, known: Mapping[str, PublishedTopic]) -> bool:
@@ -255,14 +256,14 @@ class Inputs:
             former, self.sync = self.sync, Synchronizer(roles, self._config, results, SILENCE)
             self.sync.take_over(former)
             self.handlers = make_handlers(self.sync, roles, self._decode)
-            for name in self._ousters.packets & self.handlers.keys():
+            for name in self._packets.packets & self.handlers.keys():
                 self.handlers[name] = partial(self._gather, self.handlers[name])
         elif roles.around != self.roles.around:
             others = self.handlers.keys() - {topic for topic, _, _ in self.roles.around}
             self.handlers = {topic: self.handlers[topic] for topic in others}
             self.handlers |= make_around_handlers(self.sync, roles, LiveMessage.decode)
         self.roles = roles
-        metadata_topics = [name for name in self._ousters.metadata if name in known]
+        metadata_topics = [name for name in self._packets.metadata if name in known]
         self.handlers |= dict.fromkeys(metadata_topics, self._add_metadata)
         return True
 
@@ -274,25 +275,24 @@ class Inputs:
         """
         if (handler := self.handlers.get(message.topic)) is not None:
             handler(message)
-        return message.topic in self._ousters.metadata
+        return message.topic in self._packets.metadata
 
     def _describe(self, topics: Iterable[PublishedTopic]) -> list[Topic]:
         boxes = self._source.boxes.get("topic", "")
         known = [
             Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
         ]
-        return [self._ousters.describe(topic, self._source.lidar_calibration) for topic in known]
+        return [self._packets.describe(topic, self._source.lidar_calibration) for topic in known]
 
     def _add_metadata(self, message: LiveMessage) -> None:
         text = guard(message, surroundings.decode_mark, message.decode())
-        if self._ousters.add_metadata(message.topic, text):
+        if self._packets.add_metadata(message.topic, text):
             self._watch.tell(f"the metadata on {message.topic} have changed")
 
     def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
         """Gather packets to scans and pass these on. A scan has the time of receipt of its last packet."""
-        sensor = self._ousters.sensor(message.topic)
-        for packets in self._ousters.add_packet(message.topic, message.received, message.data):
-            handler(replace(message, received=packets[-1][0], data=b"", sensor=sensor, packets=packets))
+        for scan in self._packets.add_packet(message.topic, message.received, message.data):
+            handler(replace(message, received=scan.received, data=b"", scan=scan))
 
     def _decode(self, message: LiveMessage) -> Any:
         """Decode a message with the calibration of the configuration."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
-from bevviz.model.frame import F32, Cloud
+from bevviz.model.frame import F32, U8, Cloud
 
 MOST_POINTS = 100_000_000  # largest cloud
 MOST_FIELDS = 1024  # fields of a point; each element of a field counts
@@ -21,31 +23,96 @@ _AXES = ("x", "y", "z")
 SCALARS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
+class LayoutError(ValueError):
+    """Error for points that do not fit the fields that are stated for them."""
+
+
+class Field(NamedTuple):
+    """Field of a point, with the attributes of a sensor_msgs/PointField."""
+
+    name: str
+    offset: int  # bytes
+    datatype: int  # key of SCALARS
+    count: int = 1
+
+
 def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
-    """Decode points and further fields of a sensor_msgs/PointCloud2.
+    """Decode points and further fields of a sensor_msgs/PointCloud2, see ``make_cloud``.
 
     Fields may have any type, offset, padding and byte order. Organised clouds are flattened row by row. A
     field of several elements becomes one field for each element: ``name_0``, ``name_1`` ...
 
-    These points are dropped and counted in ``Cloud.dropped``: points with a coordinate that is NaN, infinite
-    or beyond ``FARTHEST``; points at (0, 0, 0), which drivers send for beams without a return; and points
-    that the header announces but the data do not hold.
+    Args:
+        msg: the message, or the cloud that the decoder of another message type made.
+        topic: topic of the message.
+        received: time of receipt, nanoseconds.
 
     Raises:
         MessageError: x, y or z is missing, a field does not fit into its point, or the header announces more
             than ``MOST_POINTS`` points or ``MOST_FIELDS`` fields.
     """
-    if (announced := int(msg.height) * int(msg.width)) > MOST_POINTS:
-        raise MessageError(
-            f"{topic}: a cloud of {msg.width} x {msg.height} points is not taken: "
-            f"{MOST_POINTS} at most, and there are {len(msg.data)} bytes of data"
+    if isinstance(msg, Cloud):
+        return replace(msg, topic=topic, received=received)
+    try:
+        cloud = unpack_cloud(msg, msg.data)
+    except LayoutError as error:
+        raise MessageError(f"{topic}: {error}") from None
+    return replace(cloud, topic=topic, received=received)
+
+
+def unpack_cloud(msg: Any, data: Any, count: int | None = None) -> Cloud:
+    """Make a cloud of points that have the layout of a message.
+
+    Args:
+        msg: message with the fields of a sensor_msgs/PointCloud2. Its ``data`` is not used.
+        data: bytes of the points.
+        count: number of points, all in one row; None: as the message states.
+
+    Raises:
+        LayoutError: the points do not fit the message.
+    """
+    rows, columns = (int(msg.height), int(msg.width)) if count is None else (1, count)
+    if rows * columns > MOST_POINTS:
+        raise LayoutError(
+            f"a cloud of {columns} x {rows} points is not taken: {MOST_POINTS} at most, and there are "
+            f"{len(data)} bytes of data"
         )
-    layout = _point_layout(msg, topic)
-    grid = _point_grid(msg, layout)
+    layout = point_layout(msg.fields, msg.point_step, ">" if msg.is_bigendian else "<")
+    grid = _point_grid(np.frombuffer(data, np.uint8), layout, rows, columns, int(msg.row_step))
+    return make_cloud(stamp_ns(msg.header.stamp), msg.header.frame_id, grid, rows * columns)
+
+
+def make_cloud(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Cloud:
+    """Make a cloud of structured points.
+
+    These points are dropped and counted in ``Cloud.dropped``: points with a coordinate that is NaN, infinite
+    or beyond ``FARTHEST``; points at (0, 0, 0), which drivers send for beams without a return; and points
+    that are announced but missing.
+
+    Args:
+        stamp: nanoseconds.
+        frame_id: frame of the points.
+        points: structured array of any shape, with x, y, z and further fields of numbers.
+        announced: number of points that a message states, if larger than that of the array.
+
+    Raises:
+        LayoutError: x, y or z is missing, a field is not a number that a PointField can have, or there are
+            more than ``MOST_POINTS`` points.
+    """
+    names = points.dtype.names or ()
+    if missing := [name for name in _AXES if name not in names]:
+        raise LayoutError(
+            f"the cloud has no field {', '.join(missing)}; its fields are {', '.join(names) or 'none'}"
+        )
+    if odd := [name for name in names if points.dtype[name].str[1:] not in SCALARS.values()]:
+        raise LayoutError(f"the field {odd[0]} of its points is {points.dtype[odd[0]]}, not a number")
+    announced = max(announced, points.size)
+    if announced > MOST_POINTS:
+        raise LayoutError(f"a cloud of {announced} points is not taken: {MOST_POINTS} at most")
     with np.errstate(
         over="ignore", invalid="ignore"
     ):  # float64 values beyond float32 become infinite and are dropped
-        xyz = _positions(grid)
+        xyz = _positions(points)
         x, y, z = xyz.T
         squared = x * x + y * y + z * z
         usable = squared <= np.float32(FARTHEST**2)  # false for NaN and for overflow
@@ -53,23 +120,15 @@ def decode_cloud(msg: Any, topic: str, received: int) -> Cloud:
         usable &= xyz.any(axis=1)
     kept = None if usable.all() else np.flatnonzero(usable)
     fields: dict[str, NDArray[Any]] = {}
-    for name in layout.fields or ():
+    for name in names:
         if name not in _AXES:
-            values = grid[name].reshape(-1)
+            values = points[name].reshape(-1)
             # A copy, because a view would be unaligned and read-only and keep the whole message in memory.
             values = values.copy() if kept is None else values.take(kept)
             fields[name] = np.asarray(values, values.dtype.newbyteorder("="))
     if kept is not None:
         xyz = xyz.take(kept, axis=0)
-    return Cloud(
-        stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id),
-        xyz=xyz,
-        fields=fields,
-        topic=topic,
-        received=received,
-        dropped=announced - len(xyz),
-    )
+    return Cloud(stamp, frame_name(frame_id), xyz, fields, dropped=announced - len(xyz))
 
 
 def decode_laser_scan(msg: Any, topic: str, received: int) -> Cloud:
@@ -121,50 +180,55 @@ def _positions(grid: NDArray[np.void]) -> F32:
     return xyz.reshape(-1, 3)
 
 
-def _point_layout(msg: Any, topic: str) -> np.dtype[np.void]:
-    """Return the structured dtype of a point. Its ``itemsize`` is point_step."""
-    if not 0 < msg.point_step < 1 << 31:
-        raise MessageError(f"{topic}: a point of {msg.point_step} bytes cannot be")
-    if sum(max(int(field.count), 1) for field in msg.fields) > MOST_FIELDS:
-        raise MessageError(f"{topic}: its points have more than {MOST_FIELDS} fields, each element counted")
-    order = ">" if msg.is_bigendian else "<"
+def point_layout(fields: Iterable[Any], step: int, order: str = "<") -> np.dtype[np.void]:
+    """Return the structured dtype of a point.
+
+    Args:
+        fields: fields with the attributes of ``Field``.
+        step: bytes of a point.
+        order: byte order, ``<`` or ``>``.
+
+    Raises:
+        LayoutError: a field does not fit into the point, or there are more than ``MOST_FIELDS``.
+    """
+    if not 0 < step < 1 << 31:
+        raise LayoutError(f"a point of {step} bytes cannot be")
+    fields = list(fields)
+    if sum(max(int(field.count), 1) for field in fields) > MOST_FIELDS:
+        raise LayoutError(f"its points have more than {MOST_FIELDS} fields, each element counted")
     formats: dict[str, str] = {}
     offsets: dict[str, int] = {}
-    for field in msg.fields:
+    for field in fields:
         if field.datatype not in SCALARS:
-            raise MessageError(f"{topic}: field '{field.name}' has the unknown datatype {field.datatype}")
+            raise LayoutError(f"field '{field.name}' has the unknown datatype {field.datatype}")
         scalar = np.dtype(order + SCALARS[field.datatype])
         count = max(int(field.count), 1)  # old drivers send 0
-        if field.offset + count * scalar.itemsize > msg.point_step:
-            raise MessageError(
-                f"{topic}: field '{field.name}' ends at byte {field.offset + count * scalar.itemsize} "
-                f"of a point, but point_step is {msg.point_step}"
+        if field.offset + count * scalar.itemsize > step:
+            raise LayoutError(
+                f"field '{field.name}' ends at byte {field.offset + count * scalar.itemsize} of a point, but "
+                f"point_step is {step}"
             )
         for i in range(count):
             name = field.name if count == 1 else f"{field.name}_{i}"
             formats.setdefault(name, scalar.str)
             offsets.setdefault(name, field.offset + i * scalar.itemsize)
-    if missing := [name for name in _AXES if name not in formats]:
-        raise MessageError(
-            f"{topic}: the cloud has no field {', '.join(missing)}; "
-            f"its fields are {', '.join(formats) or 'none'}"
-        )
     return np.dtype(
         {
             "names": list(formats),
             "formats": list(formats.values()),
             "offsets": list(offsets.values()),
-            "itemsize": int(msg.point_step),
+            "itemsize": int(step),
         }
     )
 
 
-def _point_grid(msg: Any, layout: np.dtype[np.void]) -> NDArray[np.void]:
+def _point_grid(
+    data: U8, layout: np.dtype[np.void], rows: int, columns: int, row_step: int
+) -> NDArray[np.void]:
     """Return a (rows, columns) view of the points that the data hold completely."""
-    data = np.frombuffer(msg.data, np.uint8)
-    rows, columns, step = int(msg.height), int(msg.width), layout.itemsize
+    step = layout.itemsize
     row_bytes = columns * step
-    row_step = max(int(msg.row_step), row_bytes)  # some drivers send 0
+    row_step = max(row_step, row_bytes)  # some drivers send 0
     if row_step == row_bytes or rows == 1:
         rows, columns = 1, min(rows * columns, data.size // step)
     else:

@@ -13,15 +13,18 @@ decoders of bevviz come first, then those that installed packages register under
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from importlib.metadata import EntryPoint
+from typing import Any, Literal, Protocol
 
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
+from bevviz.model.frame import Cloud
+from bevviz.support.extensions import load, registered
 
 LATEST = 2**63 - 1  # nanoseconds; the largest stamp that 64 bits hold
+SECOND = 1_000_000_000
 
 
 class MessageError(UserError):
@@ -72,6 +75,44 @@ def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, 
         raise MessageError(f"{topic}: a message of {len(data)} bytes has no header") from None
 
 
+@dataclass(frozen=True, slots=True)
+class ListMessage:
+    """Beginning of a serialised message with a std_msgs/Header and a list."""
+
+    order: Literal["<", ">"]  # byte order, as struct and numpy write it
+    stamp: int  # of the header, nanoseconds
+    frame_id: str
+    count: int  # length that the list states
+    at: int  # byte at which its first item begins
+
+
+def read_list_message(
+    data: bytes | memoryview, *, ros1: bool, alignment: int = 4, skipped: int = 0
+) -> ListMessage:
+    """Read the beginning of a message.
+
+    Args:
+        data: serialised message.
+        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
+        alignment: bytes to which CDR aligns the field behind the header.
+        skipped: bytes of the fields between the header and the list.
+
+    Raises:
+        ValueError: the data are no such message.
+    """
+    order: Literal["<", ">"] = "<" if ros1 or data[1:2] != b"\0" else ">"
+    try:
+        # Behind the encapsulation header of CDR, or the seq of ROS 1.
+        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
+        at = 16 + length
+        frame_id = bytes(data[16:at]).rstrip(b"\0").decode()
+        at += skipped + (0 if ros1 else -(at - 4) % alignment)
+        (count,) = struct.unpack_from(f"{order}I", data, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ValueError(f"{len(data)} bytes end before the list of the message") from error
+    return ListMessage(order, sec * SECOND + nanosec, frame_id, count, at + 4)
+
+
 def frame_name(name: str) -> str:
     """Return a frame name without the leading slash of ROS 1."""
     return name.removeprefix("/")  # ROS 1 used both spellings
@@ -90,13 +131,9 @@ def either(msg: Any, *names: str) -> Any:
     raise AttributeError(f"no field {wanted}", name=wanted, obj=msg)
 
 
-GROUP = "bevviz.decoders"  # of the entry points
 # Names, not imports: drivers import this package. Each names a Decoder or a sequence of them.
 BUILT_IN = (
     "bevviz.drivers.livox:DECODER",
-    "bevviz.drivers.hesai:DECODER",
-    "bevviz.drivers.velodyne:DECODER",
-    "bevviz.drivers.ouster:DECODER",
     "bevviz.drivers.compressed_clouds:DECODER",
     "bevviz.messages.foxglove:DECODERS",
     "bevviz.drivers.video:DECODERS",
@@ -126,20 +163,96 @@ def _nothing() -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class Scan:
+    """One scan made of packets. It is decoded when a frame takes it, maybe in another process.
+
+    Attributes:
+        received: time of receipt of its last packet, nanoseconds.
+        decode: decodes its packets. It can be pickled.
+    """
+
+    received: int
+    decode: Callable[[], Cloud]
+
+
+def decode_scan(scan: Scan) -> Cloud:
+    """Decode the packets of a scan."""
+    return scan.decode()
+
+
+class ScanDecoder(Protocol):
+    """Decoder of the packets of one sensor. It holds the packets of the scan that is not complete yet."""
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the clouds."""
+
+    def add(self, received: int, data: Bytes, *, ros1: bool) -> Iterator[Scan]:
+        """Add a serialised message. Yield each scan that ends with it.
+
+        Raises:
+            ValueError: the packet is not one of the sensor.
+        """
+
+    def rest(self) -> Iterator[Scan]:
+        """Yield the incomplete scan."""
+
+
+@dataclass(frozen=True, slots=True)
+class PacketStream:
+    """Description of the topics on which each message is a single packet, of which scans are made.
+
+    Attributes:
+        sensor: name of the sensor in sentences, with its article.
+        open: makes the decoder of a sensor from its metadata and the file or topic that they come from.
+            Raises UserError.
+        metadata_topic: returns the topic of the metadata (std_msgs/String) for a topic of packets.
+        smallest: bytes; messages that are not larger are packets of the sensor's IMU.
+    """
+
+    sensor: str
+    open: Callable[[str, str], ScanDecoder]
+    metadata_topic: Callable[[str], str]
+    smallest: int
+
+    @property
+    def imu(self) -> str:
+        """Note on a topic of packets that belong to no scan."""
+        return f"packets of {self.sensor}'s IMU"
+
+    @property
+    def lacks_metadata(self) -> str:
+        """Note on a recorded topic of packets without metadata."""
+        return (
+            f"packets of {self.sensor} without its metadata: record its metadata topic (std_msgs/String) "
+            "with them, --set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its "
+            "driver"
+        )
+
+    def awaits_metadata(self, topic: str) -> str:
+        """Return the note on a live topic of packets whose metadata have not arrived yet."""
+        return (
+            f"packets of {self.sensor} whose metadata are waited for on {self.metadata_topic(topic)} "
+            f"(std_msgs/String); --set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from "
+            "a file"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Decoder:
     """Decoder of a driver's message types.
 
     Attributes:
-        types: message types that the decoder takes, as ``package/msg/Name``.
+        types: message types that the decoder takes, as ``package/msg/Name``. The decoder of one compression
+            of CompressedPointCloud2 has ``package/msg/Name/format``.
         kind: ROS message that the types are handled as, without its package: ``PointCloud2``.
-        from_bytes: decodes a serialised message.
-        from_message: converts a message with the fields of its definition. Without ``from_bytes`` and
-            ``from_message`` the message stays as it is.
+        from_bytes: decodes a serialised message, to a ``Cloud`` or to a message of ``kind``.
+        from_message: does the same with a message that has the fields of its definition. Without
+            ``from_bytes`` and ``from_message`` the message stays as it is.
         missing: returns the library that must be installed for the decoder; empty: none is missing.
         definitions: text of the message definitions that rosbags lacks, by type.
-        metadata_topic: returns the topic with the metadata of the LiDAR, for a topic of its packets. Given
-            where a message is a single packet, of which the source gathers scans. Such a topic has the kind
-            only if ``Topic.scans`` is set.
+        packets: given where a message is a single packet, of which the source gathers scans. Such a topic
+            has the kind only if ``Topic.scans`` is set.
     """
 
     types: tuple[str, ...]
@@ -148,7 +261,7 @@ class Decoder:
     from_message: Callable[[Any], Any] | None = None
     missing: Callable[[], str] = _nothing
     definitions: Mapping[str, str] = field(default_factory=dict)
-    metadata_topic: Callable[[str], str] | None = None
+    packets: PacketStream | None = None
 
 
 @cache
@@ -159,8 +272,8 @@ def decoders() -> Mapping[str, Decoder]:
         UserError: a decoder of an installed package cannot be loaded.
     """
     by_type: dict[str, Decoder] = {}
-    points = [*(EntryPoint(name, name, GROUP) for name in BUILT_IN), *entry_points(group=GROUP)]
-    for point in points:
+    built_in = (EntryPoint(name, name, "bevviz.decoders") for name in BUILT_IN)
+    for point in (*built_in, *registered("decoders").values()):
         for decoder in _loaded(point):
             for msgtype in decoder.types:
                 by_type.setdefault(msgtype, decoder)
@@ -169,13 +282,7 @@ def decoders() -> Mapping[str, Decoder]:
 
 def _loaded(point: EntryPoint) -> Iterable[Decoder]:
     """Load the decoders of an entry point."""
-    try:
-        target = point.load()
-    except Exception as error:  # a package may raise anything when it is imported
-        raise UserError(
-            f"the decoder '{point.name}' ({point.value}) cannot be loaded: {type(error).__name__}: "
-            f"{first_line(error)}; repair or uninstall its package"
-        ) from error
+    target = load(point)
     loaded = [target] if isinstance(target, Decoder) else list(target) if isinstance(target, tuple) else []
     if not loaded or not all(isinstance(decoder, Decoder) for decoder in loaded):
         raise UserError(

@@ -15,11 +15,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bevviz.messages.clouds import Field, make_cloud, point_layout
 from bevviz.messages.decoders import Decoder, nanoseconds
 from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make
 from bevviz.model import geometry
-from bevviz.model.frame import F64, U8
+from bevviz.model.frame import F64, Cloud
 
 ENCODINGS = ("protobuf", "json")
 TYPE = re.compile(r"^foxglove(?:_msgs)?[./](?:msg/)?(\w+)$")
@@ -35,8 +37,7 @@ KINDS = {  # kind of ROS message by Foxglove's type
 }
 # Datatype of a PointField by Foxglove's type: uint8 to float64.
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
-_AXES = ["x", "y", "z"]
-_FLOATS = {7: "<f4", 8: "<f8"}
+_AXES = ("x", "y", "z")
 # Keys of metadata; the first that exists is the class.
 _LABELS = ("category", "label", "class", "class_name", "type", "name")
 _MODELS = {"kannala_brandt": "equidistant"}
@@ -103,15 +104,6 @@ class _Fields(SimpleNamespace):
         return None
 
 
-def to_ros(message: Any, msgtype: str) -> Any:
-    """Convert a message of Foxglove to the ROS message of the same meaning.
-
-    Raises:
-        ValueError: a field that the ROS message needs is missing or wrong.
-    """
-    return _CONVERT[foxglove_type(msgtype)](message)
-
-
 def header(message: Any, msgtype: str) -> tuple[int, str]:
     """Return stamp (nanoseconds) and frame_id; those of the first part if the message has several."""
     kind = foxglove_type(msgtype)
@@ -158,56 +150,29 @@ def _header(message: Any) -> Any:
     return make("std_msgs/msg/Header", stamp=time, frame_id=_frame(message))
 
 
-def _cloud(message: Any) -> Any:
-    data, step = _data(message), _integer(message, "point_stride")
+def _cloud(message: Any) -> Cloud:
+    data, step = np.frombuffer(_data(message), np.uint8), _integer(message, "point_stride")
     fields = [
-        make(
-            "sensor_msgs/msg/PointField",
-            name=str(field.name),
-            offset=_integer(field, "offset"),
-            datatype=_POINT_FIELD.get(_integer(field, "type"), 0),
-            count=1,
-        )
+        Field(str(field.name), _integer(field, "offset"), _POINT_FIELD.get(_integer(field, "type"), 0))
         for field in message.fields or ()
     ]
-    count = len(data) // step if step > 0 else 0
+    layout = point_layout(fields, step)
+    points = data[: len(data) // step * step].view(layout)
     pose = _matrix(message.pose) if _is_set(message, "pose") else np.eye(4)
-    values = np.frombuffer(data, np.uint8)
     if not np.array_equal(pose, np.eye(4)):
-        values = _transform_points(values, step, fields, pose)
-    return make(
-        "sensor_msgs/msg/PointCloud2",
-        header=_header(message),
-        height=1,
-        width=count,
-        fields=fields,
-        is_bigendian=False,
-        point_step=step,
-        row_step=step * count,
-        data=values,
-        is_dense=False,
-    )
+        points = _transform_points(points, pose)
+    return make_cloud(_stamp(message), _frame(message), points)
 
 
-def _transform_points(data: U8, step: int, fields: Iterable[Any], pose: F64) -> U8:
-    """Transform points of ``step`` bytes into the frame of the message."""
-    at = {field.name: field for field in fields if field.name in _AXES and field.datatype in _FLOATS}
-    if len(at) < len(_AXES):
+def _transform_points(points: NDArray[np.void], pose: F64) -> NDArray[np.void]:
+    """Return the points in the frame of the message."""
+    if any(name not in points.dtype.names or points.dtype[name].kind != "f" for name in _AXES):
         raise ValueError("a cloud with a pose needs x, y and z as floats")
-    layout: np.dtype[np.void] = np.dtype(
-        {
-            "names": _AXES,
-            "formats": [_FLOATS[at[name].datatype] for name in _AXES],
-            "offsets": [at[name].offset for name in _AXES],
-            "itemsize": step,
-        }
-    )
-    turned = data[: len(data) // step * step].copy()
-    points = turned.view(layout)
+    moved = points.copy()
     xyz = np.stack([points[name] for name in _AXES], axis=1) @ pose[:3, :3].T + pose[:3, 3]
     for name, values in zip(_AXES, xyz.T, strict=True):
-        points[name] = values
-    return turned
+        moved[name] = values
+    return moved
 
 
 def _compressed(message: Any) -> Any:

@@ -16,7 +16,6 @@ from bevviz.messages.foreign_boxes import holds_boxes
 CLOUDS = ("PointCloud2", "LaserScan")  # what may be a LiDAR's; scans of one plane where there is no cloud
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
-NOT_LIDAR = "packets of an Ouster's IMU"  # Topic.aside of packets that belong to no scan
 
 # Entities of recordings beside those of the sensors (docs/recordings.md). No sensor may have these names.
 RESERVED = frozenset(
@@ -58,7 +57,7 @@ class Topic:
     def kind(self) -> str:
         """Type that the messages are handled as, without package: PointCloud2 for a LiDAR's packets."""
         decoder = find_decoder(self.type)
-        if decoder is not None and (self.scans or decoder.metadata_topic is None):
+        if decoder is not None and (self.scans or decoder.packets is None):
             return decoder.kind
         if self.video:
             return "CompressedVideo"
@@ -68,7 +67,7 @@ class Topic:
     def metadata_topic(self) -> str:
         """Topic with the metadata of the LiDAR whose packets these are; empty for other topics."""
         decoder = declared_decoder(self.type) if self.scans else None
-        return decoder.metadata_topic(self.name) if decoder and decoder.metadata_topic else ""
+        return decoder.packets.metadata_topic(self.name) if decoder and decoder.packets else ""
 
 
 _FOREIGN = (  # sensor, type, and what would help: points or pixels in forms that are not supported
@@ -103,8 +102,8 @@ def unsupported_reason(topic: Topic, sensor: str = "") -> str:
     if topic.kind == "PointCloud2":
         return ""
     decoder = declared_decoder(topic.type)
-    if decoder is not None and decoder.metadata_topic is not None and topic.aside:
-        return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != NOT_LIDAR) else ""
+    if decoder is not None and decoder.packets is not None and topic.aside:
+        return topic.aside if not sensor or (sensor == "LiDAR" and topic.aside != decoder.packets.imu) else ""
     if decoder is not None and sensor in ("", "LiDAR") and (why := decoder.missing()):
         return why
     for name, types, reason in _FOREIGN:

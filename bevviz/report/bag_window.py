@@ -18,7 +18,6 @@ from bevviz.bags.message import RawMessage, is_ros1
 from bevviz.bags.reader import LAST_TIME
 from bevviz.bags.source import MARGIN, SECOND, BagSource, iso
 from bevviz.config import Config
-from bevviz.drivers.ouster import metadata_topic
 from bevviz.errors import UserError
 from bevviz.messages.roles import Roles
 from bevviz.sync.report import UnusableMessages
@@ -88,7 +87,7 @@ def choose_topics(recording: Recording, roles: Roles, patterns: Sequence[str] | 
     if patterns is None:
         return names
     check_patterns(recording, patterns, "--topics")
-    needed = {*_read(roles), *(metadata_topic(topic.name) for topic in recording.topics if topic.scans)}
+    needed = {*_read(roles), *(topic.metadata_topic for topic in recording.topics)}
     return [n for n in names if n in needed or any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 

@@ -16,6 +16,7 @@ Kind: TypeAlias = Literal[
     "datasets",
     "decoders",
     "exports",
+    "files",
     "rescuers",
     "simulators",
     "stages",

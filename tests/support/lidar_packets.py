@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import get_types_from_msg
 
-from bevviz.drivers.hesai import MODELS, Model
+from bevviz.extras.lidars.hesai import MODELS, Model
 from tests.support import bags
 
 SCAN, PACKET = "pandar_msgs/msg/PandarScan", "pandar_msgs/msg/PandarPacket"

@@ -10,20 +10,17 @@ import json
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bevviz.errors import UserError
-from bevviz.messages.decoders import Decoder, declared_decoder
-from bevviz.messages.encode import encode_points
-from bevviz.model.frame import F32, U8
+from bevviz.messages.clouds import make_cloud
+from bevviz.messages.decoders import Bytes, Decoder, PacketStream, Scan
+from bevviz.model.frame import F32, U8, Cloud
 
 FRAME = "os_lidar"  # frame of the clouds that Ouster's driver publishes
-NO_METADATA = (
-    "packets of an Ouster without its metadata: record its metadata topic (std_msgs/String) with them, "
-    "--set 'source.lidar_calibration={TOPIC: metadata.json}', or play them through its driver"
-)
 SMALLEST = 1000  # bytes; packets of the IMU have 48
 MINUTE = 60_000_000_000
 ReceivedPacket = tuple[int, bytes | memoryview]  # time of receipt in nanoseconds, and the bytes
@@ -124,12 +121,14 @@ class Sensor:
         return int.from_bytes(packet[at : at + 2], "little")
 
 
-class ScanCollector:
-    """Collector that groups the packets of a sensor into scans.
+class OusterDecoder:
+    """Decoder of the packets of one sensor; see ``bevviz.messages.decoders.ScanDecoder``.
 
     A scan is complete with its last packet. If packets are lost, it ends when the next scan begins. Late and
     repeated packets are discarded.
     """
+
+    frame_id = FRAME
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
@@ -137,13 +136,23 @@ class ScanCollector:
         self._finished: deque[int] = deque(maxlen=2)  # numbers of the previous scans
         self._packets: dict[int, ReceivedPacket] = {}  # packets of the current scan by their first column
 
-    def add(self, received: int, packet: bytes | memoryview) -> Iterator[tuple[ReceivedPacket, ...]]:
-        """Add a packet. Yield each scan that it ends.
+    def add(self, received: int, data: Bytes, *, ros1: bool) -> Iterator[Scan]:
+        """Add a serialised PacketMsg. Yield each scan that ends with it.
 
         Args:
             received: time of receipt, nanoseconds.
-            packet: ``sensor.size`` bytes.
+            data: the message.
+            ros1: whether ROS 1 serialised it; otherwise it is CDR.
+
+        Raises:
+            ValueError: the packet is not of the sensor that the metadata describe.
         """
+        packet = payload(data, ros1=ros1)
+        if len(packet) != self.sensor.size:
+            raise ValueError(
+                f"a packet of {len(packet)} bytes, but the sensor that its metadata are of sends packets of "
+                f"{self.sensor.size}"
+            )
         number, begin = self.sensor.number(packet), self.sensor.begin(packet)
         if number in self._finished or begin >= self.sensor.columns:
             return
@@ -154,31 +163,23 @@ class ScanCollector:
         if len(self._packets) == self.sensor.sent:
             yield from self.rest()
 
-    def rest(self) -> Iterator[tuple[ReceivedPacket, ...]]:
+    def rest(self) -> Iterator[Scan]:
         """Yield the incomplete scan. Its further packets are then too late."""
         if self._packets:
             packets, self._packets = tuple(self._packets.values()), {}
             self._finished.append(self._current)
             self._current = -1
-            yield packets
+            yield Scan(packets[-1][0], partial(decode, self.sensor, packets))
 
 
-def is_packet(msgtype: str) -> bool:
-    """Return whether messages of a type are packets of an Ouster."""
-    return declared_decoder(msgtype) is DECODER
+def open_decoder(text: str, where: str) -> OusterDecoder:
+    """Return the decoder for the packets of the sensor that a text describes; see ``read_sensor``."""
+    return OusterDecoder(read_sensor(text, where))
 
 
 def metadata_topic(topic: str) -> str:
     """Return the topic of the metadata (std_msgs/String), for a topic of packets."""
     return f"{topic.rpartition('/')[0]}/metadata"
-
-
-def waiting_note(topic: str) -> str:
-    """Return the note on a live topic of packets whose metadata have not arrived yet."""
-    return (
-        f"packets of an Ouster whose metadata are waited for on {metadata_topic(topic)} (std_msgs/String); "
-        f"--set 'source.lidar_calibration={{{topic}: metadata.json}}' gives them from a file"
-    )
 
 
 def read_sensor(text: str, where: str) -> Sensor:
@@ -226,7 +227,7 @@ def read_sensor(text: str, where: str) -> Sensor:
     )
 
 
-def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
+def payload(data: Bytes, *, ros1: bool) -> memoryview:
     """Return the packet of a serialised PacketMsg. Its bytes are the only field of the message."""
     at = 0 if ros1 else 4
     big = not ros1 and data[1:2] == b"\0"
@@ -234,14 +235,13 @@ def payload(data: bytes | memoryview, *, ros1: bool) -> memoryview:
     return memoryview(data)[at + 4 : at + 4 + length]
 
 
-def decode(sensor: Sensor, packets: Sequence[ReceivedPacket]) -> Any:
-    """Decode the packets of one scan into a sensor_msgs/PointCloud2 in the frame os_lidar.
+def decode(sensor: Sensor, packets: Sequence[ReceivedPacket]) -> Cloud:
+    """Decode the packets of one scan into a cloud in the frame os_lidar.
 
     The stamp is that of the first column, by the sensor's clock if this is within a minute of the time of
     receipt. Otherwise the clock counts from the sensor's start, and the stamp is the time at which the packet
     of the column was received. ``time`` is in seconds after the stamp. Of two returns the first one is used.
-    The width of the cloud counts all measurements of a full turn, also those without a return and those in
-    lost packets.
+    All measurements of a full turn without a return count as dropped, also those in lost packets.
 
     Args:
         sensor: sensor that sent the packets.
@@ -295,9 +295,10 @@ def decode(sensor: Sensor, packets: Sequence[ReceivedPacket]) -> Any:
     points["intensity"] = columns["measured"]["signal"][row, pixel]
     points["ring"] = pixel
     points["time"] = times[row]
-    return encode_points(stamp, FRAME, points, sensor.columns * pixels)
+    return make_cloud(stamp, FRAME, points, sensor.columns * pixels)
 
 
 _TYPES = tuple(f"{package}/msg/PacketMsg" for package in ("ouster_sensor_msgs", "ouster_msgs", "ouster_ros"))
 DEFINITIONS = dict.fromkeys(_TYPES, "uint8[] buf\n")
-DECODER = Decoder(types=_TYPES, kind="PointCloud2", definitions=DEFINITIONS, metadata_topic=metadata_topic)
+PACKETS = PacketStream("an Ouster", open_decoder, metadata_topic, SMALLEST)
+DECODER = Decoder(types=_TYPES, kind="PointCloud2", definitions=DEFINITIONS, packets=PACKETS)

@@ -18,11 +18,12 @@ from typing import BinaryIO, Literal, NamedTuple
 import numpy as np
 from rosbags.interfaces import Connection
 
+from bevviz.bags.file_types import FileFormat
 from bevviz.bags.reader import LAST_TIME, FileBytes, Message
 from bevviz.datasets.dataset import make_connection
-from bevviz.drivers import hesai, ouster
-from bevviz.drivers.packets import encode_scan
 from bevviz.errors import UserError
+from bevviz.extras.lidars import hesai, ouster
+from bevviz.extras.lidars.scan_messages import encode_scan
 from bevviz.messages.definitions import typestore
 from bevviz.model.frame import I64
 
@@ -346,3 +347,9 @@ def _time_unit(options: bytes, order: str) -> tuple[int, int]:
             break
         at += 4 + length + -length % 4
     return 1000, 1
+
+
+FORMATS = tuple(
+    FileFormat("network capture", magic, ".pcap", lambda path, _: PcapReader(path))
+    for magic in (*MAGICS, NEXT_GENERATION)
+)

@@ -10,8 +10,8 @@ import pytest
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.drivers import ouster
 from bevviz.errors import UserError
+from bevviz.extras.lidars import ouster
 from tests.support import bags
 from tests.support.ouster_packets import (
     COLUMNS,

@@ -1,4 +1,4 @@
-"""Scans of LiDAR packets in VelodyneScan and PandarScan messages, and the calibration files of LiDARs.
+"""Scans of LiDAR packets in VelodyneScan and PandarScan messages.
 
 A serialised message is read as an array. Deserialising up to 9,000 packets a second as objects is slow.
 """
@@ -8,16 +8,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
+from bevviz.messages.decoders import SECOND, read_list_message
 from bevviz.model.frame import I64, U8
-from bevviz.support.files import read_text
 
 MOST_PACKETS = 100_000
-SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,44 +36,6 @@ class ScanPackets:
     data: U8
     sizes: I64
     lost: int
-
-
-@dataclass(frozen=True, slots=True)
-class ListMessage:
-    """Beginning of a serialised message with a std_msgs/Header and a list."""
-
-    order: Literal["<", ">"]  # byte order, as struct and numpy write it
-    stamp: int  # of the header, nanoseconds
-    frame_id: str
-    count: int  # length that the list states
-    at: int  # byte at which its first item begins
-
-
-def read_list_message(
-    data: bytes | memoryview, *, ros1: bool, alignment: int = 4, skipped: int = 0
-) -> ListMessage:
-    """Read the beginning of a message.
-
-    Args:
-        data: serialised message.
-        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
-        alignment: bytes to which CDR aligns the field behind the header.
-        skipped: bytes of the fields between the header and the list.
-
-    Raises:
-        ValueError: the data are no such message.
-    """
-    order: Literal["<", ">"] = "<" if ros1 or data[1:2] != b"\0" else ">"
-    try:
-        # Behind the encapsulation header of CDR, or the seq of ROS 1.
-        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
-        at = 16 + length
-        frame_id = bytes(data[16:at]).rstrip(b"\0").decode()
-        at += skipped + (0 if ros1 else -(at - 4) % alignment)
-        (count,) = struct.unpack_from(f"{order}I", data, at)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{len(data)} bytes end before the list of the message") from error
-    return ListMessage(order, sec * SECOND + nanosec, frame_id, count, at + 4)
 
 
 def split(data: bytes | memoryview, size: int, *, sized: bool, ros1: bool) -> ScanPackets:
@@ -137,12 +96,3 @@ def encode_scan(
         data = struct.pack("<II", *divmod(time, SECOND)) + packet.ljust(size, b"\0") + used
         parts.append(data + bytes(-len(data) % 4))
     return b"".join(parts)
-
-
-def read_calibration(path: Path) -> str:
-    """Return the text of a file that ``source.lidar_calibration`` names.
-
-    Raises:
-        UserError: the file cannot be read.
-    """
-    return read_text(path, problem=f"source.lidar_calibration: {path}: cannot be read")

@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
-from bevviz.drivers import velodyne
-from bevviz.drivers.hesai import NOMINAL
+from bevviz.extras.lidars import velodyne
+from bevviz.extras.lidars.hesai import NOMINAL
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import MessageError
@@ -204,4 +204,5 @@ def test_without_its_library_a_velodyne_says_what_to_install(
     item = bags.Item("/velodyne_packets", VELODYNE, bags.START, scan(made, bags.START, [b""], VELODYNE))
     assert main(["info", str(bags.write(tmp_path / "bag", [item], made))]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "/velodyne_packets holds packets of the sensor, which velodyne-decoder reads: pip install" in said
+    assert "/velodyne_packets holds packets of the sensor, which velodyne-decoder reads: " in said
+    assert "pip install 'bevviz[lidars]'" in said

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from functools import cache
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bevviz.drivers.packets import ScanPackets, read_calibration, split
 from bevviz.errors import UserError
+from bevviz.extras.lidars.scan_messages import ScanPackets, split
+from bevviz.messages.clouds import make_cloud
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
-from bevviz.messages.encode import encode_points
-from bevviz.model.frame import F32, I64
+from bevviz.messages.packet_topics import read_calibration
+from bevviz.model.frame import F32, I64, Cloud
 
-NOMINAL = Path(__file__).parents[1] / "data" / "hesai_angles.csv"  # the angles that Hesai's drivers contain
+NOMINAL = Path(__file__).with_name("hesai_angles.csv")  # the angles that Hesai's drivers contain
 AZIMUTHS = 36_000  # units of a full circle
 POINT = np.dtype([(n, "<f4") for n in ("x", "y", "z", "intensity", "time")] + [("ring", "<u2")])
 
@@ -103,13 +103,13 @@ MODELS = (
 RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3, 0x3E: 2}
 
 
-def decode(packets: ScanPackets, angles: Path | None = None) -> Any:
-    """Decode a scan into a sensor_msgs/PointCloud2, as Hesai's driver does: y points to azimuth 0.
+def decode(packets: ScanPackets, angles: Path | None = None) -> Cloud:
+    """Decode a scan, as Hesai's driver does: y points to azimuth 0.
 
     ``ring`` is the channel number from 0. ``time`` is in seconds after the stamp of the scan, by the sensor's
     clock. All channels of a block get the same time, because they fire within 0.15 ms. If a beam has several
-    returns, those at different distances become points. The width of the cloud counts every beam, also beams
-    without a return and beams of lost packets.
+    returns, those at different distances become points. Beams without a return, also those of lost packets,
+    count as dropped.
 
     Args:
         packets: packets of the scan. Cut packets, and packets of another model or return mode than most,
@@ -157,7 +157,7 @@ def decode(packets: ScanPackets, angles: Path | None = None) -> Any:
     points["time"] = _times(packets, usable, model, returns)[packet, group]
     lost = packets.lost + len(packets.data) - len(data)
     announced = len(points) + int((~met).sum()) + lost * met[0].size
-    return encode_points(packets.stamp, packets.frame_id, points, announced)
+    return make_cloud(packets.stamp, packets.frame_id, points, announced)
 
 
 def _model_of(packets: ScanPackets) -> tuple[Model, I64]:
@@ -235,7 +235,7 @@ def _read_angles(path: Path, model: Model) -> Angles:
     return _sorted_angles(rows)
 
 
-def read_scan(data: Bytes, serialization: Serialization) -> Any:
+def read_scan(data: Bytes, serialization: Serialization) -> Cloud:
     """Decode a serialised PandarScan, with the sensor's own angles if the configuration states their file."""
     packets = split(data, 1500, sized=True, ros1=serialization.ros1)
     return decode(packets, Path(serialization.calibration) if serialization.calibration else None)

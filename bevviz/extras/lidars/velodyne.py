@@ -1,24 +1,24 @@
-"""Decoder for packets of Velodyne's LiDARs, by the library velodyne-decoder (``bevviz[velodyne]``)."""
+"""Decoder for packets of Velodyne's LiDARs, by the library velodyne-decoder (``bevviz[lidars]``)."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 
-from bevviz.drivers.packets import ScanPackets, split
 from bevviz.errors import UserError, first_line
+from bevviz.extras.lidars.scan_messages import ScanPackets, split
+from bevviz.messages.clouds import make_cloud
 from bevviz.messages.decoders import Bytes, Decoder, Serialization
-from bevviz.messages.encode import encode_points
+from bevviz.model.frame import Cloud
 
 FIELDS = ("x", "y", "z", "intensity", "time", "ring")
 MODEL = 1205  # offset of the byte that states the model
 FAR = 1000.0  # metres; no model measures farther
 
 
-def decode(packets: ScanPackets) -> Any:
-    """Decode a scan into a sensor_msgs/PointCloud2, as velodyne_pointcloud does.
+def decode(packets: ScanPackets) -> Cloud:
+    """Decode a scan, as velodyne_pointcloud does.
 
     The packets state the model. The nominal angles of the model are used. ``time`` is in seconds after the
     stamp of the scan, which is that of its first or of its last packet, depending on the driver.
@@ -45,10 +45,10 @@ def decode(packets: ScanPackets) -> Any:
         raise ValueError(f"velodyne-decoder does not take the packets ({first_line(error)})") from None
     # The library's times are relative to the last packet.
     points["time"] += np.float32((int(packets.received[usable[-1]]) - packets.stamp) * 1e-9)
-    return encode_points(packets.stamp, packets.frame_id, points[list(FIELDS)])
+    return make_cloud(packets.stamp, packets.frame_id, points[list(FIELDS)])
 
 
-def read_scan(data: Bytes, serialization: Serialization) -> Any:
+def read_scan(data: Bytes, serialization: Serialization) -> Cloud:
     """Decode a serialised VelodyneScan.
 
     Raises:
@@ -63,7 +63,7 @@ def _missing() -> str:
     """Return the library to install; empty if it is installed."""
     if find_spec("velodyne_decoder") is not None:
         return ""
-    return "packets of the sensor, which velodyne-decoder reads: pip install 'bevviz[velodyne]'"
+    return "packets of the sensor, which velodyne-decoder reads: pip install 'bevviz[lidars]'"
 
 
 DEFINITIONS = {

@@ -1,0 +1,1 @@
+"""Tests of LiDAR packets, network captures and draco."""
