@@ -11,7 +11,7 @@ import time
 from collections import Counter
 
 from benchmarks.measure import machine
-from bevviz.why.robot_chain import RobotChain, verdict
+from bevviz.extras.robot_chain.chain import RobotChain, verdict
 from tests.support.robot_graphs import PARENT, TOPICS, make_graph
 
 

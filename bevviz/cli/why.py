@@ -23,13 +23,15 @@ from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.contexts import garbage_collection_off
+from bevviz.support.extensions import load_all
 
 if TYPE_CHECKING:
-    from bevviz.bags.source import BagSource
-    from bevviz.model.frame import Frame, Scene
+    from bevviz.cli.parser import Parser
+    from bevviz.model.frame import Scene
     from bevviz.model.json_forms import WhyForm
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, FrameExplainer, Selection
+    from bevviz.why.robot_questions import Question
 
 EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx                  whatever went wrong in that frame
@@ -56,15 +58,19 @@ def add(commands: Commands) -> None:
     targets.add_argument(
         "--all", action="store_true", help="also what went well, and what nothing could be done about"
     )
-    targets.add_argument(
-        "--robot",
-        action="store_true",
-        help="which of the robot's own nodes lost, renamed, delayed or moved it (alone, --class or --point)",
-    )
     add_json(why)
     add_config(why)
     add_output(why, blueprint="explain").description = "None, unless one is given."
     why.set_defaults(run=_why)
+    why.add_later(lambda: _add_questions(why, targets))
+
+
+def _add_questions(why: Parser, group: argparse._ArgumentGroup) -> None:
+    """Add the options of the questions that are registered."""
+    questions = [*load_all("questions", lambda text: warn([text]))]
+    for question in questions:
+        question.add_options(group)
+    why.set_defaults(questions=questions)
 
 
 @garbage_collection_off()
@@ -86,8 +92,12 @@ def _why(options: argparse.Namespace) -> int:
         if frame is None:
             option = f"--at {options.at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{option}: the scan there cannot be read")
-        if options.robot:
-            return _follow(options, source, frame, selection)
+        questions: list[Question] = options.questions
+        answered = (question.answer(options, source, frame, selection) for question in questions)
+        if (further := next(filter(None, answered), None)) is not None:
+            tree, lines = further
+            print_result(options, "why", tree, lambda: "\n".join(map(printable, lines)))
+            return 0
         outputs = Outputs.of(options)
         result = session.run(frame) if outputs else session.run_explained(frame)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
@@ -102,37 +112,6 @@ def _why(options: argparse.Namespace) -> int:
         print_result(options, "why", _tree(result, answers, neighbours, headline), lambda: text)
         if outputs:
             _show(result, answers, source.scene, outputs, options.limit)
-    return 0
-
-
-def _follow(options: argparse.Namespace, source: BagSource, frame: Frame, selection: Selection) -> int:
-    """Say which steps of the robot's own chain lost or changed objects."""
-    from bevviz.support.text import printable
-    from bevviz.why.robot_messages import RobotQuestions
-
-    if selection.one and not selection.point:
-        raise UserError("--robot: give the object with --point, or all of a class with --class")
-    questions = RobotQuestions(source, frame)
-    followed = [questions.at(selection.point)] if selection.point else questions.objects()
-    if selection.label:
-        followed = [one for one in followed if one.label.lower() == selection.label.lower()]
-    changed = [one for one in followed if one.change is not None]
-    shown = followed if selection.point or options.all else changed
-    head = f"frame {frame.index}: {len(changed)} of the robot's {len(followed)} objects lost or changed"
-    lines = [head, "", *questions.lines()]
-    for number, one in enumerate(shown):
-        steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < options.limit else []
-        lines += ["", one.text, *steps] if steps else [one.text]
-    tree: WhyForm = {
-        "frame": frame.index,
-        "stamp": frame.stamp,
-        "preset": source.config.preset,
-        "summary": head,
-        "answers": [],
-        "beside": [],
-        "robot": {"chain": list(questions.lines()), "objects": [one.as_form() for one in shown]},
-    }
-    print_result(options, "why", tree, lambda: "\n".join(map(printable, lines)))
     return 0
 
 

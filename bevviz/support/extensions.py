@@ -17,6 +17,7 @@ Kind: TypeAlias = Literal[
     "decoders",
     "exports",
     "files",
+    "questions",
     "rescuers",
     "simulators",
     "stages",

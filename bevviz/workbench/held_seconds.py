@@ -19,7 +19,7 @@ from bevviz.model.frame import Camera, Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.support.contexts import Closable
 from bevviz.support.scratch_folder import ScratchFolder
-from bevviz.why.robot_messages import RobotQuestions
+from bevviz.why.robot_questions import RobotQuestions, robot_questions
 
 NEIGHBOURS = (0, -1, 1)  # scans that are tried where the time of receipt is that of one of many packets
 
@@ -134,8 +134,7 @@ class HeldSeconds(Closable):
         Raises:
             UserError: the robot published no objects around the frame.
         """
-        known = self._robot
-        self._robot = RobotQuestions(self._source(delivered), frame) if known is None else known.about(frame)
+        self._robot = robot_questions(self._source(delivered), frame, self._robot)
         return self._robot
 
     def _source(self, delivered: DeliveredFrame) -> BagSource:

@@ -273,7 +273,6 @@ class PageConnection:
     def _followed(self, number: int, result: FrameResult, answer: Answer) -> dict[str, Any] | None:
         """Return what the robot's own nodes did with an object. None: nothing is to be shown."""
         from bevviz.why.log import focus_point
-        from bevviz.workbench.page_messages import robot_dict
 
         if number != self._asked:
             return None
@@ -283,9 +282,9 @@ class PageConnection:
                 followed = self._source.follow_robot(frame, place)
         except UserError as error:
             return {"text": f"what the robot's nodes did cannot be told: {error}", "steps": [], "notes": []}
-        if followed is None or (answer.empty and all(one.row < 0 for one in followed[1].outcomes)):
+        if followed is None or (answer.empty and not followed.is_known):
             return None
-        return robot_dict(*followed)
+        return followed.page_form()
 
     def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""

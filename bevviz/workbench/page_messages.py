@@ -12,7 +12,6 @@ from typing import Any
 from bevviz.config import Config, Parameter, parameters, values
 from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.why import Answer
-from bevviz.why.robot_messages import FollowedObject, RobotQuestions, step_line
 from bevviz.workbench.source import Message
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
@@ -36,24 +35,6 @@ def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
 def hints_dict(answer: Answer) -> dict[str, Any]:
     """Return the hints of an answer with hints, and the sentence about them."""
     return {"hints": answer.as_dict()["hints"], "remark": answer.remark}
-
-
-def robot_dict(questions: RobotQuestions, followed: FollowedObject) -> dict[str, Any]:
-    """Return each step of the robot's own chain, with what it did with an object."""
-    outcomes = {outcome.topic: outcome for outcome in followed.outcomes}
-    chain, change = questions.chain, followed.change
-    return {
-        "text": followed.text,
-        "steps": [
-            {
-                "about": step_line(step.topic, chain).removeprefix(f"{step.topic}: "),
-                "text": outcomes[step.topic].text if step.topic in outcomes else "",
-                "changed": change is not None and step.topic == change.topic,
-            }
-            for step in chain.steps
-        ],
-        "notes": questions.notes,
-    }
 
 
 def note_dict(note: Note) -> dict[str, Any]:

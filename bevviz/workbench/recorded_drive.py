@@ -32,7 +32,7 @@ from bevviz.recording import entities
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.why.robot_messages import RobotQuestions, object_topics
+from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.fix_search import FixSearch
@@ -503,8 +503,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         frame = self.robot_bag.frame(number)
         if frame is None:
             raise UserError(f"frame {number} cannot be read")
-        known = self._robot
-        self._robot = RobotQuestions(self.robot_bag, frame) if known is None else known.about(frame)
+        self._robot = robot_questions(self.robot_bag, frame, self._robot)
         return self._robot
 
     def select(

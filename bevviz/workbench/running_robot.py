@@ -32,7 +32,7 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
-from bevviz.why.robot_messages import RobotQuestions
+from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer

@@ -20,7 +20,7 @@ from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.session import Session
 from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.robot_messages import FollowedObject, RobotQuestions
+from bevviz.why.robot_questions import RobotObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 
@@ -106,9 +106,7 @@ class Source(Closable):
         """
         return None
 
-    def follow_robot(
-        self, number: int, place: F32 | F64 | None
-    ) -> tuple[RobotQuestions, FollowedObject] | None:
+    def follow_robot(self, number: int, place: F32 | F64 | None) -> RobotObject | None:
         """Follow the object at a place in the frame of the points through the robot's own chain.
 
         Raises:
@@ -120,7 +118,7 @@ class Source(Closable):
                 return None
             if place is None:
                 raise UserError("where the object is in space is unknown")
-            return questions, questions.at(np.asarray(place, np.float64))
+            return questions.at(np.asarray(place, np.float64))
 
     @property
     def on_demand(self) -> bool:

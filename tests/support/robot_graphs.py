@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from bevviz.why.robot_chain import ObjectMessage
+from bevviz.extras.robot_chain.chain import ObjectMessage
 
 TOPICS = {
     "lidar_detector": "/lidar/objects",

@@ -14,9 +14,10 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.extras.robot_chain.chain import ObjectMessage, RobotChain, verdict
+from bevviz.extras.robot_chain.messages import FollowedObject
 from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
-from bevviz.why.robot_chain import ObjectMessage, RobotChain, verdict
 from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support import bags, documented_json
 from tests.support.live_sessions import live_bench
@@ -194,12 +195,13 @@ def test_the_page_reads_the_chain_once(bag: tuple[Path, Graph], tmp_path: Path) 
     path, graph = bag
     with bevviz.open(path) as drive, RecordedDrive(drive, BagSource([path], load())) as bench:
         asked = [bench.follow_robot(plant.frame, place_of(plant, graph)) for plant in graph.plants]
+        followed = [one for one in asked if isinstance(one, FollowedObject)]
         right = [
-            one is not None and one[1].change is not None and one[1].change.topic == TOPICS[plant.node]
-            for plant, one in zip(graph.plants, asked, strict=True)
+            one.change is not None and one.change.topic == TOPICS[plant.node]
+            for plant, one in zip(graph.plants, followed, strict=True)
         ]
         assert sum(right) >= len(right) - 1
-        assert len({id(one[0].chain) for one in asked if one is not None}) == 1
+        assert len({id(one.chain) for one in followed}) == 1
         with pytest.raises(UserError, match="where the object is in space"):
             bench.follow_robot(3, None)
     plain = bags.write(tmp_path / "plain", bags.small_items(scans=5))
@@ -220,7 +222,7 @@ def test_a_running_robot_is_asked_for_its_nodes(bag: tuple[Path, Graph]) -> None
             right = 0
             for plant in graph.plants:
                 followed = bench.follow_robot(plant.frame, place_of(plant, graph))
-                assert followed is not None
-                change = followed[1].change
+                assert isinstance(followed, FollowedObject)
+                change = followed.change
                 right += change is not None and change.topic == TOPICS[plant.node]
     assert right >= len(graph.plants) - 1

@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bevviz.bags.message import RawMessage
 from bevviz.bags.source import BagSource
 from bevviz.errors import UserError
+from bevviz.extras.robot_chain.chain import NEAR, SECOND, ObjectMessage, RobotChain, StepOutcome, verdict
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.detections import decode_boxes
 from bevviz.messages.guard import guard
@@ -19,16 +21,10 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame, LabelledBoxes3D
 from bevviz.model.json_forms import RobotObjectForm
 from bevviz.sync.transform_tree import TransformBuffer, TransformError
-from bevviz.why.robot_chain import NEAR, SECOND, ObjectMessage, RobotChain, StepOutcome, verdict
+from bevviz.why.robot_questions import object_topics
 
 AROUND = 10 * SECOND  # nanoseconds before and after the frame that the chain is inferred from
 LEAST = 4  # messages of a topic that the chain needs
-
-
-def object_topics(source: BagSource) -> list[str]:
-    """Return the topics of a bag with objects of the robot."""
-    roles, names = source.roles, {topic.name for topic in source.recording.topics}
-    return sorted(names & {*roles.robot_detections_3d, *roles.stages} - {*roles.robot_clouds})
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +35,20 @@ class FollowedObject:
         label: class name in the first topic that has it.
         center: (3,) place in the frame of the points.
         outcomes: one for each step that it could have reached.
+        chain: the steps.
+        notes: one sentence for each topic that is not in the chain.
     """
 
     label: str
     center: F64
     outcomes: tuple[StepOutcome, ...]
+    chain: RobotChain
+    notes: Sequence[str]
+
+    @property
+    def is_known(self) -> bool:
+        """Whether a step has it."""
+        return any(outcome.row >= 0 for outcome in self.outcomes)
 
     @property
     def change(self) -> StepOutcome | None:
@@ -76,6 +81,23 @@ class FollowedObject:
                 {"topic": one.topic, "parent": one.parent, "state": one.state, "text": one.text}
                 for one in self.outcomes
             ],
+        }
+
+    def page_form(self) -> dict[str, Any]:
+        """Return each step of the chain, with what it did with the object."""
+        outcomes = {outcome.topic: outcome for outcome in self.outcomes}
+        change = self.change
+        return {
+            "text": self.text,
+            "steps": [
+                {
+                    "about": step_line(step.topic, self.chain).removeprefix(f"{step.topic}: "),
+                    "text": outcomes[step.topic].text if step.topic in outcomes else "",
+                    "changed": change is not None and step.topic == change.topic,
+                }
+                for step in self.chain.steps
+            ],
+            "notes": list(self.notes),
         }
 
 
@@ -144,7 +166,7 @@ class RobotQuestions:
         place = np.asarray(center, np.float64)
         world = geometry.apply(self._frame.pose, place[None].astype(np.float32))[0]
         outcomes = self.chain.follow(self._frame.stamp, world)
-        return FollowedObject(self._label(outcomes), place, tuple(outcomes))
+        return FollowedObject(self._label(outcomes), place, tuple(outcomes), self.chain, self.notes)
 
     def objects(self) -> list[FollowedObject]:
         """Follow every object that a step has in the frame. Changed ones come first, nearest first."""

@@ -1,0 +1,71 @@
+"""Option ``--robot`` of ``bevviz why``, and the questions of the workbench."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from bevviz.errors import UserError
+
+if TYPE_CHECKING:
+    from bevviz.bags.source import BagSource
+    from bevviz.extras.robot_chain.messages import RobotQuestions
+    from bevviz.model.frame import Frame
+    from bevviz.model.json_forms import WhyForm
+    from bevviz.why import Selection
+
+
+def add_options(group: argparse._ArgumentGroup) -> None:
+    """Add ``--robot``."""
+    group.add_argument(
+        "--robot",
+        action="store_true",
+        help="which of the robot's own nodes lost, renamed, delayed or moved it (alone, --class or --point)",
+    )
+
+
+def around(source: BagSource, frame: Frame) -> RobotQuestions:
+    """Return the questions about the robot's own chain around a frame.
+
+    Raises:
+        UserError: the robot published no objects around the frame.
+    """
+    from bevviz.extras.robot_chain.messages import RobotQuestions
+
+    return RobotQuestions(source, frame)
+
+
+def answer(
+    options: argparse.Namespace, source: BagSource, frame: Frame, selection: Selection
+) -> tuple[WhyForm, Sequence[str]] | None:
+    """Say which steps of the robot's own chain lost or changed objects.
+
+    Raises:
+        UserError: an object is selected by other means than a place, or the chain cannot be told.
+    """
+    if not options.robot:
+        return None
+    if selection.one and not selection.point:
+        raise UserError("--robot: give the object with --point, or all of a class with --class")
+    questions = around(source, frame)
+    followed = [questions.at(selection.point)] if selection.point else questions.objects()
+    if selection.label:
+        followed = [one for one in followed if one.label.lower() == selection.label.lower()]
+    changed = [one for one in followed if one.change is not None]
+    shown = followed if selection.point or options.all else changed
+    head = f"frame {frame.index}: {len(changed)} of the robot's {len(followed)} objects lost or changed"
+    lines = [head, "", *questions.lines()]
+    for number, one in enumerate(shown):
+        steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < options.limit else []
+        lines += ["", one.text, *steps] if steps else [one.text]
+    tree: WhyForm = {
+        "frame": frame.index,
+        "stamp": frame.stamp,
+        "preset": source.config.preset,
+        "summary": head,
+        "answers": [],
+        "beside": [],
+        "robot": {"chain": list(questions.lines()), "objects": [one.as_form() for one in shown]},
+    }
+    return tree, lines
