@@ -166,7 +166,8 @@ def _cloud(message: Any) -> Cloud:
 
 def _transform_points(points: NDArray[np.void], pose: F64) -> NDArray[np.void]:
     """Return the points in the frame of the message."""
-    if any(name not in points.dtype.names or points.dtype[name].kind != "f" for name in _AXES):
+    names = points.dtype.names or ()
+    if any(name not in names or points.dtype[name].kind != "f" for name in _AXES):
         raise ValueError("a cloud with a pose needs x, y and z as floats")
     moved = points.copy()
     xyz = np.stack([points[name] for name in _AXES], axis=1) @ pose[:3, :3].T + pose[:3, 3]
