@@ -17,6 +17,7 @@ from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer
 from bevviz.live.raw_recorder import RawRecorder, RawTopics
 from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import make_message
 from bevviz.messages.roles import MARK, Roles
 from bevviz.messages.topics import CLOUDS, Topic
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
@@ -227,7 +228,7 @@ class LiveSource(Closable):
     def mark(self, text: str) -> None:
         """Take in a mark as if it came on the topic of marks. Any thread may call it."""
         kind, now = self._mark.type, time.time_ns()
-        message = typestore().types[kind](data=text)
+        message = make_message(kind, data=text)
         data = bytes(typestore().serialize_cdr(message, kind))
         with self._lock:
             self._receive(self._mark, data, {"received_timestamp": now, "source_timestamp": now})

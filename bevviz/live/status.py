@@ -15,6 +15,7 @@ import numpy as np
 from bevviz.live.graph import open_publisher
 from bevviz.live.node import add_timer
 from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import make_header, make_message
 from bevviz.messages.surroundings import LEVELS
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -179,10 +180,7 @@ class Diagnostics:
         sources = self._status("sources", WARN if warnings else OK, text, listed)
         statuses = [self._pipeline(numbers), self._anomalies(), sources]
         now = time.time_ns()
-        types = typestore().types
-        stamp = types["builtin_interfaces/msg/Time"](sec=now // 10**9, nanosec=now % 10**9)
-        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-        message = types[TYPE](header=header, status=statuses)
+        message = make_message(TYPE, header=make_header(now, ""), status=statuses)
         self._publisher.publish(bytes(typestore().serialize_cdr(message, TYPE)))
 
     def _pipeline(self, numbers: Mapping[str, float]) -> Any:
@@ -206,12 +204,11 @@ class Diagnostics:
         return self._status("anomalies", level, text, {f"{a.kind} {a.subject}": a.text for a in anomalies})
 
     def _status(self, part: str, level: int, text: str, values: Mapping[str, str]) -> Any:
-        types = typestore().types
-        pairs = [types["diagnostic_msgs/msg/KeyValue"](key=k, value=v) for k, v in values.items()]
-        return types["diagnostic_msgs/msg/DiagnosticStatus"](
+        pairs = [make_message("diagnostic_msgs/msg/KeyValue", key=k, value=v) for k, v in values.items()]
+        return make_message(
+            "diagnostic_msgs/msg/DiagnosticStatus",
             level=level,
             name=f"{self._name}: {part}",
             message=text or LEVELS[level],
-            hardware_id="",
             values=pairs,
         )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 
 from bevviz.messages.definitions import typestore
 from bevviz.model import geometry
@@ -37,7 +39,7 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced
     """
     layout, width = points.dtype, max(len(points), announced)
     fields = [
-        make(
+        make_message(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=int(layout.fields[name][1]),  # type: ignore[index]
@@ -46,13 +48,12 @@ def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced
         )
         for name in layout.names or ()
     ]
-    return make(
+    return make_message(
         "sensor_msgs/msg/PointCloud2",
-        header=_header(stamp, frame_id),
+        header=make_header(stamp, frame_id),
         height=1,
         width=width,
         fields=fields,
-        is_bigendian=False,
         point_step=layout.itemsize,
         row_step=layout.itemsize * width,
         data=points.view(np.uint8),
@@ -67,13 +68,12 @@ POINT_FIELD: Mapping[str, int] = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "
 def encode_image(image: Image) -> Any:
     """Make a sensor_msgs/Image in bgr8."""
     height, width = image.bgr.shape[:2]
-    return make(
+    return make_message(
         "sensor_msgs/msg/Image",
-        header=_header(image.stamp, image.frame_id),
+        header=make_header(image.stamp, image.frame_id),
         height=height,
         width=width,
         encoding="bgr8",
-        is_bigendian=0,
         step=3 * width,
         data=np.ascontiguousarray(image.bgr).reshape(-1),
     )
@@ -81,9 +81,9 @@ def encode_image(image: Image) -> Any:
 
 def encode_compressed_image(stamp: int, frame_id: str, encoded: bytes, kind: str) -> Any:
     """Make a sensor_msgs/CompressedImage from the bytes of a file. ``kind`` is png or jpeg."""
-    return make(
+    return make_message(
         "sensor_msgs/msg/CompressedImage",
-        header=_header(stamp, frame_id),
+        header=make_header(stamp, frame_id),
         format=kind,
         data=np.frombuffer(encoded, np.uint8),
     )
@@ -99,7 +99,7 @@ def encode_intrinsics(stamp: int, frame_id: str, intrinsics: Intrinsics) -> Any:
     k, size = intrinsics.K, (intrinsics.width, intrinsics.height)
     p = np.column_stack([k, np.zeros(3)]).reshape(-1)
     d = np.asarray(intrinsics.D, np.float64)
-    return encode_camera(_header(stamp, frame_id), size, intrinsics.distortion_model, d, k.reshape(-1), p)
+    return encode_camera(make_header(stamp, frame_id), size, intrinsics.distortion_model, d, k.reshape(-1), p)
 
 
 def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64, p: F64) -> Any:
@@ -113,10 +113,7 @@ def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64
         k: (9,) camera matrix, row by row.
         p: (12,) projection matrix, row by row; zeros are written for another size.
     """
-    region = make(
-        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
-    return make(
+    return make_message(
         "sensor_msgs/msg/CameraInfo",
         header=header,
         width=size[0],
@@ -126,9 +123,6 @@ def encode_camera(header: Any, size: tuple[int, int], model: str, d: F64, k: F64
         k=k,
         r=np.eye(3).reshape(-1),
         p=p if p.size == 12 else np.zeros(12),
-        binning_x=0,
-        binning_y=0,
-        roi=region,
     )
 
 
@@ -151,7 +145,7 @@ def encode_boxes_3d(
         ids: id of each box; empty: the boxes have none.
     """
     turn = np.eye(4) if pose is None else pose
-    about = _header(stamp, frame_id)
+    about = make_header(stamp, frame_id)
     detections = []
     names = ids or [""] * len(boxes)
     for center, size, yaw, hypotheses, name in zip(
@@ -164,14 +158,14 @@ def encode_boxes_3d(
         if not turned:  # marks an unknown orientation for readers of the message
             box.bbox.center.orientation.w = np.nan
         detections.append(box)
-    return make("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
+    return make_message("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
 
 
 def encode_box_3d(header: Any, pose: F64, size: Iterable[float], results: Hypotheses, name: str = "") -> Any:
     """Make a vision_msgs/Detection3D. ``pose`` is (4, 4), the header's frame from the box."""
     place = _pose(pose)
-    box = make("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
-    return make(
+    box = make_message("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+    return make_message(
         "vision_msgs/msg/Detection3D", header=header, results=_results(results, place), bbox=box, id=name
     )
 
@@ -202,7 +196,7 @@ def encode_labels(
     message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
     if image is None:
         return message
-    return make(
+    return make_message(
         "bevviz_msgs/msg/Detection3DArray",
         header=message.header,
         detections=message.detections,
@@ -232,8 +226,8 @@ def encode_markers(
         pose: (4, 4) frame_id from the frame of the boxes; None: both are the same.
     """
     turn, markers = np.eye(4) if pose is None else pose, []
-    about = _header(stamp, frame_id)
-    lasting = make("builtin_interfaces/msg/Duration", sec=0, nanosec=500_000_000)
+    about = make_header(stamp, frame_id)
+    lasting = make_message("builtin_interfaces/msg/Duration", nanosec=500_000_000)
     for center, size, yaw, way, number, text in zip(
         boxes.center, boxes.size, boxes.yaw, velocity, ids.tolist(), texts, strict=True
     ):
@@ -251,34 +245,21 @@ def encode_markers(
             shapes.append(("ways", 0, _pose(np.eye(4)), np.array([0.1, 0.25, 0]), 1.0, points, ""))
         for space, kind, place, scale, alpha, points, words in shapes:
             markers.append(
-                make(
+                make_message(
                     "visualization_msgs/msg/Marker",
                     header=about,
                     ns=space,
                     id=number % 2**31,
                     type=kind,
-                    action=0,
                     pose=place,
                     scale=_vector("Vector3", scale),
-                    color=make("std_msgs/msg/ColorRGBA", r=color[0], g=color[1], b=color[2], a=alpha),
+                    color=make_message("std_msgs/msg/ColorRGBA", r=color[0], g=color[1], b=color[2], a=alpha),
                     lifetime=lasting,
-                    frame_locked=False,
                     points=points,
-                    colors=[],
-                    texture_resource="",
-                    texture=make(
-                        "sensor_msgs/msg/CompressedImage", header=about, format="", data=np.zeros(0, np.uint8)
-                    ),
-                    uv_coordinates=[],
                     text=words,
-                    mesh_resource="",
-                    mesh_file=make(
-                        "visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)
-                    ),
-                    mesh_use_embedded_materials=False,
                 )
             )
-    return make("visualization_msgs/msg/MarkerArray", markers=markers)
+    return make_message("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
 def _hue(number: int) -> tuple[float, float, float]:
@@ -288,34 +269,33 @@ def _hue(number: int) -> tuple[float, float, float]:
 
 def encode_boxes_2d(stamp: int, frame_id: str, xyxy: F32, results: Iterable[Hypotheses]) -> Any:
     """Make a vision_msgs/Detection2DArray. ``results`` are the hypotheses of each box."""
-    about, nowhere = _header(stamp, frame_id), _pose(np.eye(4))
+    about, nowhere = make_header(stamp, frame_id), _pose(np.eye(4))
     detections = []
     for (x0, y0, x1, y1), hypotheses in zip(xyxy.tolist(), results, strict=True):
-        middle = make("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
-        box = make(
+        middle = make_message("vision_msgs/msg/Point2D", x=(x0 + x1) / 2, y=(y0 + y1) / 2)
+        box = make_message(
             "vision_msgs/msg/BoundingBox2D",
-            center=make("vision_msgs/msg/Pose2D", position=middle, theta=0.0),
+            center=make_message("vision_msgs/msg/Pose2D", position=middle),
             size_x=x1 - x0,
             size_y=y1 - y0,
         )
         detections.append(
-            make(
+            make_message(
                 "vision_msgs/msg/Detection2D",
                 header=about,
                 results=_results(hypotheses, nowhere),
                 bbox=box,
-                id="",
             )
         )
-    return make("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
+    return make_message("vision_msgs/msg/Detection2DArray", header=about, detections=detections)
 
 
 def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
-    covered = make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36))
+    covered = make_message("geometry_msgs/msg/PoseWithCovariance", pose=place)
     return [
-        make(
+        make_message(
             "vision_msgs/msg/ObjectHypothesisWithPose",
-            hypothesis=make("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
+            hypothesis=make_message("vision_msgs/msg/ObjectHypothesis", class_id=name, score=float(score)),
             pose=covered,
         )
         for name, score in hypotheses
@@ -324,17 +304,17 @@ def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
 
 def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
     """Make a tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
-    return encode_pose_edges((_header(stamp, parent), child, pose) for parent, child, pose in edges)
+    return encode_pose_edges((make_header(stamp, parent), child, pose) for parent, child, pose in edges)
 
 
 def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
     """Make a tf2_msgs/TFMessage of (header, child, header.frame_id from child)."""
     transforms = [
-        make(
+        make_message(
             "geometry_msgs/msg/TransformStamped",
             header=header,
             child_frame_id=child,
-            transform=make(
+            transform=make_message(
                 "geometry_msgs/msg/Transform",
                 translation=_vector("Vector3", pose[:3, 3]),
                 rotation=_rotation(pose),
@@ -342,7 +322,7 @@ def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
         )
         for header, child, pose in edges
     ]
-    return make("tf2_msgs/msg/TFMessage", transforms=transforms)
+    return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def encode_odometry(
@@ -351,44 +331,70 @@ def encode_odometry(
     """Make a nav_msgs/Odometry. Its velocities lead to the pose ``later``, which is ``dt`` seconds later."""
     step = geometry.inverse(parent_from_child) @ later
     turn = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2
-    twist = make(
+    twist = make_message(
         "geometry_msgs/msg/Twist",
         linear=_vector("Vector3", step[:3, 3] / dt),
         angular=_vector("Vector3", turn / dt),
     )
-    none = np.zeros(36)
-    return make(
+    return make_message(
         "nav_msgs/msg/Odometry",
-        header=_header(stamp, parent),
+        header=make_header(stamp, parent),
         child_frame_id=child,
-        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child), covariance=none),
-        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+        pose=make_message("geometry_msgs/msg/PoseWithCovariance", pose=_pose(parent_from_child)),
+        twist=make_message("geometry_msgs/msg/TwistWithCovariance", twist=twist),
     )
 
 
 # --- parts -------------------------------------------------------------------------------------
 
 
-def make(kind: str, **values: Any) -> Any:
-    """Make a message of a type in ``typestore``."""
-    return typestore().types[kind](**values)
+def make_message(kind: str, **fields: Any) -> Any:
+    """Make a message of a type in ``typestore``. Fields that are not stated are zero, false or empty."""
+    blanks = {name: blank() for name, blank in _blanks(kind).items() if name not in fields}
+    return typestore().types[kind](**fields, **blanks)
 
 
-def _header(stamp: int, frame_id: str) -> Any:
-    time = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+@cache
+def _blanks(kind: str) -> Mapping[str, Callable[[], Any]]:
+    """Return for each field of a message type a function that makes its blank value."""
+    return {name: _blank(*field) for name, field in typestore().fielddefs[kind][1]}
+
+
+def _blank(node: Nodetype, about: Any) -> Callable[[], Any]:
+    """Return a function that makes a blank value of a field, given the definition of the field."""
+    if node == Nodetype.NAME:
+        return partial(make_message, about)
+    if node == Nodetype.BASE:
+        return {"string": str, "wstring": str, "bool": bool, "float32": float, "float64": float}.get(
+            about[0], int
+        )
+    (element, kind), length = about
+    length = length if node == Nodetype.ARRAY else 0
+    if element == Nodetype.BASE and kind[0] not in ("string", "wstring"):
+        return partial(np.zeros, length, np.dtype(_NUMPY.get(kind[0], kind[0])))
+    make_element = _blank(element, kind)
+    return lambda: [make_element() for _ in range(length)]
+
+
+_NUMPY = {"octet": "uint8", "byte": "uint8", "char": "uint8"}  # dtype of ROS's other names
+
+
+def make_header(stamp: int, frame_id: str) -> Any:
+    """Make a std_msgs/Header. The stamp is in nanoseconds."""
+    time = make_message("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return make_message("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
 
 def _vector(kind: str, xyz: Iterable[float]) -> Any:
     x, y, z = map(float, xyz)
-    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+    return make_message(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
 def _rotation(a_from_b: F64) -> Any:
     x, y, z, w = map(float, geometry.quaternion(a_from_b))
-    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return make_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
 def _pose(a_from_b: F64) -> Any:
     position = _vector("Point", a_from_b[:3, 3])
-    return make("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))
+    return make_message("geometry_msgs/msg/Pose", position=position, orientation=_rotation(a_from_b))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bevviz.messages.clouds import Field, make_cloud, point_layout
 from bevviz.messages.decoders import Decoder, nanoseconds
-from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make
+from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make_header, make_message
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Cloud
 
@@ -145,9 +145,7 @@ def _data(message: Any) -> bytes:
 
 
 def _header(message: Any) -> Any:
-    stamp = _stamp(message)
-    time = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return make("std_msgs/msg/Header", stamp=time, frame_id=_frame(message))
+    return make_header(_stamp(message), _frame(message))
 
 
 def _cloud(message: Any) -> Cloud:
@@ -178,7 +176,7 @@ def _transform_points(points: NDArray[np.void], pose: F64) -> NDArray[np.void]:
 
 def _compressed(message: Any) -> Any:
     data = np.frombuffer(_data(message), np.uint8)
-    return make(
+    return make_message(
         "sensor_msgs/msg/CompressedImage",
         header=_header(message),
         format=str(message.format or ""),
@@ -187,13 +185,12 @@ def _compressed(message: Any) -> Any:
 
 
 def _raw(message: Any) -> Any:
-    return make(
+    return make_message(
         "sensor_msgs/msg/Image",
         header=_header(message),
         height=_integer(message, "height"),
         width=_integer(message, "width"),
         encoding=str(message.encoding or ""),
-        is_bigendian=0,
         step=_integer(message, "step"),
         data=np.frombuffer(_data(message), np.uint8),
     )
@@ -233,8 +230,8 @@ def _scene(message: Any) -> Any:
             size, results = _numbers(solid.size, "xyz"), [(_label(entity), 1.0)]
             boxes.append(encode_box_3d(_header(entity), pose, size, results, str(entity.id or "")))
     time = next((box_message.header.stamp for box_message in boxes), _header(message).stamp)
-    header = make("std_msgs/msg/Header", stamp=time, frame_id="")
-    return make("vision_msgs/msg/Detection3DArray", header=header, detections=boxes)
+    header = make_message("std_msgs/msg/Header", stamp=time)
+    return make_message("vision_msgs/msg/Detection3DArray", header=header, detections=boxes)
 
 
 def _label(entity: Any) -> str:

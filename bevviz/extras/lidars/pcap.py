@@ -25,6 +25,7 @@ from bevviz.errors import UserError
 from bevviz.extras.lidars import hesai, ouster
 from bevviz.extras.lidars.scan_messages import encode_scan
 from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import make_message
 from bevviz.model.frame import I64
 
 SECOND = 1_000_000_000
@@ -176,9 +177,8 @@ class PcapReader:
     def _message(self, number: int, row: int) -> bytes | memoryview:
         """Return a serialised message."""
         if number == len(self._streams):
-            store = typestore()
-            text = store.types["std_msgs/msg/String"](data=self._metadata)
-            return store.serialize_cdr(text, "std_msgs/msg/String")
+            text = make_message("std_msgs/msg/String", data=self._metadata)
+            return typestore().serialize_cdr(text, "std_msgs/msg/String")
         stream = self._streams[number]
         first = stream.starts[row]
         end = stream.starts[row + 1] if row + 1 < len(stream.starts) else len(stream.times)
