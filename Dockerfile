@@ -4,7 +4,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends git && rm -rf /
 WORKDIR /source
 COPY . .
 RUN python -m venv /opt/bevviz \
-    && /opt/bevviz/bin/pip install --no-cache-dir --constraint docs/constraints.txt ".[workbench,evaluate,dask,velodyne,draco]"
+    && /opt/bevviz/bin/pip install --no-cache-dir --constraint docs/constraints.txt ".[workbench,evaluate,dask,lidars]"
 
 FROM python:3.12-slim-bookworm
 # PyAV's wheel brings x264 and x265 (GPL): THIRD_PARTY_NOTICES.md says what follows for whoever passes the image on.
