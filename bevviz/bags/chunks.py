@@ -1,4 +1,20 @@
-"""Reader of sound files that consist of chunks with an index: MCAP and ROS 1 bags."""
+"""Reader of sound files that consist of chunks with an index: MCAP and ROS 1 bags.
+
+The formats' own packages read them, too. This reader is kept because it is faster where a frame is chosen at
+random or a drive is long, reads bags at an address by ranges, and compares the index with the data, so that
+damage is found. Medians in ms, 2026-11-27, mcap 1.6 and rosbags 0.11:
+
+=============================================================  =====  ====  =======
+bag and question                                               here   mcap  rosbags
+=============================================================  =====  ====  =======
+MCAP of 15.6 GB, 3,414 chunks without compression: its index   116    111
+    scan and image of a random frame                           8.0    13.4
+    the same, where the index of a chunk leads to messages     0.4    20.0
+    two seconds of /tf                                         0.6    149
+ROS 1 bag of an hour, 396,000 messages: its index              19           1,361
+    0.15 s at a random time                                    22           169
+=============================================================  =====  ====  =======
+"""
 
 from __future__ import annotations
 
@@ -91,9 +107,6 @@ class ChunkFormat:
 
 class ChunkReader:
     """Reader by the index of a file. Messages are views into the unpacked chunks.
-
-    rosbags copies each message twice: 1.2 s per GB instead of 0.5 s with chunks of 4 MB. It also skips broken
-    records in a chunk without a checksum.
 
     Args:
         path: file.

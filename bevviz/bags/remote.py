@@ -55,6 +55,9 @@ class _RefusedError(Exception):
 class RemoteBytes(FileBytes):
     """Bytes of a file at an address, by ranges. The latest ones are kept in memory.
 
+    The caches of fsspec either keep one stretch of the file (``BytesCache``), or ask for each of their blocks
+    by a request of its own (``BlockCache``), which is 65 requests instead of one for a chunk of 4 MB.
+
     Raises:
         UserError: the file cannot be reached or read by ranges, the server is too slow or does not give what
             was asked for, or a package for its protocol is missing.
