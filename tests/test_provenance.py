@@ -39,6 +39,8 @@ NEUTRAL = {
     "motmetrics": "scores of results",
     "jinja2": "pages about results",
     "starlette": "the workbench's server",
+    "websockets": "the server for Foxglove",
+    "aiohttp": "the transport of remote bags",
     "uvicorn": "the workbench's server",
     "ruamel.yaml": "files of configurations",
     "pyarrow": "containers of what is computed",

@@ -24,6 +24,7 @@ RESERVED = frozenset(
     | {"about", "log", "states", "objects", "count"}  # in /compare
     | {"pipeline", "marks"}  # in /explain/states
     | {"lidars"}  # merged cloud of several LiDARs
+    | {"overlay"}  # in /bev
 )
 
 

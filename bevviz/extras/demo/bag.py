@@ -40,13 +40,14 @@ from bevviz.model.frame import Frame
 TOPICS = {
     drive.LIDAR_TOPIC: "sensor_msgs/msg/PointCloud2",
     drive.IMAGE_TOPIC: "sensor_msgs/msg/Image",
-    f"{drive.IMAGE_TOPIC}/compressed": "sensor_msgs/msg/CompressedImage",
     drive.CAMERA_INFO_TOPIC: "sensor_msgs/msg/CameraInfo",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     drive.ODOMETRY_TOPIC: "nav_msgs/msg/Odometry",
     drive.TRUTH_TOPIC: "vision_msgs/msg/Detection3DArray",
 }
+JPEG_TOPIC = f"{drive.IMAGE_TOPIC}/compressed"  # in place of the images, where these have the bytes of a JPEG
+JPEG_TYPE = "sensor_msgs/msg/CompressedImage"
 
 ODOMETRY_PERIOD = 20_000_000  # nanoseconds
 
@@ -72,7 +73,8 @@ class BagWriter:
             raise UserError(f"{path} exists already; remove it or give another name")
         self._source = source
         self._writer = McapWriter(path, lambda connection: connection.msgdef, compress=compress)
-        self._connections = {topic: _connection(topic, kind) for topic, kind in TOPICS.items()}
+        self._types = {**TOPICS, JPEG_TOPIC: JPEG_TYPE}
+        self._connections = {topic: _connection(topic, kind) for topic, kind in self._types.items()}
 
     def __enter__(self) -> BagWriter:
         self._writer.__enter__()
@@ -91,7 +93,7 @@ class BagWriter:
 
     def _put(self, topic: str, received: int, message: Any) -> None:
         """Append one message."""
-        data = typestore().serialize_cdr(message, TOPICS[topic])
+        data = typestore().serialize_cdr(message, self._types[topic])
         self._writer.write(self._connections[topic], received, data)
 
 
@@ -122,7 +124,7 @@ def messages(source: SyntheticSource, frame: Frame) -> list[tuple[str, int, Any]
         ]
         if (jpeg := camera.image.encoded) is not None:
             message = encode_compressed_image(camera.image.stamp, camera.image.frame_id, jpeg, "jpeg")
-            timed_messages[-1] = (f"{drive.IMAGE_TOPIC}/compressed", received, message)
+            timed_messages[-1] = (JPEG_TOPIC, received, message)
     return sorted(timed_messages, key=lambda m: m[1])
 
 
