@@ -18,6 +18,7 @@ from bevviz.bags.source import BagSource  # noqa: E402
 from bevviz.cli import main  # noqa: E402
 from bevviz.config import load  # noqa: E402
 from bevviz.messages.decoders import find_decoder  # noqa: E402
+from bevviz.messages.detections import decode_detections_3d  # noqa: E402
 from bevviz.messages.foxglove import parse  # noqa: E402
 from bevviz.model import geometry  # noqa: E402
 from bevviz.model.frame import F32  # noqa: E402
@@ -252,3 +253,25 @@ def test_a_number_in_place_of_data_takes_no_memory(kind: str) -> None:
     assert decoder is not None and decoder.from_message is not None
     with pytest.raises(ValueError, match="the field 'data' is the number 2147483648"):
         decoder.from_message(message)
+
+
+def test_a_scene_is_read_as_ground_truth() -> None:
+    cube = {
+        "pose": {"position": {"x": 4, "y": 1, "z": 0}, "orientation": {"w": 1}},
+        "size": {"x": 3, "y": 2, "z": 1},
+    }
+    scene = {
+        "entities": [{"timestamp": {"sec": 2, "nsec": 7}, "frame_id": "map", "id": "a", "cubes": [cube]}]
+    }
+    decoder = find_decoder("foxglove.SceneUpdate")
+    assert decoder is not None and decoder.from_message is not None
+    content = decoder.from_message(parse(json.dumps(scene).encode(), "foxglove.SceneUpdate", "json", ""))
+    boxes = decode_detections_3d(content, "/ground_truth", 9)
+    assert (boxes.topic, boxes.received, boxes.stamp, boxes.frame_id) == (
+        "/ground_truth",
+        9,
+        2_000_000_007,
+        "map",
+    )
+    np.testing.assert_array_equal(boxes.boxes.center, [[4, 1, 0]])
+    assert boxes.ids == ("a",)

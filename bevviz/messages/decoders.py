@@ -246,7 +246,8 @@ class Decoder:
         types: message types that the decoder takes, as ``package/msg/Name``. The decoder of one compression
             of CompressedPointCloud2 has ``package/msg/Name/format``.
         kind: ROS message that the types are handled as, without its package: ``PointCloud2``.
-        from_bytes: decodes a serialised message, to a ``Cloud`` or to a message of ``kind``.
+        from_bytes: decodes a serialised message, to a ``Cloud``, ``LabelledBoxes3D``, a list of
+            ``StampedTransform``, or a message of ``kind``.
         from_message: does the same with a message that has the fields of its definition. Without
             ``from_bytes`` and ``from_message`` the message stays as it is.
         missing: returns the library that must be installed for the decoder; empty: none is missing.

@@ -11,6 +11,7 @@ import numpy as np
 
 from bevviz.messages.decoders import either, frame_name, stamp_ns
 from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d, decode_objects
+from bevviz.messages.poses import quaternion_of, vector_of
 from bevviz.model.frame import Bool, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
 
 
@@ -48,7 +49,7 @@ def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str])
     Raises:
         MessageError: the message has no boxes that can be found.
     """
-    if hasattr(msg, "detections") and not stated:
+    if isinstance(msg, LabelledBoxes3D) or (hasattr(msg, "detections") and not stated):
         return decode_detections_3d(msg, topic, received)
     return decode_objects(msg, topic, received, stated)
 
@@ -58,12 +59,15 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
 
     An orientation of zero is no rotation. Boxes that are not finite or have a negative size are left out and
     listed in ``unusable``. If the header of the array has no frame, the frames of the detections are used.
+    ``msg`` may also be the boxes that the decoder of a message type returned.
     """
+    if isinstance(msg, LabelledBoxes3D):
+        stamp = msg.stamp or (0 if len(msg.boxes) else received)
+        return replace(msg, topic=topic, received=received, stamp=stamp)
 
     def numbers(detection: Any) -> tuple[float, ...]:
         center, size = detection.bbox.center, detection.bbox.size
-        p, q = center.position, center.orientation
-        return p.x, p.y, p.z, size.x, size.y, size.z, q.x, q.y, q.z, q.w
+        return (*vector_of(center.position), *vector_of(size), *quaternion_of(center.orientation))
 
     columns = box_columns(_rows(msg, numbers), 10)
     stated = frame_name(msg.header.frame_id)

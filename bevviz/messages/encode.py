@@ -153,21 +153,14 @@ def encode_boxes_3d(
     ):
         turned = bool(np.isfinite(yaw))
         half = float(yaw) / 2 if turned else 0.0
-        place = turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)]))
-        box = encode_box_3d(about, place, size, hypotheses, name)
+        place = _pose(turn @ geometry.transform(center, np.array([0, 0, np.sin(half), np.cos(half)])))
         if not turned:  # marks an unknown orientation for readers of the message
-            box.bbox.center.orientation.w = np.nan
-        detections.append(box)
+            place.orientation.w = np.nan
+        box = make_message("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
+        kept = _results(hypotheses, place)
+        detection = make_message("vision_msgs/msg/Detection3D", header=about, results=kept, bbox=box, id=name)
+        detections.append(detection)
     return make_message("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
-
-
-def encode_box_3d(header: Any, pose: F64, size: Iterable[float], results: Hypotheses, name: str = "") -> Any:
-    """Make a vision_msgs/Detection3D. ``pose`` is (4, 4), the header's frame from the box."""
-    place = _pose(pose)
-    box = make_message("vision_msgs/msg/BoundingBox3D", center=place, size=_vector("Vector3", size))
-    return make_message(
-        "vision_msgs/msg/Detection3D", header=header, results=_results(results, place), bbox=box, id=name
-    )
 
 
 def encode_labels(
@@ -304,15 +297,10 @@ def _results(hypotheses: Hypotheses, place: Any) -> list[Any]:
 
 def encode_transforms(stamp: int, edges: Iterable[tuple[str, str, F64]]) -> Any:
     """Make a tf2_msgs/TFMessage of (parent, child, parent_from_child)."""
-    return encode_pose_edges((make_header(stamp, parent), child, pose) for parent, child, pose in edges)
-
-
-def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
-    """Make a tf2_msgs/TFMessage of (header, child, header.frame_id from child)."""
     transforms = [
         make_message(
             "geometry_msgs/msg/TransformStamped",
-            header=header,
+            header=make_header(stamp, parent),
             child_frame_id=child,
             transform=make_message(
                 "geometry_msgs/msg/Transform",
@@ -320,7 +308,7 @@ def encode_pose_edges(edges: Iterable[tuple[Any, str, F64]]) -> Any:
                 rotation=_rotation(pose),
             ),
         )
-        for header, child, pose in edges
+        for parent, child, pose in edges
     ]
     return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 

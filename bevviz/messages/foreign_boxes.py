@@ -14,6 +14,7 @@ import numpy as np
 from bevviz.errors import UserError
 from bevviz.messages.decoders import frame_name, stamp_ns
 from bevviz.messages.guard import describe_kind, field_names
+from bevviz.messages.poses import UPRIGHT, quaternion_of, vector_of, yaw_of
 from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes3D
 
 T = TypeVar("T")
@@ -129,23 +130,23 @@ def decode_objects(msg: Any, topic: str, received: int, stated: Mapping[str, str
 def _row(item: Any, where: Fields) -> tuple[float, ...]:
     """Return centre, size and quaternion of an object."""
     holder, _ = _follow(item, where.center)
-    x, y, z = _read(_vector, item, where.center)
-    turn = 0.0, 0.0, 0.0, 1.0
+    x, y, z = _read(vector_of, item, where.center)
+    turn = UPRIGHT
     if where.yaw:
         half = _read(float, item, where.yaw) / 2
         turn = 0.0, 0.0, math.sin(half), math.cos(half)
     elif where.orientation:
-        turn = _read(_quaternion, item, where.orientation)
+        turn = _read(quaternion_of, item, where.orientation)
     elif hasattr(holder, "orientation"):
-        turn = _quaternion(holder.orientation)
-    length, width, height = _read(_vector, item, where.size)
+        turn = quaternion_of(holder.orientation)
+    length, width, height = _read(vector_of, item, where.size)
     shape = getattr(item, "shape", None)
     if shape is not None and getattr(shape, "type", None) == POLYGON and hasattr(shape, "footprint"):
         outline = np.array([(p.x, p.y) for p in shape.footprint.points], np.float64).reshape(-1, 2)
         if len(outline):  # in the axes of the object
             low, high = outline.min(axis=0), outline.max(axis=0)
             (length, width), (dx, dy) = (high - low).tolist(), ((low + high) / 2).tolist()
-            yaw = float(_yaw(np.array(turn)))
+            yaw = float(yaw_of(np.array(turn)))
             c, s = math.cos(yaw), math.sin(yaw)
             x, y = x + c * dx - s * dy, y + s * dx + c * dy
     return x, y, z, length, width, height, *turn
@@ -159,9 +160,9 @@ def _markers(markers: Iterable[Any], topic: str, received: int) -> LabelledBoxes
     others = {number: text for (ns, number), text in texts.items() if ns not in of_solids}
     rows = []
     for marker in solids:
-        place, turn = _vector(marker.pose.position), _quaternion(marker.pose.orientation)
+        place, turn = vector_of(marker.pose.position), quaternion_of(marker.pose.orientation)
         text = texts.get((marker.ns, marker.id)) or others.get(marker.id) or str(marker.ns)
-        rows.append(BoxRow((*place, *_vector(marker.scale), *turn), text, 1.0, f"{marker.ns}/{marker.id}"))
+        rows.append(BoxRow((*place, *vector_of(marker.scale), *turn), text, 1.0, f"{marker.ns}/{marker.id}"))
     columns = box_columns(rows, 10, lambda number, label, identity: f"marker {identity}")
     return _boxes(columns, [marker.header for marker in solids], topic, received)
 
@@ -294,10 +295,10 @@ def turned_boxes(values: F64) -> tuple[Boxes3D, F64 | None]:
     A quaternion of zero is no rotation.
     """
     turns = values[:, 6:].copy()
-    turns[~turns.any(axis=1)] = 0, 0, 0, 1
+    turns[~turns.any(axis=1)] = UPRIGHT
     x, y, z, w = turns.T
     leans = x * x + y * y > math.sin(LEAN / 2) ** 2 * (x * x + y * y + z * z + w * w)
-    boxes = Boxes3D(values[:, :3], values[:, 3:6].astype(np.float32), _yaw(turns).astype(np.float32))
+    boxes = Boxes3D(values[:, :3], values[:, 3:6].astype(np.float32), yaw_of(turns).astype(np.float32))
     return boxes, turns if leans.any() else None
 
 
@@ -361,24 +362,6 @@ def _only_list(msg: Any) -> Any:
             f"objects is not stated, and there are {len(lists)} lists: {', '.join(lists) or 'none'}"
         )
     return next(iter(lists.values()))
-
-
-def _vector(value: Any) -> tuple[float, float, float]:
-    if hasattr(value, "x"):
-        return float(value.x), float(value.y), float(value.z)
-    x, y, z = value
-    return float(x), float(y), float(z)
-
-
-def _quaternion(q: Any) -> tuple[float, float, float, float]:
-    return float(q.x), float(q.y), float(q.z), float(q.w)
-
-
-def _yaw(turns: F64) -> F64:
-    """Return the (...) rotations about z of (..., 4) quaternions xyzw of any length; 0 for a zero one."""
-    x, y, z, w = np.moveaxis(turns, -1, 0)
-    yaw: F64 = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    return yaw
 
 
 def _label(item: Any, path: str) -> str:

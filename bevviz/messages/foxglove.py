@@ -1,4 +1,4 @@
-"""Conversion of Foxglove's messages (protobuf, JSON or ROS) to ROS messages.
+"""Decoders of Foxglove's messages (protobuf, JSON or ROS) into clouds, transforms, boxes and ROS messages.
 
 A bag contains the schema of protobuf messages. Only field names are defined here
 (https://docs.foxglove.dev/docs/visualization/message-schemas).
@@ -18,10 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.messages.clouds import Field, make_cloud, point_layout
-from bevviz.messages.decoders import Decoder, nanoseconds
-from bevviz.messages.encode import encode_box_3d, encode_camera, encode_pose_edges, make_header, make_message
+from bevviz.messages.decoders import Decoder, frame_name, nanoseconds
+from bevviz.messages.encode import encode_camera, make_header, make_message
+from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d
+from bevviz.messages.poses import matrix_of
+from bevviz.messages.transforms import StampedTransform
 from bevviz.model import geometry
-from bevviz.model.frame import F64, Cloud
+from bevviz.model.frame import F64, Cloud, LabelledBoxes3D
 
 ENCODINGS = ("protobuf", "json")
 TYPE = re.compile(r"^foxglove(?:_msgs)?[./](?:msg/)?(\w+)$")
@@ -210,28 +213,31 @@ def _matrix_of(message: Any, name: str) -> F64:
     return np.array(_first_field(message, name, name.lower()) or [], np.float64)
 
 
-def _transforms(message: Any) -> Any:
+def _transforms(message: Any) -> list[StampedTransform]:
     items = (
         message.transforms if hasattr(message, "transforms") and message.transforms is not None else [message]
     )
     edges = []
     for item in items:
         place = _pose_of(item.translation if _is_set(item, "translation") else None, item.rotation)
-        edges.append((_header(item), str(item.child_frame_id or ""), place))
-    return encode_pose_edges(edges)
+        child = frame_name(str(item.child_frame_id or ""))
+        edges.append(StampedTransform(_stamp(item), frame_name(_frame(item)), child, place))
+    return edges
 
 
-def _scene(message: Any) -> Any:
+def _scene(message: Any) -> LabelledBoxes3D:
     """Convert cubes and cylinders to boxes in the frame of their entity. Boxes enclose the cylinders."""
-    boxes = []
+    rows, stamps = list[BoxRow](), list[int]()
     for entity in message.entities or ():
         for solid in (*(entity.cubes or ()), *(entity.cylinders or ())):
             pose = _matrix(solid.pose) if _is_set(solid, "pose") else np.eye(4)
-            size, results = _numbers(solid.size, "xyz"), [(_label(entity), 1.0)]
-            boxes.append(encode_box_3d(_header(entity), pose, size, results, str(entity.id or "")))
-    time = next((box_message.header.stamp for box_message in boxes), _header(message).stamp)
-    header = make_message("std_msgs/msg/Header", stamp=time)
-    return make_message("vision_msgs/msg/Detection3DArray", header=header, detections=boxes)
+            numbers = (*pose[:3, 3], *_numbers(solid.size, "xyz"), *geometry.quaternion(pose))
+            frame = frame_name(_frame(entity))
+            rows.append(BoxRow(tuple(map(float, numbers)), _label(entity), 1.0, str(entity.id or ""), frame))
+            stamps.append(_stamp(entity))
+    columns = box_columns(rows, 10)
+    stamp = next(iter(stamps), _stamp(message))
+    return boxes_3d(columns, "", 0, stamp, next(iter(columns.frames), ""))
 
 
 def _label(entity: Any) -> str:
@@ -253,9 +259,9 @@ def _matrix(pose: Any) -> F64:
 
 
 def _pose_of(position: Any, orientation: Any) -> F64:
-    x, y, z, *_ = _numbers(position, "xyz")
-    turn = _numbers(orientation, "xyzw")
-    return geometry.transform(np.array([x, y, z]), np.array(turn if any(turn) else [0.0, 0.0, 0.0, 1.0]))
+    x, y, z, w = _numbers(orientation, "xyzw")
+    px, py, pz = _numbers(position, "xyz")
+    return matrix_of((px, py, pz), (x, y, z, w))
 
 
 def _numbers(message: Any, names: str) -> list[float]:

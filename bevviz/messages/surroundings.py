@@ -10,6 +10,7 @@ import numpy as np
 from bevviz.messages.clouds import decode_cloud, decode_laser_scan
 from bevviz.messages.decoders import MessageError, stamp_ns, text_of
 from bevviz.messages.images import decode_image
+from bevviz.messages.poses import pose_of, vector_of
 from bevviz.messages.robot_description import parse_links
 from bevviz.model import geometry
 from bevviz.model.frame import (
@@ -77,15 +78,15 @@ def decode_shapes(msg: Any, short: str, topic: str) -> list[PlacedShape]:
     header = msg.info.header if short == "GridMap" and not hasattr(msg, "header") else msg.header
     about = topic, header.frame_id.lstrip("/"), stamp_ns(header.stamp)
     if short == "GridMap":
-        surface = decode_grid_map(msg, _pose(msg.info.pose), topic)
+        surface = decode_grid_map(msg, pose_of(msg.info.pose), topic)
         return [] if surface is None else [PlacedShape(*about, surface=surface)]
     if short == "LaserScan":
         return [PlacedShape(*about, points=decode_laser_scan(msg, topic, 0).xyz)]
     if short == "Path":
-        positions = np.array([[*_xyz(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
+        positions = np.array([[*vector_of(p.pose.position)] for p in msg.poses], np.float32).reshape(-1, 3)
         return [PlacedShape(*about, strips=(positions,))] if len(positions) else []
     if short == "PoseStamped":
-        return [PlacedShape(*about, axes=_pose(msg.pose))]
+        return [PlacedShape(*about, axes=pose_of(msg.pose))]
     if short == "NavSatFix":
         has_fix = np.isfinite([msg.latitude, msg.longitude]).all() and msg.status.status >= 0
         return [PlacedShape(*about, fix=(float(msg.latitude), float(msg.longitude)))] if has_fix else []
@@ -97,7 +98,7 @@ def _grid(msg: Any, topic: str) -> OccupancyGrid:
     if len(cells) != about.width * about.height:
         raise MessageError(f"{topic}: {len(cells)} cells in a map of {about.width} x {about.height}")
     return OccupancyGrid(
-        cells.reshape(about.height, about.width), float(about.resolution), _pose(about.origin)
+        cells.reshape(about.height, about.width), float(about.resolution), pose_of(about.origin)
     )
 
 
@@ -118,10 +119,10 @@ def _markers(markers: Sequence[Any], topic: str) -> list[PlacedShape]:
 
 
 def _marker(marker: Any, name: str, frame: str, stamp: int) -> PlacedShape | None:
-    pose, color = _pose(marker.pose), _color(marker.color)
+    pose, color = pose_of(marker.pose), _color(marker.color)
     about: dict[str, Any] = {"topic": name, "frame_id": frame.lstrip("/"), "stamp": stamp, "color": color}
-    scale = np.array([*_xyz(marker.scale)], np.float32)
-    points = np.array([[*_xyz(point)] for point in marker.points], np.float32).reshape(-1, 3)
+    scale = np.array([*vector_of(marker.scale)], np.float32)
+    points = np.array([[*vector_of(point)] for point in marker.points], np.float32).reshape(-1, 3)
     points = geometry.apply(pose, points)
     if marker.type in (_CUBE, _SPHERE, _CYLINDER, _TEXT):
         half: F32 = scale[None] / np.float32(np.inf if marker.type == _TEXT else 2)
@@ -146,18 +147,6 @@ def _marker(marker: Any, name: str, frame: str, stamp: int) -> PlacedShape | Non
 def _color(color: Any) -> U8:
     parts: U8 = np.round(255 * np.clip([color.r, color.g, color.b, color.a], 0, 1)).astype(np.uint8)
     return parts
-
-
-def _xyz(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
-
-
-def _pose(pose: Any) -> F64:
-    turn = pose.orientation
-    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
-    if not np.isfinite(quaternion).all() or not quaternion.any():
-        quaternion = np.array([0.0, 0.0, 0.0, 1.0])  # RViz does the same with an orientation that is not set
-    return geometry.transform(np.array(_xyz(pose.position)), quaternion)
 
 
 # --- grid maps -------------------------------------------------------------------------------

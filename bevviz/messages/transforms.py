@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
+from bevviz.messages.poses import Vector, quaternion_of, vector_of
 from bevviz.model import geometry
 from bevviz.model.frame import F64
 
@@ -33,15 +34,23 @@ class StampedTransform:
 def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
     """Return the transforms of a tf2_msgs/TFMessage. Transforms that are not rigid are left out.
 
+    Args:
+        msg: the message, or the transforms that the decoder of another message type returned.
+        topic: topic of the message, for errors.
+
     Raises:
         MessageError: no transform is rigid.
     """
     transforms, problems = [], []
-    for item in msg.transforms:
-        transform = item.transform
+    for item in msg if isinstance(msg, list) else msg.transforms:
         try:
             transforms.append(
-                _stamped(item.header, item.child_frame_id, transform.translation, transform.rotation, topic)
+                _checked(item, topic)
+                if isinstance(item, StampedTransform)
+                else _stamped(
+                    *(item.header, item.child_frame_id),
+                    *(item.transform.translation, item.transform.rotation, topic),
+                )
             )
         except MessageError as error:
             problems.append(error)
@@ -58,9 +67,6 @@ def decode_odometry(msg: Any, topic: str = "odometry") -> StampedTransform:
     """
     pose = msg.pose.pose
     return _stamped(msg.header, msg.child_frame_id, pose.position, pose.orientation, topic)
-
-
-Vector: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +92,10 @@ def decode_acceleration(msg: Any, topic: str = "imu") -> Acceleration:
     """
     if msg.linear_acceleration_covariance[0] == -1:
         raise MessageError(f"{topic}: its covariance says that no acceleration is measured")
-    measured = msg.linear_acceleration
     return Acceleration(
         stamp_ns(msg.header.stamp),
         frame_name(msg.header.frame_id),
-        np.array([measured.x, measured.y, measured.z], np.float64),
+        np.array(vector_of(msg.linear_acceleration)),
     )
 
 
@@ -99,25 +104,27 @@ def decode_motion(msg: Any) -> tuple[Vector, Vector, int]:
     none = (math.nan, math.nan, math.nan)
     rotation, acceleration = msg.angular_velocity, msg.linear_acceleration
     return (
-        none
-        if msg.angular_velocity_covariance[0] == -1
-        else (float(rotation.x), float(rotation.y), float(rotation.z)),
-        none
-        if msg.linear_acceleration_covariance[0] == -1
-        else (float(acceleration.x), float(acceleration.y), float(acceleration.z)),
+        none if msg.angular_velocity_covariance[0] == -1 else vector_of(rotation),
+        none if msg.linear_acceleration_covariance[0] == -1 else vector_of(acceleration),
         stamp_ns(msg.header.stamp),
     )
 
 
 def _stamped(header: Any, child: str, translation: Any, rotation: Any, topic: str) -> StampedTransform:
     parent, child = frame_name(header.frame_id), frame_name(child)
-    if not parent or not child or parent == child:
-        raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
-    xyz = translation.x, translation.y, translation.z
+    position, orientation = vector_of(translation), quaternion_of(rotation)
     try:
-        matrix = geometry.transform(xyz, (rotation.x, rotation.y, rotation.z, rotation.w))
+        matrix = geometry.transform(position, orientation)
     except ValueError as error:
         raise MessageError(f"{topic}: rotation from '{child}' to '{parent}': {error}") from None
-    if not all(map(math.isfinite, xyz)):
+    return _checked(StampedTransform(stamp_ns(header.stamp), parent, child, matrix), topic)
+
+
+def _checked(edge: StampedTransform, topic: str) -> StampedTransform:
+    """Return an edge. Raise MessageError if its frames or its translation cannot be used."""
+    parent, child = edge.parent, edge.child
+    if not parent or not child or parent == child:
+        raise MessageError(f"{topic}: '{parent}' and '{child}' cannot be parent and child frame")
+    if not all(map(math.isfinite, edge.parent_from_child[:3, 3].tolist())):
         raise MessageError(f"{topic}: the translation from '{child}' to '{parent}' is not finite")
-    return StampedTransform(stamp_ns(header.stamp), parent, child, matrix)
+    return edge
