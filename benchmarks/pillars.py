@@ -16,7 +16,7 @@ from statistics import median
 
 import numpy as np
 
-from bevviz.stages.pillars.group import Pillars, group
+from bevviz.extras.pillars.group import Pillars, group
 
 LOW, HIGH, SIZE = (-80.0, -80.0, -5.0), (80.0, 80.0, 3.0), (0.16, 0.16, 8.0)
 MAX_POINTS, MAX_PILLARS, REPETITIONS = 32, 40_000, 9

@@ -256,9 +256,7 @@ def test_a_3d_detector_lacks_its_file_before_its_parameters(tmp_path: Path) -> N
     with pytest.raises(UserError, match=r"^--set objects\.method=.*net\.onnx: no such file$"):
         load(settings=[f"objects.method={file}"])
     file.touch()
-    with pytest.raises(
-        UserError, match=r"net\.onnx: a 3D detector needs objects\.params\.point_range, in a YAML"
-    ):
+    with pytest.raises(UserError, match=r"net\.onnx: it needs objects\.params\.point_range, in a YAML"):
         load(settings=[f"objects.method={file}"])
 
 

@@ -19,9 +19,9 @@ from bevviz.config import DetectorConfig, load
 from bevviz.errors import UserError
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import Detector, session
+from tests.extras.pillars.networks import autoware, settings_of
 from tests.support import onnx_networks
 from tests.support.onnx_networks import FLOAT, INT64, Input, image_input, node
-from tests.support.pillar_networks import autoware, settings_of
 
 H, W = 64, 96
 CELLS = sum((H // s) * (W // s) for s in (8, 16, 32))

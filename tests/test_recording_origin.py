@@ -14,7 +14,7 @@ import bevviz
 from bevviz.bags.bag import Recording
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
-from bevviz.config import load, object_files
+from bevviz.config import load, stage_files
 from bevviz.errors import UserError
 from bevviz.messages.roles import find_roles
 from bevviz.recording.frame_logger import FrameLogger
@@ -289,7 +289,7 @@ def test_the_files_of_a_3d_detector_are_found_again(folder: Path, made: Path) ->
 
     recorded = find_source(away / "objects.rrd")
     found = recorded.load()
-    assert object_files(found) == {key: str(away / name) for key, name in names.items()}
+    assert stage_files(found) == {key: str(away / name) for key, name in names.items()}
     assert found.objects.params["classes"] == ["Car"]
     assert recorded.load(preset="reference").objects.method == "frustum"
     assert recorded.load(settings=["objects.score_threshold=0.5"]).objects.params["score_threshold"] == 0.5

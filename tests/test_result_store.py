@@ -27,8 +27,8 @@ from bevviz.pipeline.result_store import ResultStore, StoredDetector, open_store
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector.session import NetworkSession
 from bevviz.support import progress
+from tests.extras.pillars.networks import Reference
 from tests.support.onnx_networks import answer, image_input
-from tests.support.pillar_networks import Reference
 from tests.support.small_disk import small_disk
 
 MB = 1_000_000

@@ -13,7 +13,7 @@ def add(commands: Commands) -> None:
     store = commands.add_parser(
         "store",
         help="the results that are kept on disk, so that no command makes them twice",
-        description="Print where detections of images and boxes of 3D networks are kept, how many there are, "
+        description="Print where detections of images and results of stages are kept, how many there are, "
         "and what they take. --set store.size=0 makes a command do without them.",
     )
     store.add_argument("--clear", action="store_true", help="delete all results")

@@ -30,11 +30,13 @@ class Layer:
         where: name of the source, for error messages.
         values: values by dotted key.
         trust: whether functions among the values may run. By default they may not.
+        folder: folder that files in parameters of stages are relative to. None: the working directory.
     """
 
     where: str
     values: Mapping[str, Any]
     trust: Trust = RECEIVED
+    folder: Path | None = None
 
     @property
     def functions(self) -> tuple[str, ...]:

@@ -10,12 +10,19 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from bevviz.config.files import Layer, parse_yaml, read_layer
-from bevviz.config.methods import METHOD_KEYS, names_function, params_model
+from bevviz.config.methods import (
+    METHOD_KEYS,
+    holds_file,
+    is_stage_file,
+    names_function,
+    params_model,
+    same_stage,
+)
 from bevviz.config.module_folder import ModuleFolder
 from bevviz.config.parameters import TUTORIAL_NAMES, parameter, parameters, unknown_key
-from bevviz.config.pillars import COMPLETE_SENTENCE, is_network_file
 from bevviz.config.sections import Config, Functions, Preset
 from bevviz.config.trust import MESSAGE, RECEIVED, USER, Trust
+from bevviz.config.value_types import COMPLETE_SENTENCE
 from bevviz.config.values_by_key import flatten, values
 from bevviz.errors import UserError
 from bevviz.support.text import short_repr
@@ -89,7 +96,7 @@ def load(
     for key, value, layer in entries:
         section, _, name = key.partition(".")
         previous = stated.get(key, value)
-        if name == METHOD_KEYS.get(section) and previous != value and not _alike(previous, value):
+        if name == METHOD_KEYS.get(section) and not same_stage(section, str(previous), str(value)):
             stated = {k: v for k, v in stated.items() if not k.startswith(f"{section}.params.")}
         stated[key], origin[key], layers_in_force[key] = value, layer.where, layer
     running_functions = [config.functions for config in (in_force, base) if isinstance(config, Config)]
@@ -115,9 +122,13 @@ def load(
     try:
         for section, model in param_models.items():
             prefix = f"{section}.params."
-            tree[section]["params"] = model.model_validate(tree[section].get("params", {})).model_dump(
-                mode="json"
-            )
+            stated_params = tree[section].get("params", {})
+            for name, file in stated_params.items():
+                layer = layers_in_force.get(f"{prefix}{name}")
+                is_file = name in model.model_fields and holds_file(model.model_fields[name])
+                if file and is_file and layer is not None and layer.folder is not None:
+                    stated_params[name] = str(layer.folder / str(file))
+            tree[section]["params"] = model.model_validate(stated_params).model_dump(mode="json")
         prefix = ""
         loaded = Config.model_validate(tree)
     except ValidationError as error:
@@ -125,14 +136,10 @@ def load(
         loc = (*prefix.split(".")[:-1], *first["loc"])
         key = next((k for k in _prefixes(loc) if k in origin), ".".join(map(str, loc)))
         where = origin.get(key, BASE)
-        if (
-            prefix
-            and first["type"] == "missing"
-            and is_network_file(method := str(tree["objects"]["method"]))
-        ):
-            raise UserError(
-                _unfit_network(origin.get("objects.method", where), method, key, params)
-            ) from None
+        if prefix and first["type"] == "missing":
+            method_key = f"{loc[0]}.{METHOD_KEYS[str(loc[0])]}"
+            method = str(stated[method_key])
+            raise UserError(_lacking_stage(origin[method_key], method_key, method, key, params)) from None
         is_complete = first["type"] in ("wrong_unit", "missing", COMPLETE_SENTENCE)
         value = f" (given: {short_repr(first['input'])})" if not is_complete else ""
         declared = parameter(key)
@@ -245,25 +252,20 @@ def _functions(
     return in_force
 
 
-def _unfit_network(where: str, method: str, key: str, descriptions: Mapping[str, str]) -> str:
-    """Return the error about a 3D detector whose file or first required parameter is missing."""
-    head = where if method in where else f"{where}: objects.method {method}"
-    if not Path(method).is_file():
+def _lacking_stage(
+    where: str, method_key: str, method: str, key: str, descriptions: Mapping[str, str]
+) -> str:
+    """Return the error about a stage whose file or first required parameter is missing."""
+    head = where if method in where else f"{where}: {method_key} {method}"
+    if is_stage_file(method_key.partition(".")[0], method) and not Path(method).is_file():
         return f"{head}: no such file"
-    return (
-        f"{head}: a 3D detector needs {key}, in a YAML file or by --set; it is: {descriptions.get(key, '')}"
-    )
-
-
-def _alike(method: Any, other: Any) -> bool:
-    """Return whether two methods take the same parameters. Two network files do."""
-    return is_network_file(str(method)) and is_network_file(str(other))
+    return f"{head}: it needs {key}, in a YAML file or by --set; it is: {descriptions.get(key, '')}"
 
 
 def _param_models(
     stated: Mapping[str, Any], origin: Mapping[str, str], functions: Functions
 ) -> dict[str, type[BaseModel]]:
-    """Return the model of the parameters for each section whose function or network has parameters."""
+    """Return the model of the parameters for each section whose function has parameters."""
     models: dict[str, type[BaseModel]] = {}
     for section, key in METHOD_KEYS.items():
         method = stated.get(f"{section}.{key}")

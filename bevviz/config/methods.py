@@ -1,16 +1,16 @@
-"""Methods that a stage can name, and their parameters: built-in, a function, a network, or a topic."""
+"""Methods that a stage can name, and their parameters: built-in, a function, a file, or a topic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from bevviz.config import plugins
 from bevviz.config.module_folder import ModuleFolder
-from bevviz.config.pillars import PillarParams, is_network_file
 from bevviz.config.plugins import TOPIC
 from bevviz.config.sections import Config, Functions
 from bevviz.config.value_types import CLUSTERING, GROUND, OBJECTS
@@ -50,14 +50,15 @@ def names_function(section: str, method: str) -> bool:
 def _plugin(section: str, method: str, functions: Functions) -> plugins.Plugin | None:
     """Load the user-defined function of a method, or return None."""
     folder: ModuleFolder | None = None
-    name = method
+    name = ""
     if names_function(section, method):
         if (section, method) not in functions:  # ``load`` did not build this configuration.
             raise UserError(f"{section}.{METHOD_KEYS[section]} {method}: no function that the user has named")
-        folder = functions[section, method]
+        name, folder = method, functions[section, method]
     else:
         is_builtin = method in BUILTIN_METHODS or (section == "detector" and Path(method).exists())
-        name = "" if is_builtin else plugins.registered().get(method, "")
+        if not is_builtin:
+            name = plugins.file_stage(section, method) or plugins.registered().get(method, "")
     if not name:
         return None
     try:
@@ -72,31 +73,58 @@ def stage_topics(config: Config) -> dict[str, str]:
     return {key: name.removeprefix(TOPIC) for key, name in methods.items() if name.startswith(TOPIC)}
 
 
-def object_network_params(config: Config) -> PillarParams | None:
-    """Return the parameters of the 3D detector file that ``objects.method`` names, or None."""
-    return (
-        PillarParams.model_validate(config.objects.params) if is_network_file(config.objects.method) else None
-    )
+def is_stage_file(section: str, method: str) -> bool:
+    """Return whether a stage's section names a file that a registered stage reads."""
+    return bool(plugins.file_stage(section, method))
 
 
-def object_files(config: Config) -> dict[str, str]:
-    """Return the files of the 3D detector, by the dotted key that names each."""
-    params = object_network_params(config)
-    if params is None:
-        return {}
-    files = {"objects.method": config.objects.method, "objects.params.encoder": params.encoder}
-    return {key: file for key, file in files.items() if file}
+def same_stage(section: str, method: str, other: str) -> bool:
+    """Return whether two methods of a section are the same function, or two files of one stage."""
+    return method == other or "" != plugins.file_stage(section, method) == plugins.file_stage(section, other)
 
 
-def with_object_files(config: Config, rename: Callable[[str], str]) -> Config:
-    """Return the configuration with the files of the 3D detector renamed by ``named``."""
-    files = object_files(config)
-    if not files:
-        return config
-    encoder = rename(files.get("objects.params.encoder", "")) if len(files) > 1 else ""
-    params = {**config.objects.params, "encoder": encoder}
-    changed = {"method": rename(files["objects.method"]), "params": params}
-    return config.model_copy(update={"objects": config.objects.model_copy(update=changed)})
+def method_label(config: Config, section: str) -> str:
+    """Return the name of a user-defined stage for sentences: ``module:function``, or the name of its file."""
+    method = method_of(config, section)
+    if is_stage_file(section, method):
+        return Path(method).name
+    plugin = plugin_of(config, section)
+    return "" if plugin is None else plugin.name
+
+
+def holds_file(info: FieldInfo) -> bool:
+    """Return whether a parameter names a file: its type is Path, also of pydantic's kinds, or optional."""
+    kinds = get_args(info.annotation) or (info.annotation,)
+    return any(isinstance(kind, type) and issubclass(kind, Path) for kind in kinds)
+
+
+def stage_files(config: Config) -> dict[str, str]:
+    """Return the files of user-defined stages, by the dotted key that names each."""
+    files: dict[str, str] = {}
+    for section, key in METHOD_KEYS.items():
+        if is_stage_file(section, method := method_of(config, section)):
+            files[f"{section}.{key}"] = method
+        for name, info in params_of(config, section).items():
+            file = getattr(config, section).params.get(name)
+            if file and holds_file(info):
+                files[f"{section}.params.{name}"] = str(file)
+    return files
+
+
+def with_stage_files(config: Config, rename: Callable[[str], str]) -> Config:
+    """Return the configuration with the files of user-defined stages renamed."""
+    renamed = {key: rename(file) for key, file in stage_files(config).items()}
+    sections: dict[str, Any] = {}
+    for section, key in METHOD_KEYS.items():
+        prefix = f"{section}.params."
+        params = {k.removeprefix(prefix): file for k, file in renamed.items() if k.startswith(prefix)}
+        settings = getattr(config, section)
+        update: dict[str, Any] = {"params": {**settings.params, **params}} if params else {}
+        if (method := renamed.get(f"{section}.{key}")) is not None:
+            update[key] = method
+        if update:
+            sections[section] = settings.model_copy(update=update)
+    return config.model_copy(update=sections) if sections else config
 
 
 def params_model(section: str, method: str, functions: Functions) -> type[BaseModel] | None:
@@ -107,14 +135,12 @@ def params_model(section: str, method: str, functions: Functions) -> type[BaseMo
         method: method that the section names.
         functions: ``Config.functions``.
     """
-    if section == "objects" and is_network_file(method):
-        return PillarParams
     plugin = _plugin(section, method, functions)
     return None if plugin is None else plugin.params
 
 
 def params_of(config: Config, section: str) -> Mapping[str, FieldInfo]:
-    """Return the additional parameters of a stage: those of a function or of a network on pillars."""
+    """Return the additional parameters of a stage: those of a user-defined function."""
     if section not in METHOD_KEYS:
         return {}
     model = params_model(section, method_of(config, section), config.functions)

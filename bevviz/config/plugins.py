@@ -40,6 +40,8 @@ CLOUD_PARAMETER_NAMES = (
 IMAGE_PARAMETER_NAMES = ("image", "img", "bgr", "frame", "picture")
 _ARRAY_ANNOTATION = re.compile(r"\b(ndarray|NDArray|ArrayLike|Tensor)\b")
 FACTS = ("stamp", "number", "sensor")  # of the frame; a stage gets those that it has parameters for
+# Of the configuration; a class gets those that its constructor has parameters for.
+SETTINGS = ("file", "provider", "threads")
 STAGE_HINT = "write a function whose first parameter is 'points' or 'image' (docs/stages.md)"
 
 
@@ -53,6 +55,7 @@ class Plugin:
         params: model of its parameters. None: it has none.
         takes_params: whether it takes its parameters as an argument after the array.
         facts: those of ``FACTS`` that it has parameters for.
+        settings: those of ``SETTINGS`` that the constructor of a class has parameters for.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Plugin:
     params: type[BaseModel] | None
     takes_params: bool
     facts: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
@@ -84,7 +88,25 @@ class Plugin:
 @cache
 def registered() -> dict[str, str]:
     """Return the ``module:name`` of each name that installed packages registered."""
-    return {point.name: point.value for point in entry_points(group=GROUP)}
+    return {point.name: point.value for point in entry_points(group=GROUP) if "." not in point.name}
+
+
+@cache
+def file_stages(section: str) -> dict[str, str]:
+    """Return the ``module:name`` that reads files, by their suffix, as installed packages registered it.
+
+    The entry point ``objects.onnx`` is the stage that reads ``objects.method=FILE.onnx``.
+    """
+    points = [(point.name.partition("."), point.value) for point in entry_points(group=GROUP)]
+    return {f".{suffix}": value for (name, dot, suffix), value in points if dot and name == section}
+
+
+def file_stage(section: str, method: str) -> str:
+    """Return the ``module:name`` that reads the file that a method names, or an empty text."""
+    if ":" in method:
+        return ""
+    lower = method.lower()
+    return next((name for suffix, name in file_stages(section).items() if lower.endswith(suffix)), "")
 
 
 def is_user_function(method: str) -> bool:
@@ -124,7 +146,10 @@ def load_plugin(name: str, folder: ModuleFolder | None = WORKING_DIRECTORY) -> P
         params = None
     if folder is not None and (fault := _target_fault(target, has_params=params is not None)):
         raise UserError(f"'{name}' is no stage: {fault}")
-    return Plugin(name, target, params, params is not None and _accepts_params(target), _facts(target))
+    takes_params = params is not None and _accepts_params(target)
+    call = target.__call__ if isinstance(target, type) else target
+    settings = _named_parameters(target, SETTINGS) if isinstance(target, type) else ()
+    return Plugin(name, target, params, takes_params, _named_parameters(call, FACTS), settings)
 
 
 def _import_module(name: str, folder: ModuleFolder | None) -> ModuleType:
@@ -155,23 +180,22 @@ def describe_exception(error: BaseException, file: Path | None = None) -> str:
     return f"{type(error).__name__}: {first_line(error)} {place}"
 
 
-def _facts(target: Callable[..., Any]) -> tuple[str, ...]:
-    """Return the facts of the frame that a target has parameters for."""
-    call = target.__call__ if isinstance(target, type) else target
+def _named_parameters(call: Callable[..., Any], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return those of the names that a callable has parameters for."""
     try:
-        return tuple(name for name in FACTS if name in signature(call).parameters)
+        return tuple(name for name in names if name in signature(call).parameters)
     except (TypeError, ValueError):  # compiled code without a signature
         return ()
 
 
 def _accepts_params(target: Callable[..., Any]) -> bool:
     """Return whether a target accepts parameters: a class in its constructor, a function after the array."""
-    min_count = 1 if isinstance(target, type) else 2
+    min_count, excluded = (1, SETTINGS) if isinstance(target, type) else (2, FACTS)
     try:
         parameters = signature(target).parameters.values()
     except (TypeError, ValueError):
         return True
-    positional = [p for p in parameters if p.kind in POSITIONAL and p.name not in FACTS]
+    positional = [p for p in parameters if p.kind in POSITIONAL and p.name not in excluded]
     return len(positional) >= min_count or any(p.kind is Parameter.VAR_POSITIONAL for p in parameters)
 
 
@@ -191,8 +215,10 @@ def _target_fault(target: Callable[..., Any], *, has_params: bool) -> str:
         )
         if not _is_outside_library(target) or not _is_python_function(call):
             return f"a class needs a method __call__(self, points) of its own; {STAGE_HINT}"
-        if _is_python_function(constructor) and (fault := _missing_argument(constructor, 1, 1 + has_params)):
-            return f"{fault}; {STAGE_HINT}"
+        if _is_python_function(constructor):
+            fault = _missing_argument(constructor, 1, 1 + has_params, SETTINGS)
+            if fault:
+                return f"{fault}; {STAGE_HINT}"
         return _signature_fault(call, 1, 0)
     if not _is_python_function(target) or not _is_outside_library(target):
         return f"it is no Python function or class of a module outside Python's own library; {STAGE_HINT}"
@@ -219,15 +245,16 @@ def _signature_fault(function: Any, skipped: int, additional: int) -> str:
     return f"{fault}; {STAGE_HINT}" if fault else ""
 
 
-def _missing_argument(function: Any, first: int, last: int) -> str:
+def _missing_argument(function: Any, first: int, last: int, by_name: tuple[str, ...] = FACTS) -> str:
     """Return the sentence about a required parameter that gets no argument, or an empty string.
 
     Args:
         function: function that is called.
         first: number of arguments that it always gets.
         last: number of arguments that it gets at most.
+        by_name: names of parameters that get arguments by name.
     """
-    parameters = [p for p in signature(function).parameters.values() if p.name not in FACTS]
+    parameters = [p for p in signature(function).parameters.values() if p.name not in by_name]
     required = [p for p in parameters if p.kind in POSITIONAL and p.default is Parameter.empty][last:]
     required += [p for p in parameters if p.kind is Parameter.KEYWORD_ONLY and p.default is Parameter.empty]
     if not required:

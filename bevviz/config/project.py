@@ -21,10 +21,20 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from bevviz.config import BUILTIN_METHODS, TUTORIAL_NAMES, Config, Layer, Preset, flatten, plugins, read_layer
+from bevviz.config import (
+    BUILTIN_METHODS,
+    METHOD_KEYS,
+    TUTORIAL_NAMES,
+    Config,
+    Layer,
+    Preset,
+    flatten,
+    is_stage_file,
+    plugins,
+    read_layer,
+)
 from bevviz.config.files import read_toml
 from bevviz.config.methods import CLASS_LISTS
-from bevviz.config.pillars import is_network_file
 from bevviz.config.trust import USER, NamedCode, trust_in
 from bevviz.errors import UserError
 from bevviz.support.text import did_you_mean, short_repr
@@ -123,11 +133,11 @@ def _read_layers(path: Path) -> list[Layer]:
     for key in ("detector.model", "detector.names"):
         if isinstance(own_values.get(key), str):
             own_values[key] = _relative_to(path.parent, key, own_values[key])
-    for key in ("objects.method", "objects.encoder", "objects.params.encoder"):
-        if is_network_file(str(own_values.get(key, ""))):
+    for section, name in METHOD_KEYS.items():
+        if is_stage_file(section, str(own_values.get(key := f"{section}.{name}", ""))):
             own_values[key] = str(path.parent / own_values[key])
     yaml_layers = [read_layer(path.parent / name, pipe=False) for name in project.config]
-    return [*yaml_layers, Layer(str(path), own_values)]
+    return [*yaml_layers, Layer(str(path), own_values, folder=path.parent)]
 
 
 def _relative_to(folder: Path, key: str, value: str) -> str:

@@ -50,9 +50,7 @@ class Section(BaseModel):
 class StageSection(Section):
     """Base class of the settings of a stage that can be user-defined."""
 
-    params: Mapping[str, Any] = Field(
-        {}, description="parameters of a function that is not bevviz's own, or of a network on pillars"
-    )
+    params: Mapping[str, Any] = Field({}, description="parameters of a function that is not bevviz's own")
 
 
 class SourceConfig(Section):
@@ -223,7 +221,7 @@ class ObjectsConfig(StageSection):
 
     method: Annotated[str, AfterValidator(OBJECTS.check)] = Field(
         "frustum",
-        description="frustum: clusters that detections name; or FILE.onnx, a 3D detector on pillars; or "
+        description="frustum: clusters that detections name; or a file that a registered stage reads; or "
         "module:function, (N, 4) points and intensity -> (K, 7) boxes x y z length width height yaw, score, "
         "names; or topic:/objects of the robot",
     )
@@ -390,7 +388,7 @@ class StoreConfig(Section):
     size: Megabytes = Field(
         10_000.0,
         ge=0,
-        description="disk space for detections of images and boxes of 3D networks, which no command makes "
+        description="disk space for detections of images and results of stages, which no command makes "
         "twice; the least recently used go first; 0: none are kept",
     )
 

@@ -11,7 +11,6 @@ from pydantic import AfterValidator, BeforeValidator, PositiveFloat
 from pydantic_core import PydanticCustomError
 
 from bevviz.config import plugins
-from bevviz.config.pillars import is_network_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +56,8 @@ Megabytes = Annotated[float, BeforeValidator(MEGABYTES.parse)]
 # Means of road users are KITTI's (Geiger et al. 2012, as Qi et al. 2018 give them for Frustum PointNets).
 # Classes that KITTI lacks have the means of nuScenes (Caesar et al. 2020, as Zhu et al. 2019 give them for
 # CBGS). The truck is between the two, since COCO also calls a pickup a truck.
+COMPLETE_SENTENCE = "unfit"  # type of an error whose text contains the stated value
+
 # Spreads are those of KITTI's cars, but wider across, since cars elsewhere are 2 m wide. Other spreads are
 # wider than the difference between the two data sets. Sizes below the line are our own estimates.
 CLASS_SIZES: dict[str, tuple[float, ...]] = {
@@ -111,16 +112,16 @@ ClassSize = Annotated[tuple[PositiveFloat, ...], AfterValidator(_check_count)]
 
 @dataclass(frozen=True, slots=True)
 class StageMethods:
-    """Allowed methods of a stage: built-in, ``module:function``, a registered name, or ``topic:NAME``."""
+    """Allowed methods of a stage: built-in, registered, ``module:function``, a file, or ``topic:NAME``."""
 
+    section: str
     ours: tuple[str, ...]
-    networks: bool = False  # whether an ONNX file is allowed
 
     def check(self, value: str) -> str:
         """Return the method. Raise an error for pydantic if the stage does not allow it."""
         if value in self.ours or ":" in value or value in plugins.registered():
             return value
-        if self.networks and is_network_file(value):
+        if plugins.file_stage(self.section, value):
             return value
         registered = f", {', '.join(plugins.registered())} (registered)" if plugins.registered() else ""
         raise PydanticCustomError(
@@ -129,11 +130,11 @@ class StageMethods:
             {
                 "ours": ", ".join(self.ours),
                 "registered": registered,
-                "file": "FILE.onnx, " if self.networks else "",
+                "file": "".join(f"FILE{suffix}, " for suffix in plugins.file_stages(self.section)),
             },
         )
 
 
-GROUND = StageMethods(("polar", "plane"))
-CLUSTERING = StageMethods(("dbscan",))
-OBJECTS = StageMethods(("frustum",), networks=True)
+GROUND = StageMethods("ground", ("polar", "plane"))
+CLUSTERING = StageMethods("clustering", ("dbscan",))
+OBJECTS = StageMethods("objects", ("frustum",))

@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from bevviz.config import BUILTIN_METHODS, METHOD_KEYS, Config, parameters, plugin_of
+from bevviz.config import METHOD_KEYS, Config, method_label, parameters
 from bevviz.config.plugins import TOPIC
 from bevviz.errors import UserError
 
@@ -241,9 +240,6 @@ def owner_of(config: Config, section: str) -> StageOwner:
     if method.startswith(TOPIC):
         return StageOwner(section, topic=method.removeprefix(TOPIC))
     try:
-        plugin = plugin_of(config, section)
+        return StageOwner(section, function=method_label(config, section))
     except UserError:  # The function could be loaded when the frame was run.
         return StageOwner(section, function=method)
-    if plugin is None and section == "objects" and method not in BUILTIN_METHODS:
-        return StageOwner(section, function=Path(method).name)  # file of a network
-    return StageOwner(section, function=plugin.name if plugin is not None else "")

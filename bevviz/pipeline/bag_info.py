@@ -19,7 +19,7 @@ from bevviz.config import (
     Config,
     DetectorConfig,
     ObjectsConfig,
-    object_network_params,
+    is_stage_file,
     stage_topics,
     stated_lines,
 )
@@ -194,8 +194,11 @@ def network_providers(config: Config) -> tuple[dict[str, str], list[str]]:
     """
     runs_on = {"detector": network_provider(config), "objects": ""}
     missing = [] if config.detector.model else ["no detector: --model FILE.onnx"]
-    named_files = {"detector": model_path(config), "objects": object_network_params(config)}
-    for section in [section for section, file in named_files.items() if file is not None]:
+    has_file = {
+        "detector": model_path(config) is not None,
+        "objects": is_stage_file("objects", config.objects.method),
+    }
+    for section in [section for section, named in has_file.items() if named]:
         try:
             provider = _alone(config, section).provider
         except UserError as error:

@@ -29,7 +29,6 @@ from bevviz.model.results import (
     Splits,
     Voxels,
 )
-from bevviz.pipeline.result_store import StoredObjectNetwork
 from bevviz.pipeline.stage_loader import Stages
 from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages import robot_results, user_stages
@@ -39,7 +38,6 @@ from bevviz.stages.frustum_fusion import claim_clusters
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import no_ground, segment_ground
 from bevviz.stages.opinions import opinions
-from bevviz.stages.pillars import ObjectNetwork
 from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
@@ -308,15 +306,8 @@ def _objects(
         return log.guard("objects", lambda: robot_results.find_objects(frame, topic, obstacles, clusters))
     if len(frame.points) == 0 and stages.objects is not None:
         return None
-    if isinstance(network := stages.objects, ObjectNetwork | StoredObjectNetwork):
-
-        def detect() -> Objects:
-            boxes, score, names = network(frame.points, frame.fields.get("intensity"), log.call)
-            return user_stages.make_objects(boxes, names, score, obstacles, clusters)
-
-        return log.guard("objects", detect)
-    if isinstance(function := stages.objects, UserStage):
-        cloud = user_stages.with_intensity(frame.points, frame.fields.get("intensity"))
+    if (function := stages.objects) is not None:
+        cloud = log.call(user_stages.with_intensity, frame.points, frame.fields.get("intensity"))
         return log.guard(
             "objects",
             lambda: user_stages.objects_of(

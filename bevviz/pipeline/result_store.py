@@ -1,7 +1,8 @@
 """Store of expensive results of single frames on disk. A result is found by the content it was made from.
 
-The detections of an image and the boxes of a 3D detector are kept. Their keys are hashes of the image or the
-cloud, of the network's files, of the code that runs it, and of the parameters that the result depends on.
+The detections of an image are kept, and what a user-defined stage returns that says what its results depend
+on. Their keys are hashes of the image or the cloud, of the network's files, of the code that runs it, and of
+the parameters that the result depends on.
 """
 
 from __future__ import annotations
@@ -24,12 +25,11 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from bevviz.config.pillars import PillarParams
 from bevviz.errors import UserError
-from bevviz.model.frame import F32, I64, U8, Boxes3D
+from bevviz.model.frame import I64, U8
 from bevviz.model.results import Masks
 from bevviz.stages.detector import Detector, Inference
-from bevviz.stages.pillars import ObjectNetwork, run_directly
+from bevviz.stages.user_stages import UserStage
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
 from bevviz.support.files import file_hash
@@ -39,7 +39,7 @@ from bevviz.support.version import __version__
 T = TypeVar("T")
 Arrays = Sequence[NDArray[Any]]
 
-NETWORKS = "stages/detector", "stages/pillars"  # code that runs networks, in the package
+NETWORKS = "stages/detector"  # code that runs networks, in the package
 FOLDER_VARIABLE = "BEVVIZ_STORE"
 FILE_NAME = "results.sqlite"
 APPLICATION_ID = 0x62657676  # "bevv", in the header of the file
@@ -300,40 +300,38 @@ class StoredDetector:
         return masks
 
 
-class StoredObjectNetwork:
-    """3D detector that keeps its boxes, of each set of thresholds its own.
+class StoredStage:
+    """User-defined stage that keeps the arrays and names that it returns.
 
     Args:
-        network: the detector.
+        stage: the stage, with an identity.
         store: where they are kept.
-        files: files of the network.
-        params: parameters of ``objects``.
+        files: files of the stage.
     """
 
-    def __init__(
-        self, network: ObjectNetwork, store: ResultStore, files: Iterable[Path], params: PillarParams
-    ) -> None:
-        self.network, self._network, self._store = network.network, network, store
-        self._identity = _identity(files, network.network.provider, params.model_dump_json())
+    def __init__(self, stage: UserStage, store: ResultStore, files: Iterable[Path]) -> None:
+        self._call, self._store = stage.call, store
+        module, code = stage.plugin.file, ""
+        if module is not None:
+            code = code_hash(str(module.parent)) if "." in stage.plugin.module else file_hash(module)
+        self._identity = _identity(files, stage.plugin.name, code, stage.identity)
 
-    def __call__(
-        self, points: F32, intensity: F32 | None = None, call: Callable[..., Any] = run_directly
-    ) -> tuple[Boxes3D, F32, list[str]]:
-        """Detect objects in a cloud, as ``ObjectNetwork`` does."""
-        key = store_key(self._identity, points, *([] if intensity is None else [intensity]))
-        arrays = _unpack(self._store.get(key), ((2, "f"), (2, "f"), (1, "f"), (1, "f"), (1, "U")))
-        if arrays is not None:
-            center, size, yaw, score, names = arrays
-            return Boxes3D(center, size, yaw), score, names.tolist()
-        boxes, score, labels = self._network(points, intensity, call)
-        arrays = [boxes.center, boxes.size, boxes.yaw, score, np.array(labels, dtype=str)]
-        self._store.put(key, _pack(arrays))
-        return boxes, score, labels
+    def __call__(self, array: NDArray[Any], **facts: Any) -> Any:
+        """Return the stage's result for an array."""
+        key = store_key(self._identity, str(sorted(facts.items())), array)
+        known = _unpack(self._store.get(key))
+        if known is not None:
+            return known[0] if len(known) == 1 else tuple(known)
+        returned = self._call(array, **facts)
+        arrays = [np.asarray(part) for part in (returned if isinstance(returned, tuple) else [returned])]
+        if all(part.dtype.kind in "biufU" for part in arrays):
+            self._store.put(key, _pack(arrays))
+        return returned
 
 
 def _identity(files: Iterable[Path], *facts: str) -> bytes:
     """Return the hash of everything but the input that a network's result depends on."""
-    versions = __version__, ort.__version__, cv2.__version__, np.__version__, code_hash(*NETWORKS)
+    versions = __version__, ort.__version__, cv2.__version__, np.__version__, code_hash(NETWORKS)
     return store_key(*versions, *facts, *(file_hash(path) for file in files for path in with_weights(file)))
 
 
@@ -377,13 +375,19 @@ def _pack(arrays: Arrays) -> bytes:
     return target.getvalue()
 
 
-def _unpack(value: bytes | None, expected: Sequence[tuple[int, str]]) -> list[Any] | None:
-    """Return arrays of the expected number of axes and kinds. None: there is no such value."""
+def _unpack(value: bytes | None, expected: Sequence[tuple[int, str]] = ()) -> list[Any] | None:
+    """Return arrays of the expected number of axes and kinds. None: there is no such value.
+
+    Args:
+        value: what ``_pack`` returned.
+        expected: number of axes and kind of each array. Empty: any.
+    """
     if value is None:
         return None
-    source = io.BytesIO(value)
+    source, arrays = io.BytesIO(value), []
     try:
-        arrays = [np.load(source, allow_pickle=False) for _ in expected]
+        while source.tell() < len(value):
+            arrays.append(np.load(source, allow_pickle=False))
     except (ValueError, EOFError, OSError):
         return None
-    return arrays if [(a.ndim, a.dtype.kind) for a in arrays] == list(expected) else None
+    return arrays if not expected or [(a.ndim, a.dtype.kind) for a in arrays] == list(expected) else None

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bevviz.config import Config, DetectorConfig, object_network_params
-from bevviz.config.pillars import INPUT_PARAMS
+from bevviz.config import Config, DetectorConfig, stage_files
 from bevviz.config.plugins import TOPIC
 from bevviz.model.frame import Camera
 from bevviz.model.results import Detections
-from bevviz.pipeline.result_store import ResultStore, StoredDetector, StoredObjectNetwork, open_store
+from bevviz.pipeline.result_store import ResultStore, StoredDetector, StoredStage, open_store
 from bevviz.stages import user_stages
 from bevviz.stages.detector import Detector
-from bevviz.stages.pillars import ObjectNetwork, PillarNetwork
 from bevviz.stages.user_stages import UserStage
 
 DetectFunction = Callable[[Camera], Detections | None]
@@ -27,7 +25,7 @@ class Stages:
     Attributes:
         ground: user-defined function.
         clustering: user-defined function.
-        objects: user-defined function, or 3D detector.
+        objects: user-defined function.
         network: the detector's network, shared by configurations that differ only in thresholds.
         detector: the detector with this configuration's thresholds.
         detect: function that replaces both.
@@ -35,7 +33,7 @@ class Stages:
 
     ground: UserStage | None = None
     clustering: UserStage | None = None
-    objects: UserStage | ObjectNetwork | StoredObjectNetwork | None = None
+    objects: UserStage | None = None
     network: Detector | StoredDetector | UserStage | None = None
     detector: Detector | None = None
     detect: DetectFunction | None = None
@@ -50,8 +48,7 @@ class Stages:
         """Provider of the networks, the detector's first. Empty: bevviz runs none."""
         if self.detector is not None:
             return self.detector.provider
-        network = self.objects if isinstance(self.objects, ObjectNetwork | StoredObjectNetwork) else None
-        return "" if network is None else network.network.provider
+        return "" if self.objects is None else self.objects.provider
 
 
 class StageLoader:
@@ -65,8 +62,7 @@ class StageLoader:
         self._uses_store = store
         self._networks: dict[tuple[str, str, str, int], Detector] = {}
         self._stored: dict[tuple[Detector, ResultStore], StoredDetector] = {}
-        self._foreign: dict[tuple[str, str, str], UserStage | None] = {}
-        self._pillars: dict[tuple[object, ...], PillarNetwork] = {}
+        self._foreign: dict[tuple[str, str, str, str], UserStage | None] = {}
 
     def load(self, config: Config, detect: DetectFunction | None = None) -> Stages:
         """Return the stages of a configuration. ``detect`` replaces its detector.
@@ -79,7 +75,7 @@ class StageLoader:
         return Stages(
             ground=self._function(config, "ground"),
             clustering=self._function(config, "clustering"),
-            objects=self._objects(config),
+            objects=self._function(config, "objects"),
             network=detector if network is None else self._with_store(network, config),
             detector=None if network is None else network.restated(config.detector),
             detect=detect,
@@ -87,31 +83,23 @@ class StageLoader:
 
     def _function(self, config: Config, section: str) -> UserStage | None:
         """Return the user-defined function of a section, or None."""
-        key = section, getattr(config, section).model_dump_json(), str(config.functions)
+        runs_on = f"{config.detector.provider} {config.detector.threads} {config.store.size}"
+        key = section, getattr(config, section).model_dump_json(), str(config.functions), runs_on
         if key not in self._foreign:
-            self._foreign[key] = user_stages.load_user_stage(config, section)
+            stage = user_stages.load_user_stage(config, section)
+            if stage is not None and stage.identity and (store := self._store(config)) is not None:
+                files = [Path(file) for key, file in stage_files(config).items() if key.startswith(section)]
+                stage = replace(stage, call=StoredStage(stage, store, files))
+            self._foreign[key] = stage
         return self._foreign[key]
 
-    def _objects(self, config: Config) -> UserStage | ObjectNetwork | StoredObjectNetwork | None:
-        """Return the 3D detector or the user-defined function that makes the objects, or None."""
-        params = object_network_params(config)
-        if params is None:
-            return self._function(config, "objects")
-        runs_on = config.detector.provider, config.detector.threads
-        input_params = params.model_dump_json(include={*INPUT_PARAMS, "encoder"})
-        key = config.objects.method, input_params, *runs_on
-        if key not in self._pillars:
-            self._pillars[key] = PillarNetwork(Path(config.objects.method), params, *runs_on)
-        network = ObjectNetwork(self._pillars[key], params)
-        store = open_store(config.store.size) if self._uses_store else None
-        if store is None:
-            return network
-        files = [Path(config.objects.method), *([Path(params.encoder)] if params.encoder else [])]
-        return StoredObjectNetwork(network, store, files, params)
+    def _store(self, config: Config) -> ResultStore | None:
+        """Return the store of results, if there is one and this loader may use it."""
+        return open_store(config.store.size) if self._uses_store else None
 
     def _with_store(self, network: Detector, config: Config) -> Detector | StoredDetector:
         """Return the detector's network with the store of results, if there is one."""
-        store = open_store(config.store.size) if self._uses_store else None
+        store = self._store(config)
         if store is None:
             return network
         key = network, store

@@ -15,7 +15,7 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from bevviz.config import METHOD_KEYS, Config, object_files, plugin_of, with_object_files
+from bevviz.config import METHOD_KEYS, Config, plugin_of, stage_files, with_stage_files
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
 from bevviz.support.files import absolute, file_hash
@@ -82,13 +82,15 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
         if path is not None:
             dependencies[key] = Dependency(sha256=file_hash(path), file=path.name)
-    for key, file in object_files(config).items():
+    for key, file in stage_files(config).items():
         dependencies[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
     for section, key in METHOD_KEYS.items():
         plugin = plugin_of(config, section)
         if plugin is not None:
             content = file_hash(plugin.file) if plugin.file else ""
-            dependencies[f"{section}.{key}"] = Dependency(plugin.version, content, plugin.name)
+            name = f"{section}.{key}"
+            name = plugin.name if name in dependencies else name  # The key stands for the stage's file.
+            dependencies[name] = Dependency(plugin.version, content, plugin.name)
     return dependencies
 
 
@@ -129,7 +131,7 @@ def with_absolute_files(config: Config) -> Config:
     files = {"names": absolute(detector.names)}
     if model is not None and detector.model != "demo":
         files["model"] = str(model.resolve())
-    return with_object_files(config, absolute).model_copy(
+    return with_stage_files(config, absolute).model_copy(
         update={"detector": detector.model_copy(update=files)}
     )
 

@@ -13,8 +13,18 @@ from typing import Any, Self
 
 import rerun as rr
 
-from bevviz.config import Config, Layer, Preset, flat_yaml, load, object_files, untrusted_layers, values
-from bevviz.config.pillars import is_network_file
+from bevviz.config import (
+    METHOD_KEYS,
+    Config,
+    Layer,
+    Preset,
+    flat_yaml,
+    load,
+    same_stage,
+    stage_files,
+    untrusted_layers,
+    values,
+)
 from bevviz.errors import UserError, first_line
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
@@ -24,7 +34,6 @@ from bevviz.support.files import bag_files, open_regular, sampled_files
 from bevviz.support.text import path_text
 
 FRAME_SECTIONS = ("source.", "sync.")  # sections that decide what a frame is made of
-OBJECT_FILE_KEYS = ("objects.method", "objects.params.encoder")  # files of a 3D detector
 HASHED_BYTES = 1 << 16  # bytes that are hashed at the beginning, the middle and the end of a file
 PROPERTY_CHUNKS = 500  # chunks within which one property follows another
 MAGIC = b"RRF"  # followed by a digit, the generation of the format
@@ -162,7 +171,7 @@ class Origin:
         named_files = {"detector.model": model_path(config), "detector.names": names_path(config)}
         if config.detector.model == "demo":
             named_files = {}
-        named_files |= {key: Path(file) for key, file in object_files(config).items()}
+        named_files |= {key: Path(file) for key, file in stage_files(config).items()}
         try:
             bag = [FileReference.of(path, recording, folders=folders) for path in scene.bag]
             files = {
@@ -221,8 +230,8 @@ class RecordingSource:
         """Load the recording's configuration with changes.
 
         A file or a preset replaces the recording's configuration. Values that it leaves at the preset's
-        default come from the recording if they decide how frames are made, or name the detector. The method
-        of the objects does not, because it needs its parameters.
+        default come from the recording if they decide how frames are made, or name the detector. The other
+        stages do not, because a method needs its parameters.
 
         Functions in the recording's configuration run only if ``settings`` or a trusted file names them too.
 
@@ -244,10 +253,11 @@ class RecordingSource:
             recorded["detector.model"] = recording_values["detector.model"]
         for layer in self._received():
             recorded |= layer.values
+        method_keys = {f"{section}.{key}" for section, key in METHOD_KEYS.items() if section != "detector"}
         open_keys = [
             key
             for key in recorded
-            if key in defaults and key not in OBJECT_FILE_KEYS and stated[key] == defaults[key]
+            if key in defaults and key not in method_keys and stated[key] == defaults[key]
         ]
         return Layer(str(self.recording), {key: recorded[key] for key in open_keys})
 
@@ -298,9 +308,15 @@ def find_source(recording: Path, bag: Sequence[Path] = (), settings: Sequence[st
         )
     topics, file_settings = list(origin.topics) if origin is not None else [], list[str]()
     new_settings = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
-    has_no_network = not is_network_file(new_settings.get("objects.method", ".onnx"))
+    replaced = tuple(
+        section
+        for section, key in METHOD_KEYS.items()
+        if (method := new_settings.get(f"{section}.{key}")) is not None
+        and not same_stage(section, method, str(configuration.get(f"{section}.{key}")))
+    )
     for key, reference in origin.files.items() if origin is not None else ():
-        if key in new_settings or (key in OBJECT_FILE_KEYS and has_no_network):
+        section, _, name = key.partition(".")
+        if key in new_settings or (name.startswith("params.") and section in replaced):
             continue
         path, reason = reference.locate(recording)
         if path is None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from bevviz.config import Config, Layer, changes, flat_yaml, load, object_files
+from bevviz.config import Config, Layer, changes, flat_yaml, load, stage_files
 from bevviz.errors import UserError
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
@@ -249,7 +249,7 @@ def _configs(
             used = info.provenance.dependencies.get("detector.model", stored_config.detector.model)
             raise UserError(f"{rrd}: it was made with {used}, which is not beside it: give --model FILE")
         local_settings.append(f"detector.model={path}")
-    for key, name in object_files(stored_config).items():
+    for key, name in stage_files(stored_config).items():
         if any(text.partition("=")[0] in (key, key.replace(".params", "")) for text in settings):
             continue
         path = rrd.with_name(name)
@@ -277,7 +277,7 @@ def _changed_input(
     if file_hash(bag) != info.bag_sha256:
         yield _other(bag)
     for key, change in changes(stored_config, current_config).items():
-        if key not in ("detector.model", "detector.names", *object_files(stored_config)):
+        if key not in ("detector.model", "detector.names", *stage_files(stored_config)):
             yield f"{key} was {change.before}, is {change.after}"
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from bevviz.bags.source import SECOND, iso
-from bevviz.config import Config, ParameterChange, changes, load, with_object_files
+from bevviz.config import Config, ParameterChange, changes, load, with_stage_files
 from bevviz.recording.provenance import Dependency, Provenance, model_path
 from bevviz.report.bag_window import ReportWindow
 from bevviz.support.text import fenced, markdown
@@ -214,7 +214,7 @@ def shareable(config: Config) -> Config:
     results = {name: Path(file).name for name, file in config.source.results.items()}
     files = {"lidar_calibration": calibrations, "results": results}
     name = detector.model if model is None or detector.model == "demo" else model.name
-    return with_object_files(config, lambda file: Path(file).name).model_copy(
+    return with_stage_files(config, lambda file: Path(file).name).model_copy(
         update={
             "detector": detector.model_copy(update={"model": name, "names": Path(detector.names).name}),
             "source": config.source.model_copy(update=files),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevviz.config import ClusteringConfig, Config, plugin_of
+from bevviz.config import ClusteringConfig, Config, is_stage_file, method_label, method_of, plugin_of
 from bevviz.config.plugins import Plugin, describe_exception
 from bevviz.errors import FunctionError, StageError, UserError, interrupt_in
 from bevviz.model.box_points import inside_each
@@ -26,10 +27,22 @@ REACH = 200.0  # metres around the origin within which that level is stored
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UserStage:
-    """A user's function with its parameters."""
+    """A user's function with its parameters.
+
+    Attributes:
+        plugin: the function or class.
+        call: the function with its parameters, or the instance of the class.
+        name: ``module:function``, or the name of the file that the stage reads.
+        provider: what the stage runs on, of the attribute ``provider`` of its class; empty: it has none.
+        identity: what its results depend on beside the array, its files and its code, of the attribute
+            ``identity`` of its class. Results of a stage with this text may be kept; empty: it has none.
+    """
 
     plugin: Plugin
     call: Callable[..., Any]
+    name: str
+    provider: str = ""
+    identity: str = ""
 
     def __call__(self, array: NDArray[Any], stamp: int, number: int, sensor: str) -> Any:
         """Call the function with a copy of the array, so that it cannot change the frame.
@@ -55,11 +68,6 @@ class UserStage:
             reason = describe_exception(error, self.plugin.file)
             raise FunctionError(f"{self.name} raised {reason}") from error
 
-    @property
-    def name(self) -> str:
-        """The name of the function in the configuration."""
-        return self.plugin.name
-
 
 def load_user_stage(config: Config, section: str) -> UserStage | None:
     """Return the user's function that a stage's section names; None if the section names a built-in method.
@@ -70,19 +78,27 @@ def load_user_stage(config: Config, section: str) -> UserStage | None:
     plugin = plugin_of(config, section)
     if plugin is None:
         return None
-    params = []
+    label, params = method_label(config, section), []
     if plugin.takes_params and plugin.params is not None:
         params.append(plugin.params.model_validate(getattr(config, section).params))
     if not isinstance(plugin.target, type):
-        return UserStage(plugin, lambda array, **facts: plugin.target(array, *params, **facts))
+        return UserStage(plugin, lambda array, **facts: plugin.target(array, *params, **facts), label)
+    settings: dict[str, Any] = {"provider": config.detector.provider, "threads": config.detector.threads}
+    if is_stage_file(section, method := method_of(config, section)):
+        settings["file"] = Path(method)
     try:
-        instance = plugin.target(*params)
+        instance = plugin.target(
+            *params, **{name: settings[name] for name in plugin.settings if name in settings}
+        )
+    except UserError:
+        raise
     except (Exception, SystemExit) as error:  # A user's class may raise anything.
         reason = describe_exception(error, plugin.file)
         raise UserError(f"{section}: {plugin.name} cannot be made: {reason}") from error
     if not callable(instance):
         raise UserError(f"{section}: {plugin.name} makes a {type(instance).__name__} that cannot be called")
-    return UserStage(plugin, instance)
+    provider, identity = (str(getattr(instance, name, "")) for name in ("provider", "identity"))
+    return UserStage(plugin, instance, label, provider, identity)
 
 
 # --- the stages --------------------------------------------------------------------------------

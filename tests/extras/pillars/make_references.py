@@ -1,4 +1,4 @@
-"""Make what the tests hold 3D detectors on pillars to: tests/references/pillars/*.npz.
+"""Make what the tests hold 3D detectors on pillars to: references/*.npz.
 
 Each file of a head holds maps as a network might answer them, drawn with a fixed seed, and the boxes that the
 head's own code takes from them: AnchorHeadSingle and CenterHead of OpenPCDet, Anchor3DHead and CenterHead of
@@ -9,7 +9,7 @@ What these need of CUDA alone is not loaded; the suppression of turned boxes, wh
 by areas of shapely instead. Besides checkouts of both this needs, in an environment of their own:
 
     python -m pip install torch shapely spconv easydict pyyaml scipy numba mmengine mmdet mmcv-lite==2.1.0
-    python tools/make_pillar_references.py --openpcdet OpenPCDet --mmdetection3d mmdetection3d
+    python tests/extras/pillars/make_references.py --openpcdet OpenPCDet --mmdetection3d mmdetection3d
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 from torch import Tensor
 
-FOLDER = Path(__file__).parents[1] / "tests/references/pillars"
+FOLDER = Path(__file__).with_name("references")
 RANGE = (0.0, -8.0, -3.0, 24.0, 8.0, 1.0)
 VOXEL = (0.5, 0.5, 4.0)
 GRID = (48, 32)

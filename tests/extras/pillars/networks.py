@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from bevviz.config import Config, load
+from bevviz.extras.pillars.network import ObjectNetwork
+from bevviz.extras.pillars.stage import PillarStage
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.stages.pillars import ObjectNetwork
 from tests.support.onnx_networks import FLOAT, INT64, Input, answer, node, save
 
-REFERENCES = Path(__file__).parents[1] / "references/pillars"
+REFERENCES = Path(__file__).with_name("references")
 INPUTS: list[Input] = [
     ("voxels", ["n", 32, 4], FLOAT),
     ("num_points", ["n"], INT64),
@@ -47,9 +48,9 @@ class Reference:
 
 
 def network(config: Config) -> ObjectNetwork:
-    found = StageLoader().load(config).objects
-    assert isinstance(found, ObjectNetwork)
-    return found
+    found = StageLoader(store=False).load(config).objects
+    assert found is not None and isinstance(found.call, PillarStage)
+    return found.call.network
 
 
 def autoware(folder: Path, features: int = 9) -> dict[str, Any]:

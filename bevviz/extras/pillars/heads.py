@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from bevviz.config.pillars import PillarParams
+from bevviz.extras.pillars.params import PillarParams
 from bevviz.model.frame import F32, F64, I64
 from bevviz.stages.detector.session import list_tensors
 

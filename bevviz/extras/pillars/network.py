@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,13 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from bevviz.config.pillars import MAX_POINTS, PillarParams
 from bevviz.errors import UserError
+from bevviz.extras.pillars.group import Pillars, group, scatter
+from bevviz.extras.pillars.heads import find_head
+from bevviz.extras.pillars.params import MAX_POINTS, PillarParams
 from bevviz.model.frame import F32, Boxes3D
 from bevviz.stages.detector.providers import open_session, say_once
 from bevviz.stages.detector.session import NetworkSession, clip, list_tensors, reading_answer
-from bevviz.stages.pillars.group import Pillars, group, scatter
-from bevviz.stages.pillars.heads import find_head
 from bevviz.stages.rotated_boxes import survivors
 
 FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -50,7 +51,7 @@ class PillarNetwork:
 
     Args:
         path: ONNX file; with ``params.encoder`` the file of the second part.
-        params: only the parameters in ``FED`` and ``encoder`` are used.
+        params: only the parameters in ``INPUT_PARAMS`` and ``encoder`` are used.
         provider: onnxruntime execution provider, as ``detector.provider``.
         threads: as ``detector.threads``.
 
@@ -71,7 +72,8 @@ class PillarNetwork:
         first, at = self._session, self.where
         if params.encoder:
             at = f"objects.encoder {params.encoder}"
-            first = self._encoder = _open(Path(params.encoder), at, provider, threads)
+            first = self._encoder = _open(params.encoder, at, provider, threads)
+        self._latest: tuple[bytes, NetworkOutput] | None = None
         self._inputs = _inputs(first, at, alone=bool(params.encoder))
         self._max_points, self._fixed = self._fitting(self._inputs["pillars"], at)
         if self._encoder is not None:
@@ -85,7 +87,7 @@ class PillarNetwork:
         self.probe = self.infer((across - [0, 0, params.z_offset]).astype(np.float32))
 
     def infer(self, points: F32, intensity: F32 | None = None) -> NetworkOutput:
-        """Run the network on a cloud.
+        """Run the network on a cloud. The latest cloud is not run again, so that thresholds cost little.
 
         Args:
             points: (N, 3) float32, upright, in metres.
@@ -94,6 +96,14 @@ class PillarNetwork:
         Raises:
             UserError: the network fails.
         """
+        cloud = _digest(points, intensity)
+        latest = self._latest
+        if latest is None or latest[0] != cloud:
+            latest = self._latest = cloud, self._infer(points, intensity)
+        return latest[1]
+
+    def _infer(self, points: F32, intensity: F32 | None) -> NetworkOutput:
+        """Run the network on a cloud, as ``infer`` does."""
         params = self._params
         if params.z_offset:
             points = points + np.array([0, 0, params.z_offset], np.float32)
@@ -194,11 +204,6 @@ class PillarNetwork:
         return inputs[0]
 
 
-def run_directly(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function."""
-    return function(*arguments)
-
-
 class ObjectNetwork:
     """Decoder of a pillar network's outputs to boxes.
 
@@ -222,15 +227,12 @@ class ObjectNetwork:
         """Class names of the network."""
         return self._params.classes
 
-    def __call__(
-        self, points: F32, intensity: F32 | None = None, call: Callable[..., Any] = run_directly
-    ) -> tuple[Boxes3D, F32, list[str]]:
+    def __call__(self, points: F32, intensity: F32 | None = None) -> tuple[Boxes3D, F32, list[str]]:
         """Detect objects in a cloud.
 
         Args:
             points: (N, 3) float32, upright, in metres.
             intensity: (N,) of the points, or None.
-            call: function that calls another one with arguments, or knows the result already.
 
         Returns:
             Boxes in the frame of the points, best first, their scores, and their class names.
@@ -238,7 +240,7 @@ class ObjectNetwork:
         Raises:
             UserError: the network fails or returns impossible numbers.
         """
-        return self.interpret(call(self.network.infer, points, intensity))
+        return self.interpret(self.network.infer(points, intensity))
 
     def interpret(self, output: NetworkOutput) -> tuple[Boxes3D, F32, list[str]]:
         """Apply the thresholds to the network's output. The result is that of ``__call__``."""
@@ -269,6 +271,14 @@ class ObjectNetwork:
         rows32 = final.astype(np.float32)
         names = [params.classes[c] for c in class_id[kept].tolist()]
         return Boxes3D(rows32[:, :3], rows32[:, 3:6], rows32[:, 6]), candidates.score[rows][kept], names
+
+
+def _digest(*arrays: F32 | None) -> bytes:
+    """Return the hash of arrays."""
+    total = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        total.update(b"" if array is None else np.ascontiguousarray(array).data)
+    return total.digest()
 
 
 def _open(path: Path, where: str, provider: str, threads: int) -> NetworkSession:

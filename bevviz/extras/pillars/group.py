@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz.config.pillars import Feature
+from bevviz.extras.pillars.params import Feature
 from bevviz.model.frame import F32, F64, I32
 from bevviz.support.numba_kernel import kernel
 

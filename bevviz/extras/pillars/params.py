@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -16,7 +17,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-SUFFIX = ".onnx"
+from bevviz.config.value_types import COMPLETE_SENTENCE
+
 MAX_POINTS = 1000  # Most points of a pillar. Known networks have up to 100.
 
 Feature = Literal[
@@ -36,12 +38,16 @@ Feature = Literal[
 Share = Annotated[float, Field(ge=0, le=1)]
 Size3D = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 PointRange = tuple[float, float, float, float, float, float]
-COMPLETE_SENTENCE = "unfit"  # type of an error whose text contains the stated value
 
 
 def _complete_error(sentence: str) -> PydanticCustomError:
     """Return an error for pydantic with a complete sentence."""
     return PydanticCustomError(COMPLETE_SENTENCE, "{sentence}", {"sentence": sentence})
+
+
+def _empty_is_none(value: Any) -> Any:
+    """Return None for an empty text."""
+    return value or None
 
 
 def _as_list(value: Any) -> Any:
@@ -69,7 +75,9 @@ class PillarParams(BaseModel):
     classes: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = Field(
         min_length=1, description="class names in the network's order"
     )
-    encoder: str = Field("", description="ONNX file of the pillars' encoder, where the network is two files")
+    encoder: Annotated[Path | None, BeforeValidator(_empty_is_none)] = Field(
+        None, description="ONNX file of the pillars' encoder, where the network is two files"
+    )
     max_points: int | None = Field(
         None,
         ge=1,
@@ -219,8 +227,3 @@ INPUT_PARAMS = (
     "z_offset",
 )
 """Parameters that decide the input of the network. With equal ones its output is the same."""
-
-
-def is_network_file(method: str) -> bool:
-    """Return whether ``objects.method`` names a network file, and not a function or a topic."""
-    return method.lower().endswith(SUFFIX) and ":" not in method
