@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from bevviz.cli import main
-from bevviz.config import Config, load
+from bevviz.config import load
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
@@ -27,7 +27,6 @@ from bevviz.pipeline.result_store import ResultStore, StoredDetector, open_store
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector.session import NetworkSession
 from bevviz.support import progress
-from tests.extras.pillars.networks import Reference
 from tests.support.onnx_networks import answer, image_input
 from tests.support.small_disk import small_disk
 
@@ -167,31 +166,6 @@ def test_masks_are_kept_for_each_set_of_detections(
     expect_equal(plain, detections(frames[0], stricter, model=model))
     expect_equal(first, detections(frames[0], model=model))
     monkeypatch.setattr(StoredDetector, "_infer_masks", infer)
-
-
-def test_boxes_of_a_3d_network_are_kept(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = Reference("openpcdet_anchors").settings(tmp_path / "net.onnx")
-    points = np.random.default_rng(3).uniform([0, -8, -3], [20, 8, 1], (500, 3)).astype(np.float32)
-
-    def boxes(config: Config) -> Any:
-        found: Any = StageLoader().load(config).objects
-        return found(points)
-
-    plain = boxes(load(settings=[*settings, "store.size=0"]))
-    first = boxes(load(settings=settings))
-    network: Any = StageLoader().load(load(settings=settings)).objects
-    monkeypatch.setattr(network.network, "infer", lambda *_: pytest.fail("the network ran"))
-    again = network(points)
-    assert len(first[0]) > 1
-    for made, kept in ((plain, first), (first, again)):
-        expect_equal(made[0], kept[0])
-        assert made[1].tobytes() == kept[1].tobytes() and made[2] == kept[2]
-    monkeypatch.undo()
-    monkeypatch.setenv("BEVVIZ_STORE", str(folder))
-    other = boxes(load(settings=[*settings, "objects.score_threshold=0.9"]))
-    assert len(other[0]) < len(first[0])
 
 
 # --- keys --------------------------------------------------------------------------------------

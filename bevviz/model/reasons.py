@@ -113,7 +113,7 @@ MEANINGS = {  # of each reason that an answer can have, for the docs and the pag
     ReasonKind.MISFIT: "no candidate in the frustum is rated high enough",
     ReasonKind.OTHER_CLUSTER: "its detection has another cluster",
     ReasonKind.CONTRADICTED: "your function or the robot has it, and a camera that sees the place does not",
-    ReasonKind.NOT_AMONG: "it is not among the objects of your function, of a 3D network or of the robot",
+    ReasonKind.NOT_AMONG: "it is not among the objects of your function or of the robot",
     ReasonKind.LOST_IN_FUSION: "the robot has its cluster and its detection, and no object of them",
 }
 

@@ -106,3 +106,17 @@ def head(
             rows[:] = [W / 2, H / 2, W, H, layout == "YOLOv6", *[0] * count]
         rows[place] = np.hstack([center, size, objectness, by_class])
     return np.asarray(rows[None], np.float32)
+
+
+def loop(count: str, go_on: str, start: str, end: str, shape: list[int]) -> Any:
+    """Make a node that doubles a tensor again and again."""
+    boolean = TensorProto.BOOL
+    inputs = [("i", INT64, []), ("go", boolean, []), ("x", FLOAT, shape)]
+    outputs = [("go_on", boolean, []), ("y", FLOAT, shape)]
+    body = helper.make_graph(
+        [node("Identity", ["go"], ["go_on"]), node("Add", ["x", "x"], ["y"])],
+        "body",
+        [helper.make_tensor_value_info(*tensor) for tensor in inputs],
+        [helper.make_tensor_value_info(*tensor) for tensor in outputs],
+    )
+    return node("Loop", [count, go_on, start], [end], body=body)

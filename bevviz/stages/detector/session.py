@@ -32,7 +32,7 @@ INTERPRETING = ("CPU", "CUDA")  # providers that do not compile networks
 MAX_MEMORY = 8 * 2**30
 # On a smaller machine the networks may take this share of its memory. The recording needs the other half.
 MEMORY_SHARE = 0.5
-# Numbers in all inputs of a network. 800 MB as float32; the largest known maps of pillars hold 1.3e8.
+# Numbers in all inputs of a network. 800 MB as float32; the largest known inputs of 3D detectors hold 1.3e8.
 MAX_INPUT_NUMBERS = 200_000_000
 # Numbers in all outputs of a network. 400 MB as float32; detectors for 4096 x 4096 pixels give 3e7.
 MAX_OUTPUT_NUMBERS = 100_000_000

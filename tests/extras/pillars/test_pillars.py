@@ -21,7 +21,7 @@ from bevviz.config.descriptions import describe_parameters
 from bevviz.errors import UserError
 from bevviz.extras.pillars.group import Pillars, group, scatter
 from bevviz.extras.pillars.heads import anchor_boxes, decode_boxes
-from bevviz.extras.pillars.network import PillarNetwork
+from bevviz.extras.pillars.network import PROBE_POINTS, PillarNetwork
 from bevviz.extras.pillars.params import Feature, PillarParams
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
@@ -388,3 +388,28 @@ def test_a_network_that_fails_on_a_cloud_is_a_reason(tmp_path: Path) -> None:
     (failure,) = result.failures
     assert failure.stage == "objects" and "net.onnx: fails on" in failure.reason
     assert result.objects is None and result.clusters is not None
+
+
+def test_boxes_are_kept_in_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BEVVIZ_STORE", str(tmp_path / "store"))
+    settings = Reference("openpcdet_anchors").settings(tmp_path / "net.onnx")
+    cloud = np.column_stack([CLOUD, np.zeros(len(CLOUD), np.float32)])
+
+    def found(*more: str) -> Any:
+        stage = StageLoader().load(load(settings=[*settings, *more])).objects
+        assert stage is not None
+        return stage(cloud, 0, 0, "lidar")
+
+    plain, first = found("store.size=0"), found()
+    infer = PillarNetwork._infer
+    probe = []
+    monkeypatch.setattr(
+        PillarNetwork, "_infer", lambda self, *args: probe.append(len(args[0])) or infer(self, *args)
+    )
+    again = found()
+    assert set(probe) <= {PROBE_POINTS}, "the network runs on the cloud no second time"
+    assert len(first[0]) > 1
+    for one in (first, again):
+        assert one[0].tobytes() == plain[0].tobytes() and one[1].tobytes() == plain[1].tobytes()
+        assert list(one[2]) == plain[2]
+    assert len(found("objects.score_threshold=0.9")[0]) < len(first[0])
