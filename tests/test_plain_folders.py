@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 
 import bevviz
 from bevviz import UserError
+from bevviz.bags.source import BagSource
 from bevviz.cli import main
+from bevviz.config import load
 from bevviz.datasets import find_loader, loaders, open_dataset
 from bevviz.datasets.cloud_files import are_doubles, count_columns, read_cloud
 from bevviz.datasets.folder import Folder
@@ -66,9 +68,9 @@ def test_a_folder_of_five_columns_is_read_and_said(tmp_path: Path) -> None:
         cloud(5, seed=number).tofile(tmp_path / f"{number:06}.bin")
     folder = Folder(tmp_path, "")
     assert [w for w in folder.warnings if "5 columns of float32, as their values tell" in w]
-    message = next(s for s in folder.streams if s.topic == "/lidar/points").make(0)
-    assert message.width == 3000
-    assert [f.name for f in message.fields] == ["x", "y", "z", "intensity", "field_4"]
+    points = next(s for s in folder.streams if s.topic == "/lidar/points").make(0)
+    assert len(points.xyz) == 3000
+    assert [*points.fields] == ["intensity", "field_4"]
 
     (tmp_path / "calibration.yaml").write_text("fields: [x, y, z, intensity, ring]")
     folder = Folder(tmp_path, "")
@@ -411,7 +413,7 @@ def test_a_scan_as_pcd_and_as_bin_is_one_scan(tmp_path: Path) -> None:
     head += "POINTS 300\nDATA binary\n"
     (tmp_path / "000000.pcd").write_bytes(head.encode() + points.tobytes())
     (scans,) = (stream for stream in Folder(tmp_path, "").streams if stream.topic.endswith("/points"))
-    assert [file.suffix for file in scans.files] == [".pcd"]
+    assert [*scans.make(0).fields] == ["i"]  # as the PCD file names it
 
 
 def test_range_images_beside_clouds_are_no_lidar(tmp_path: Path) -> None:
@@ -454,6 +456,10 @@ def plain(root: Path) -> Path:
 
 
 POINTS = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
+PCD = (
+    b"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    b"WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA binary\n"
+)
 
 
 def test_a_folder_of_clouds_and_images_is_read(tmp_path: Path) -> None:
@@ -558,6 +564,32 @@ def test_a_damaged_cloud_is_told_and_the_rest_goes_on(tmp_path: Path, capfd: Cap
         (told,) = [w for w in drive.warnings if "1700000000.300000000.pcd" in w or "/top/points" in w]
         assert "1700000000.300000000.pcd: cannot be read as a cloud" in told
     assert capfd.readouterr().out == ""
+
+
+def test_a_scan_that_no_frame_takes_is_not_read(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / f"{number:06}.pcd").write_bytes(b"no cloud" if number % 2 else PCD + POINTS.tobytes())
+    with BagSource([tmp_path], load(), every=2) as source:
+        assert len(list(source)) == 2
+        assert not [warning for warning in source.warnings if "cannot be read" in warning]
+
+
+def test_a_bag_cut_out_of_a_folder_has_the_same_clouds(tmp_path: Path) -> None:
+    """Points without a return are left out of the bag, and counted there as well."""
+    root, part = tmp_path / "drive", tmp_path / "part.mcap"
+    root.mkdir()
+    points = POINTS.copy()
+    points[1, :3] = 0
+    for number in range(2):
+        (root / f"{number:06}.pcd").write_bytes(PCD + points.tobytes()[: 40 if number else None])
+    assert main(["cut", str(root), "-o", str(part), "--start", "0", "--end", "1"]) == 0
+    with bevviz.open(root) as folder, bevviz.open(part) as bag:
+        for number, (count, dropped) in enumerate([(2, 1), (1, 2)]):
+            ours, theirs = folder.raw(number).clouds[0], bag.raw(number).clouds[0]
+            assert (len(ours.xyz), ours.dropped) == (len(theirs.xyz), theirs.dropped) == (count, dropped)
+            np.testing.assert_array_equal(ours.xyz, theirs.xyz)
+            np.testing.assert_array_equal(ours.fields["intensity"], theirs.fields["intensity"])
+        assert any("000001.pcd: is cut: 2 of 3 points are there" in warning for warning in folder.warnings)
 
 
 def test_two_drives_in_one_folder_are_two(tmp_path: Path, capsys: Capture) -> None:

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores
 from bevviz.bags import mcap
 from bevviz.bags.file_types import BagFile, find_saved_bag, open_file
 from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1
-from bevviz.bags.reader import normalized
+from bevviz.bags.reader import LAST_TIME, normalized
 from bevviz.bags.remote import address_of, beside, open_bytes
 from bevviz.config import SourceConfig
 from bevviz.config.files import parse_yaml
@@ -91,6 +91,7 @@ class Recording(Closable):
         self._aside: dict[str, str] = {}
         self._scan_times: dict[str, I64] = {}
         self.files: list[BagFile] = []
+        self._datasets: dict[BagFile, DatasetReader] = {}
         self._notes: list[str] = []
         self.types = MessageTypes(self._notes.append)
         self._scratch = ScratchFolder()
@@ -209,6 +210,7 @@ class Recording(Closable):
         stop: int | None = None,
         *,
         few: bool = False,
+        scans: bool = False,
     ) -> Iterator[RawMessage]:
         """Yield messages of ``topics`` with start <= log time < stop in nanoseconds, in order of log time.
 
@@ -217,14 +219,21 @@ class Recording(Closable):
             start: first log time; None: that of the recording.
             stop: end of the log times; None: that of the recording.
             few: see ``ChunkReader.messages``.
+            scans: give the scans of a data set as such, see ``DatasetReader.scans``.
         """
-        sources = [self._lazy_messages(f, topics, start, stop, few) for f in self.files]
+        sources = [self._lazy_messages(f, topics, start, stop, few, scans) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
                 yield message
 
     def _lazy_messages(
-        self, file: BagFile, topics: Collection[str], start: int | None, stop: int | None, few: bool
+        self,
+        file: BagFile,
+        topics: Collection[str],
+        start: int | None,
+        stop: int | None,
+        few: bool,
+        scans: bool,
     ) -> Iterator[tuple[int, RawMessage | None]]:
         """Yield the messages of one file after an empty item.
 
@@ -235,19 +244,25 @@ class Recording(Closable):
         if not connections:
             return
         yield file.span[0], None
+        if scans and file in self._datasets:
+            ids, high = [c.id for c in connections], LAST_TIME if stop is None else stop
+            for connection, time, data, scan in self._datasets[file].scans(ids, start or 0, high):
+                yield time, RawMessage(connection.topic, time, data, connection, scan)
+            return
         for connection, time, data in file.messages(connections, start, stop, few):
             yield time, RawMessage(connection.topic, time, data, connection)
 
     def scans(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[RawMessage]:
-        """Yield messages as ``messages`` does, but collect the packets of a LiDAR into one message per scan.
+        """Yield messages as ``messages`` does, but the scans of a data set and of a LiDAR's packets as such.
 
-        A scan is received at the time of its last packet.
+        The packets of a LiDAR become one message per scan, which is received at the time of its last packet.
         """
         single = [topic for topic in topics if topic in self._sensors]
         others = [topic for topic in topics if topic not in self._sensors]
-        parts = [self.messages(others, start, stop), *(self._scans(name, start, stop) for name in single)]
+        messages = self.messages(others, start, stop, scans=True)
+        parts = [messages, *(self._scans(name, start, stop) for name in single)]
         yield from heapq.merge(*parts, key=attrgetter("received"))
 
     def _scans(self, topic: str, start: int | None, stop: int | None) -> Iterator[RawMessage]:
@@ -498,7 +513,9 @@ class Recording(Closable):
         if dataset is None:
             return False
         reader = DatasetReader(dataset)
-        self.files.append(BagFile(folder, dataset.about, lambda: reader))
+        file = BagFile(folder, dataset.about, lambda: reader)
+        self.files.append(file)
+        self._datasets[file] = reader
         self.single_frames |= dataset.single_frames
         self.is_dataset = True
         self.sample_stamps |= dataset.sample_stamps

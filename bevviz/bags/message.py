@@ -33,7 +33,7 @@ class RawMessage:
         received: log time in nanoseconds.
         data: serialised message, possibly compressed with zstd.
         connection: connection that recorded the message.
-        scan: scan made of packets, in place of ``data``; see ``Recording.scans``.
+        scan: scan made of packets or of a file, in place of ``data``; see ``Recording.scans``.
     """
 
     topic: str

@@ -8,11 +8,13 @@ import struct
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.datasets.cloud_files import (
@@ -24,15 +26,23 @@ from bevviz.datasets.cloud_files import (
     read_bytes,
 )
 from bevviz.errors import UserError, first_line
+from bevviz.messages.clouds import LayoutError, make_cloud
+from bevviz.messages.decoders import MessageError, Scan
 from bevviz.messages.definitions import typestore
-from bevviz.messages.encode import encode_compressed_image, encode_intrinsics, encode_transforms
-from bevviz.model.frame import F64, I64, Intrinsics
+from bevviz.messages.encode import (
+    encode_cloud,
+    encode_compressed_image,
+    encode_intrinsics,
+    encode_transforms,
+)
+from bevviz.model.frame import F64, I64, Cloud, Intrinsics
 from bevviz.support.files import LFS_HINT, TABLE_LIMIT, read_lines
 
 SECOND = 1_000_000_000
 MAP, BASE = "map", "base_link"  # frames of the world and of the vehicle
 MAX_POINTER_BYTES = 1024  # bytes of a pointer file, by the specification of Git LFS
 FIELDS = ("x", "y", "z", "intensity")
+POINTS = "sensor_msgs/msg/PointCloud2"
 BOXES = "bevviz_msgs/msg/Detection3DArray"
 HIDDEN = re.compile(r"\.|__MACOSX$")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
@@ -71,9 +81,10 @@ class Stream:
         topic: name that a driver would give it. So roles are found as in a bag.
         type: ROS 2 type of the messages.
         times: (N,) sorted stamps in nanoseconds. The header of a message has the same stamp.
-        make: makes the message of a row of ``times`` with ``bevviz.messages.encode``. May raise UserError.
+        make: makes a row of ``times``: a ``Cloud``, or a message of another type with
+            ``bevviz.messages.encode``. May raise UserError.
         aside: reason why the topic gets no role by default; empty: it gets one.
-        files: cloud file of each message, for clouds that may be cut.
+        cut: reason by row why a part of the points is missing, of the rows made so far.
     """
 
     topic: str
@@ -81,7 +92,7 @@ class Stream:
     times: I64
     make: Callable[[int], Any]
     aside: str = ""
-    files: Sequence[Path] = ()
+    cut: dict[int, str] = field(default_factory=dict)
 
 
 class Dataset:
@@ -226,6 +237,36 @@ class Dataset:
         return sequences[0]
 
 
+def cloud_stream(
+    topic: str,
+    frame_id: str,
+    times: I64,
+    read: Callable[[int], tuple[NDArray[np.void], int]],
+    files: Sequence[Path] = (),
+) -> Stream:
+    """Return the stream of a LiDAR's scans.
+
+    Args:
+        topic: topic of the scans.
+        frame_id: frame of the points.
+        times: (N,) sorted stamps in nanoseconds.
+        read: returns the (N,) structured points of a row, and the number that its file announces, else 0.
+        files: file of each row, where a file may be cut.
+    """
+    cut = dict[int, str]()
+
+    def make(row: int) -> Cloud:
+        points, announced = read(row)
+        if files and announced > len(points):
+            cut[row] = f"{files[row]}: is cut: {len(points)} of {announced} points are there"
+        try:
+            return make_cloud(int(times[row]), frame_id, points, announced)
+        except LayoutError as error:
+            raise UserError(f"{topic}: {error}") from None
+
+    return Stream(topic, POINTS, times, make, cut=cut)
+
+
 def image_stream(
     camera: str, times: I64, files: Sequence[Path], *, rectified: bool = True, aside: str = ""
 ) -> Stream:
@@ -327,6 +368,7 @@ def describe_unread(folder: Path) -> str:
 
 
 LAST_TIME = 2**63 - 1  # nanoseconds
+T = TypeVar("T")
 
 
 class DatasetReader:
@@ -340,8 +382,8 @@ class DatasetReader:
             for number, stream in enumerate(self._streams)
         )
         self.compression = ""
-        # By stream: reason for each row without a message, and for each row with a part of its points.
-        self._lost, self._cut = defaultdict[int, dict[int, str]](dict), defaultdict[int, dict[int, str]](dict)
+        # By stream: reason for each row without a message.
+        self._lost = defaultdict[int, dict[int, str]](dict)
 
     @property
     def span(self) -> tuple[int, int]:
@@ -357,7 +399,8 @@ class DatasetReader:
     def warnings(self) -> list[str]:
         """Warnings of the data set, unreadable files and cut files."""
         sentences = [*self._dataset.warnings]
-        for reasons, description in ((self._lost, "cannot be read"), (self._cut, "are cut")):
+        cut = {number: stream.cut for number, stream in enumerate(self._streams) if stream.cut}
+        for reasons, description in ((self._lost, "cannot be read"), (cut, "are cut")):
             for number, rows in reasons.items():
                 stream, first = self._streams[number], rows[min(rows)]
                 several = f"{stream.topic}: {len(rows)} of {len(stream.times)} {description}; the first: "
@@ -371,6 +414,24 @@ class DatasetReader:
 
         An unreadable file gives an empty message and a line in ``warnings``.
         """
+        for number, row, stamp in self._rows(ids, start, stop):
+            yield self.connections[number], stamp, self._serialized(number, row)
+
+    def scans(
+        self, ids: Collection[int], start: int, stop: int
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview, Scan | None]]:
+        """Yield messages as ``messages`` does, but clouds as scans with no data.
+
+        A file is read when its scan is decoded. It gives its cloud without a message.
+        """
+        for number, row, stamp in self._rows(ids, start, stop):
+            if self._streams[number].type == POINTS:
+                yield self.connections[number], stamp, b"", Scan(stamp, partial(self._cloud, number, row))
+            else:
+                yield self.connections[number], stamp, self._serialized(number, row), None
+
+    def _rows(self, ids: Collection[int], start: int, stop: int) -> Iterator[tuple[int, int, int]]:
+        """Yield stream, row and stamp of each message with start <= stamp < stop in order of stamp."""
         times, numbers, rows = list[I64](), list[I64](), list[I64]()
         for number in sorted(ids):
             first, last = np.searchsorted(self._streams[number].times, [start, stop])
@@ -379,23 +440,40 @@ class DatasetReader:
             rows.append(np.arange(first, last, dtype=np.int64))
         stamps, stream_of, row_of = (np.concatenate(parts) for parts in (times, numbers, rows))
         for i in np.lexsort((row_of, stream_of, stamps)).tolist():
-            stream, at_row = self._streams[int(stream_of[i])], int(row_of[i])
-            data: bytes | memoryview = b""
-            try:
-                message = stream.make(at_row)
-                data = typestore().serialize_cdr(message, stream.type)
-            except UserError as error:
-                self._lost[int(stream_of[i])][at_row] = str(error)
-            except NOT_AS_DOCUMENTED as error:
-                self._dataset.warn(
-                    f"{stream.topic}: not as {self._dataset.about} is documented ({describe_error(error)})"
-                )
-            else:
-                if stream.files and (whole_points := len(message.data) // message.point_step) < message.width:
-                    self._cut[int(stream_of[i])][at_row] = (
-                        f"{stream.files[at_row]}: is cut: {whole_points} of {message.width} points are there"
-                    )
-            yield self.connections[int(stream_of[i])], int(stamps[i]), data
+            yield int(stream_of[i]), int(row_of[i]), int(stamps[i])
+
+    def _serialized(self, number: int, row: int) -> bytes | memoryview:
+        """Return the message of a row; empty if it cannot be made."""
+
+        def serialized(made: Any) -> bytes | memoryview:
+            message = encode_cloud(made) if isinstance(made, Cloud) else made
+            return typestore().serialize_cdr(message, self._streams[number].type)
+
+        return self._read(number, row, serialized) or b""
+
+    def _cloud(self, number: int, row: int) -> Cloud:
+        """Return the cloud of a row.
+
+        Raises:
+            MessageError: it cannot be made. ``warnings`` says why.
+        """
+        cloud = self._read(number, row, lambda made: made)
+        if not isinstance(cloud, Cloud):
+            raise MessageError(f"{self._streams[number].topic}: a scan cannot be read")
+        return cloud
+
+    def _read(self, number: int, row: int, convert: Callable[[Any], T]) -> T | None:
+        """Make a row and convert it; None, and a line in ``warnings``, if it cannot be made."""
+        try:
+            return convert(self._streams[number].make(row))
+        except UserError as error:
+            self._lost[number][row] = str(error)
+        except NOT_AS_DOCUMENTED as error:
+            self._dataset.warn(
+                f"{self._streams[number].topic}: not as {self._dataset.about} is documented "
+                f"({describe_error(error)})"
+            )
+        return None
 
     def times(self, ids: Collection[int], start: int = 0, stop: int = LAST_TIME) -> I64:
         """Return the sorted log times of the connections ``ids`` with start <= time < stop."""

@@ -6,10 +6,12 @@ import csv
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevviz.config.files import parse_yaml
 from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_cloud, why_no_points
@@ -18,6 +20,7 @@ from bevviz.datasets.dataset import (
     IMAGES,
     Dataset,
     Stream,
+    cloud_stream,
     describe_unread,
     files_in,
     frame_stamps,
@@ -30,7 +33,6 @@ from bevviz.datasets.dataset import (
 )
 from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
 from bevviz.errors import UserError
-from bevviz.messages.encode import encode_points
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
 from bevviz.support.extensions import load, registered
@@ -163,7 +165,8 @@ class Folder(Dataset):
             if has_base:
                 pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
                 edges.append((BASE, name, pose))
-            streams.append(_cloud_stream(name, times, files, fields))
+            read = partial(_read_row, files, fields)
+            streams.append(cloud_stream(f"/{name}/points", name, times, read, files))
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _with_found(
@@ -497,9 +500,5 @@ def _in_order(files: Sequence[Path], stamped: Mapping[Path, int]) -> tuple[list[
     return ordered, np.array([stamped[file] for file in ordered], np.int64)
 
 
-def _cloud_stream(name: str, times: I64, files: Sequence[Path], fields: Sequence[str]) -> Stream:
-    def make(row: int) -> Any:
-        points, announced = read_cloud(files[row], fields)
-        return encode_points(int(times[row]), name, points, announced)
-
-    return Stream(f"/{name}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
+def _read_row(files: Sequence[Path], fields: Sequence[str], row: int) -> tuple[NDArray[np.void], int]:
+    return read_cloud(files[row], fields)

@@ -164,11 +164,11 @@ def _nothing() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One scan made of packets. It is decoded when a frame takes it, maybe in another process.
+    """One scan made of packets, or of a file of a data set. It is decoded when a frame takes it.
 
     Attributes:
         received: time of receipt of its last packet, nanoseconds.
-        decode: decodes its packets. It can be pickled.
+        decode: decodes its packets or its file.
     """
 
     received: int
@@ -176,7 +176,7 @@ class Scan:
 
 
 def decode_scan(scan: Scan) -> Cloud:
-    """Decode the packets of a scan."""
+    """Return the cloud of a scan."""
     return scan.decode()
 
 

@@ -19,13 +19,13 @@ Hypotheses = Sequence[tuple[str, float]]  # class and score; the first one is th
 
 
 def encode_cloud(cloud: Cloud) -> Any:
-    """Make a sensor_msgs/PointCloud2 with all fields of a cloud."""
+    """Make a sensor_msgs/PointCloud2 with all fields of a cloud. It announces the dropped points, too."""
     columns = dict(zip("xyz", cloud.xyz.T, strict=True)) | dict(cloud.fields)
     layout = np.dtype([(name, values.dtype) for name, values in columns.items()], align=True)
     points = np.zeros(len(cloud.xyz), layout)
     for name, values in columns.items():
         points[name] = values
-    return encode_points(cloud.stamp, cloud.frame_id, points)
+    return encode_points(cloud.stamp, cloud.frame_id, points, len(points) + cloud.dropped)
 
 
 def encode_points(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Any:

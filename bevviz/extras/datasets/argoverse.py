@@ -13,6 +13,7 @@ from bevviz.datasets.dataset import (
     BASE,
     Dataset,
     Stream,
+    cloud_stream,
     files_in,
     image_stream,
     intrinsics_stream,
@@ -21,7 +22,7 @@ from bevviz.datasets.dataset import (
     subfolders,
 )
 from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import encode_labels, encode_points
+from bevviz.messages.encode import encode_labels
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
 
@@ -206,13 +207,13 @@ def _intrinsics(table: Table, row: int) -> Intrinsics:
 def _clouds(times: I64, files: Sequence[Path]) -> Stream:
     """Return the stream of scans. ``time`` is in seconds after the stamp."""
 
-    def make(row: int) -> Any:
+    def read(row: int) -> tuple[NDArray[np.void], int]:
         table = _read(files[row], ("x", "y", "z"), ("intensity", "laser_number", "offset_ns"))
         names = [name for name in FIELDS if name in table]
         kinds = [(FIELDS[name], FORMATS.get(FIELDS[name], "<f4")) for name in names]
         points = np.empty(len(table["x"]), kinds)
         for name in names:
             points[FIELDS[name]] = table[name] * 1e-9 if name == "offset_ns" else table[name]
-        return encode_points(int(times[row]), BASE, points)
+        return points, 0
 
-    return Stream("/lidar/points", "sensor_msgs/msg/PointCloud2", times, make)
+    return cloud_stream("/lidar/points", BASE, times, read)

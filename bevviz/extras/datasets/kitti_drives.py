@@ -23,6 +23,7 @@ from bevviz.datasets.dataset import (
     SECOND,
     Dataset,
     Stream,
+    cloud_stream,
     files_in,
     frame_stamps,
     image_stream,
@@ -44,7 +45,7 @@ from bevviz.extras.datasets.kitti_files import (
     read_tracklets,
     rectified_camera,
 )
-from bevviz.messages.encode import encode_labels, encode_points, encode_transforms
+from bevviz.messages.encode import encode_labels, encode_transforms
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 from bevviz.support.files import read_lines
@@ -520,13 +521,13 @@ def _cloud_stream(
 ) -> Stream:
     """Return the stream of scans. ``label`` returns the labels of a row with a number of points."""
 
-    def make(row: int) -> Any:
+    def read(row: int) -> tuple[NDArray[np.void], int]:
         points, announced = read_cloud(files[row], fields)
         if label is not None:
             points = append_fields(points, "label", label(row, len(points)), usemask=False)
-        return encode_points(int(times[row]), LIDAR, points, announced)
+        return points, announced
 
-    return Stream(CLOUDS, "sensor_msgs/msg/PointCloud2", times, make)
+    return cloud_stream(CLOUDS, LIDAR, times, read)
 
 
 def _truth_stream(message_type: str, times: I64, label: Callable[[int], LabelledBoxes3D]) -> Stream:

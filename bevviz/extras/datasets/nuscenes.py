@@ -24,13 +24,14 @@ from bevviz.datasets.dataset import (
     MAP,
     Dataset,
     Stream,
+    cloud_stream,
     image_stream,
     intrinsics_stream,
     mounting_stream,
     pose_stream,
 )
 from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import encode_labels, encode_points
+from bevviz.messages.encode import encode_labels
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
@@ -182,11 +183,11 @@ class NuScenes(Dataset):
         fields = self.column_names(files, FIELDS)
         self.check_sizes([file for file in files if file.suffix == ".bin"], 4 * len(fields))
 
-        def make(row: int) -> Any:
+        def read(row: int) -> tuple[NDArray[np.void], int]:
             points, announced = read_cloud(files[row], fields)
-            return encode_points(int(times[row]), channel, _rotate(points, turns), announced)
+            return _rotate(points, turns), announced
 
-        return Stream(f"/{channel}/points", "sensor_msgs/msg/PointCloud2", times, make, files=files)
+        return cloud_stream(f"/{channel}/points", channel, times, read, files)
 
     def _images(
         self, channel: str, times: I64, files: Sequence[Path], calibration: Record

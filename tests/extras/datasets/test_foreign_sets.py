@@ -9,7 +9,6 @@ import pytest
 
 from bevviz.datasets import open_dataset
 from bevviz.extras.datasets.kitti_drives import CLOUDS
-from bevviz.messages.clouds import decode_cloud
 from tests.support.datasets import LFS_POINTER, TR, kitti_odometry, kitti_raw, nuscenes
 
 
@@ -37,7 +36,7 @@ def test_kitti_folders_with_further_columns(columns: int, tmp_path: Path) -> Non
     drive = open_dataset(folder)
     assert drive
     (stream,) = [stream for stream in drive.streams if stream.type == "sensor_msgs/msg/PointCloud2"]
-    points = decode_cloud(stream.make(0), CLOUDS, 0)
+    points = stream.make(0)
     np.testing.assert_array_equal(points.xyz, scan[:, :3])
     assert any(f"{columns} columns of float32" in line for line in drive.warnings) == (columns > 4)
 
@@ -70,7 +69,7 @@ def test_tables_of_nuscenes_with_other_scans(kind: str, tmp_path: Path) -> None:
     drive = open_dataset(root, sequence="scene-0061")
     assert drive
     (stream,) = [stream for stream in drive.streams if stream.type == "sensor_msgs/msg/PointCloud2"]
-    points = decode_cloud(stream.make(0), "", 0)
+    points = stream.make(0)
     np.testing.assert_array_equal(points.xyz, scan[:, [1, 0, 2]] * [1, -1, 1])
     assert any("4 columns of float32" in line for line in drive.warnings) == (kind == "four")
 
