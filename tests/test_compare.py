@@ -38,7 +38,7 @@ from bevviz.pipeline.session import Session, Variants, check_same_frames, withou
 from bevviz.pipeline.stage_log import Memo
 from bevviz.recording import entities
 from bevviz.stages import detector
-from tests.support import bags, documented_json
+from tests.support import bags, documented_json, kept_drives
 from tests.support.recordings import Recording, verify
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -434,7 +434,7 @@ def test_without_a_detector_it_is_not_said_that_nothing_differs(demo: str, capsy
 
 def test_both_views_follow_the_robot(demo: str) -> None:
     """The eye of each is fixed to its own LiDAR, and both LiDARs go the same way."""
-    scene = SyntheticSource(frames=1).scene
+    scene = kept_drives.scene()
     one, other = side_space(scene, ""), side_space(scene, entities.B)
     origins = [str(view.origin) for view in (one, other)]
     assert origins == ["/world/rslidar", "/b/world/rslidar"]

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.config import FusionConfig, load
-from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.decisions import mask_evidence
 from bevviz.model.frame import F32, Bool
 from bevviz.model.results import Detections, FrameResult, Fusion, Masks
@@ -23,6 +22,7 @@ from bevviz.report.fingerprints import digest, pack, unpack
 from bevviz.stages.clustering import cluster
 from bevviz.stages.fusion import fuse
 from bevviz.stages.mask_lookup import is_covered
+from tests.support import kept_drives
 from tests.support.fusion_scenes import (
     CAMERA,
     CAMERA_FROM_LIDAR,
@@ -109,7 +109,7 @@ def test_outlines_are_where_the_masks_are(tmp_path: Path) -> None:
 
 
 def test_a_report_has_the_masks() -> None:
-    frame = SyntheticSource(frames=1).snapshot(0).frame
+    frame = kept_drives.frame(0)
     image = frame.cameras[0].image
     result = replace(project_to_camera(POINTS, SEGMENTED), camera=replace(frame.cameras[0], name="front"))
     assert image is not None

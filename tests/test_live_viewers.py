@@ -10,7 +10,6 @@ import pytest
 
 import bevviz
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.runtime import Live, Outputs
@@ -20,6 +19,7 @@ from bevviz.recording import entities
 from bevviz.workbench.buffers import PageState
 from bevviz.workbench.live_buffer import AHEAD, WHOLE
 from bevviz.workbench.running_robot import RunningRobot
+from tests.support import kept_drives
 from tests.support.live_sessions import live_bench
 from tests.support.recordings import Recording
 from tests.support.replay import Replay
@@ -128,7 +128,7 @@ def test_what_a_page_was_too_slow_for_is_counted(bench: RunningRobot, results: l
 
 
 def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None:
-    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    source = Replay([result.frame for result in results], kept_drives.scene())
     settings = ReloadableConfig(None, ["detector.model=demo", "live.viewer_rate=1"])
     live = Live(source, settings, Outputs(), Notes(lambda line: None))
     with RunningRobot(live) as bench:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
-from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Frame
 from bevviz.pipeline.session import Session
+from tests.support import kept_drives
 
 
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    return SyntheticSource(frames=10).snapshot(5).frame
+    return kept_drives.frame()
 
 
 @pytest.mark.parametrize("preset", ["default", "reference"])

@@ -18,7 +18,6 @@ import pytest
 
 from bevviz.cli import main
 from bevviz.config import load
-from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
 from bevviz.pipeline import result_store
@@ -27,6 +26,7 @@ from bevviz.pipeline.result_store import ResultStore, StoredDetector, open_store
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector.session import NetworkSession
 from bevviz.support import progress
+from tests.support import kept_drives
 from tests.support.onnx_networks import answer, image_input
 from tests.support.small_disk import small_disk
 
@@ -55,7 +55,7 @@ def lines() -> Iterator[list[str]]:
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    return list(SyntheticSource(2))
+    return list(kept_drives.frames()[:2])
 
 
 def detections(frame: Frame, *settings: str, model: str = "demo", stored: bool = True) -> Detections:

@@ -45,6 +45,7 @@ from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.trials import trial_effects
+from tests.support import kept_drives
 from tests.support.recordings import Recording
 
 Drive = list[tuple[FrameResult, LabelledBoxes3D]]
@@ -424,7 +425,7 @@ def foreign() -> FrameResult:
 
 
 def recorded(path: Path, result: FrameResult) -> Recording:
-    scene = SyntheticSource(frames=1).scene
+    scene = kept_drives.scene()
     with open_recording(scene, result.config, save=path) as sinks:
         logger = FrameLogger(sinks.recording, result.config, scene)
         logger.log_static()

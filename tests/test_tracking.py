@@ -20,6 +20,7 @@ from bevviz.model.frame import F32, F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.results import Clusters, Objects, Tracks
 from bevviz.pipeline.session import Session
 from bevviz.stages.tracking import Tracker
+from tests.support import kept_drives
 from tests.support.track_metrics import IdentityCounter, Tallies, TrackTally, Truth, add_tracks, truth_of
 from tests.support.tracking_scenes import CAR, PERSON, scene
 
@@ -371,7 +372,7 @@ def of_truth(index: int, stated: LabelledBoxes3D) -> tuple[Frame, Clusters, Obje
 
 @pytest.fixture(scope="module")
 def drive() -> list[Frame]:
-    return list(SyntheticSource(frames=4))
+    return list(kept_drives.frames()[:4])
 
 
 def test_the_pipeline_runs_the_tracker(drive: list[Frame]) -> None:

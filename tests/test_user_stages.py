@@ -39,7 +39,7 @@ from bevviz.model.results import ClusterState, DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.stages import user_stages
 from bevviz.stages.robot_results import detect
-from tests.support import bags
+from tests.support import bags, kept_drives
 from tests.support.modules import forget_modules
 from tests.support.waiting import PATIENCE
 
@@ -149,7 +149,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    return SyntheticSource(frames=10).snapshot(5).frame
+    return kept_drives.frame()
 
 
 def configured(*settings: str) -> Config:

@@ -8,13 +8,13 @@ from contextlib import contextmanager
 
 from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live, Outputs
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.workbench.running_robot import RunningRobot
+from tests.support import kept_drives
 from tests.support.replay import Replay
 
 
@@ -52,7 +52,7 @@ def live_bench(
     for message in messages:
         assert raw is not None
         raw.put(RecordedMessage(message.connection, message.received, message.received, bytes(message.data)))
-    source = Replay([result.frame for result in results], SyntheticSource(frames=1).scene)
+    source = Replay([result.frame for result in results], kept_drives.scene())
     live = Live(
         source,
         values,

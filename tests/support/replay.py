@@ -35,7 +35,7 @@ class Replay:
     def __init__(
         self, frames: Sequence[Frame], scene: Scene, *, rate: float = 10.0, total: int | None = None
     ) -> None:
-        self.scene = scene
+        self.scene = replace(scene, bag=(), topics=())  # A robot has no bag.
         self.total = total
         self.warnings: tuple[str, ...] = ()
         self._frames = [*frames, *frames[-2:0:-1]]
