@@ -111,7 +111,7 @@ def end_to_end(path: Path) -> str:
 def samples(folder: Path) -> list[tuple[Path, Case]]:
     """Write the sound models; returns each file with the case that loads it."""
     from bevviz.stages.detector import DEMO_MODEL
-    from tests.extras.pillars.networks import Reference, autoware, settings_of
+    from tests.support.pillar_networks import Reference, autoware, settings_of
 
     found = []
     for write in (detector, end_to_end):

@@ -15,9 +15,9 @@ from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import session
-from tests.extras.pillars.networks import autoware, settings_of
 from tests.support import onnx_networks
 from tests.support.onnx_networks import FLOAT, loop
+from tests.support.pillar_networks import autoware, settings_of
 
 
 def refused_3d(parameters: dict[str, Any]) -> str:

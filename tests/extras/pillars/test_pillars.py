@@ -30,7 +30,9 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.rotated_boxes import survivors
 from bevviz.workbench.page_messages import controls
-from tests.extras.pillars.networks import (
+from tests.support import kept_drives
+from tests.support.onnx_networks import FLOAT, node, save
+from tests.support.pillar_networks import (
     HIGH_Z,
     INPUTS,
     LOW,
@@ -42,8 +44,6 @@ from tests.extras.pillars.networks import (
     network,
     settings_of,
 )
-from tests.support import kept_drives
-from tests.support.onnx_networks import FLOAT, node, save
 
 HEADS = ("openpcdet_anchors", "openpcdet_centers", "mmdetection3d_anchors", "mmdetection3d_centers")
 CLOUD = np.random.default_rng(0).uniform((0, -8, -3), (24, 8, 1), (500, 3)).astype(np.float32)
