@@ -165,8 +165,8 @@ class Folder(Dataset):
             if has_base:
                 pose = self._pose(stated["pose"], name) if "pose" in stated else np.eye(4)
                 edges.append((BASE, name, pose))
-            read = partial(_read_row, files, fields)
-            streams.append(cloud_stream(f"/{name}/points", name, times, read, files))
+            read_row = partial(_read_row, files, fields)
+            streams.append(cloud_stream(f"/{name}/points", name, times, read_row, files))
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _with_found(
