@@ -12,7 +12,7 @@ from bevviz.datasets.cloud_files import read_cloud
 from bevviz.datasets.kitti_labels import read_labels
 from bevviz.errors import UserError
 from bevviz.messages.detections import decode_detections_3d
-from bevviz.messages.encode import encode_labels
+from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
 from bevviz.model.geometry import inverse, transform, transform_boxes
 from tests.support.datasets import LFS_POINTER, TR
@@ -103,7 +103,7 @@ def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:
     there = np.array([[10.11, -3.22, 0.5], [25.33, 4.44, 1.0]])
     stated = there @ map_from_points[:3, :3].T + map_from_points[:3, 3]
     sizes, turns = np.ones((2, 3), np.float32), np.zeros(2, np.float32)
-    msg = encode_labels(0, "map", Boxes3D(stated, sizes, turns), ["car", "car"], ["1", "2"])
+    msg = encode_boxes_3d(0, "map", Boxes3D(stated, sizes, turns), [[("car", 1.0)]] * 2)
     boxes = transform_boxes(decode_detections_3d(msg, "/boxes", 0).boxes, inverse(map_from_points))
     assert boxes.center.dtype == np.float32
     np.testing.assert_allclose(boxes.center, there, atol=1e-4)

@@ -43,7 +43,6 @@ MAP, BASE = "map", "base_link"  # frames of the world and of the vehicle
 MAX_POINTER_BYTES = 1024  # bytes of a pointer file, by the specification of Git LFS
 FIELDS = ("x", "y", "z", "intensity")
 POINTS = "sensor_msgs/msg/PointCloud2"
-BOXES = "bevviz_msgs/msg/Detection3DArray"
 HIDDEN = re.compile(r"\.|__MACOSX$")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 

@@ -81,7 +81,7 @@ def decode_detections_3d(msg: Any, topic: str, received: int) -> LabelledBoxes3D
 
 
 def _image_labels(msg: Any, usable: Bool) -> ImageLabels | None:
-    """Return the labels of the image, see ``encode_labels``; None if the message has none."""
+    """Return the labels of the image in a bevviz_msgs/Detection3DArray; None if the message has none."""
     if not hasattr(msg, "image_boxes") or len(msg.truncated) != len(usable):
         return None
     return ImageLabels(

@@ -13,7 +13,7 @@ from rosbags.interfaces import Nodetype
 
 from bevviz.messages.definitions import typestore
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image, ImageLabels, Intrinsics
+from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image, Intrinsics
 
 Hypotheses = Sequence[tuple[str, float]]  # class and score; the first one is that of the box itself
 
@@ -161,44 +161,6 @@ def encode_boxes_3d(
         detection = make_message("vision_msgs/msg/Detection3D", header=about, results=kept, bbox=box, id=name)
         detections.append(detection)
     return make_message("vision_msgs/msg/Detection3DArray", header=about, detections=detections)
-
-
-def encode_labels(
-    stamp: int,
-    frame_id: str,
-    boxes: Boxes3D,
-    labels: Sequence[str],
-    ids: Sequence[str] = (),
-    image: ImageLabels | None = None,
-    unusable: Sequence[str] = (),
-) -> Any:
-    """Make a message of labelled boxes.
-
-    It is a Detection3DArray of vision_msgs, or of bevviz_msgs if there is an ``image``.
-
-    Args:
-        stamp: nanoseconds.
-        frame_id: frame of the header.
-        boxes: labelled boxes.
-        labels: class of each box.
-        ids: id of each box; empty: the boxes have none.
-        image: labels in the image; None: there are none.
-        unusable: a sentence for each label that was left out. It is written only with an ``image``.
-    """
-    results = [[(label, 1.0)] for label in labels]
-    message = encode_boxes_3d(stamp, frame_id, boxes, results, ids=ids)
-    if image is None:
-        return message
-    return make_message(
-        "bevviz_msgs/msg/Detection3DArray",
-        header=message.header,
-        detections=message.detections,
-        image_boxes=image.xyxy.astype(np.float32).reshape(-1),
-        truncated=image.truncated.astype(np.float32),
-        occluded=image.occluded.astype(np.int32),
-        dont_care=image.dont_care.astype(np.float32).reshape(-1),
-        unusable=list(unusable),
-    )
 
 
 def encode_markers(

@@ -22,9 +22,9 @@ from bevviz.datasets.dataset import (
     subfolders,
 )
 from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import encode_labels
+from bevviz.extras.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.model import geometry
-from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
+from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 
 LIDAR, CAMERAS = "sensors/lidar", "sensors/cameras"
 MOUNTING, LENSES = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
@@ -131,7 +131,7 @@ class Argoverse2(Dataset):
         stamps = table["timestamp_ns"].astype(np.int64)
         times = np.unique(stamps)
 
-        def make(number: int) -> Any:
+        def label(number: int) -> LabelledBoxes3D:
             rows = np.flatnonzero(stamps == times[number])
             boxes = Boxes3D(
                 np.stack([table[name][rows] for name in POSITION], axis=1),
@@ -141,9 +141,9 @@ class Argoverse2(Dataset):
             names = [str(table["category"][row]) for row in rows]
             labels = [CLASSES.get(name, name.lower()) for name in names]
             ids = [str(table["track_uuid"][row]) for row in rows]
-            return encode_labels(int(times[number]), BASE, boxes, labels, ids)
+            return truth_boxes(boxes, labels, ids)
 
-        yield Stream("/ground_truth", "vision_msgs/msg/Detection3DArray", times, make)
+        yield truth_stream(times, BASE, label)
 
 
 def _logs(path: Path) -> list[Path]:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from bevviz.datasets.cloud_files import read_cloud, read_points
 from bevviz.datasets.dataset import (
-    BOXES,
     IMAGES,
     MAP,
     SECOND,
@@ -35,6 +34,7 @@ from bevviz.datasets.dataset import (
 )
 from bevviz.datasets.kitti_labels import Calibration, named_rows, read_labels
 from bevviz.errors import UserError
+from bevviz.extras.datasets.ground_truth import BOXES_WITH_IMAGE, truth_boxes, truth_stream
 from bevviz.extras.datasets.kitti_files import (
     boxes_of,
     poses_of_oxts,
@@ -45,7 +45,7 @@ from bevviz.extras.datasets.kitti_files import (
     read_tracklets,
     rectified_camera,
 )
-from bevviz.messages.encode import encode_labels, encode_transforms
+from bevviz.messages.encode import encode_transforms
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 from bevviz.support.files import read_lines
@@ -138,7 +138,12 @@ class KittiObject(Dataset):
                 self.streams += _camera_streams(camera, number, times[rows], rows, images, calibration)
         if labels:
             self.streams.append(
-                _truth_stream(BOXES, times[with_labels], lambda row: read_labels(labels[row], calibrations))
+                truth_stream(
+                    times[with_labels],
+                    LIDAR,
+                    lambda row: read_labels(labels[row], calibrations),
+                    BOXES_WITH_IMAGE,
+                )
             )
         self.streams.append(_cloud_stream(times, scans, fields))
 
@@ -265,7 +270,7 @@ class KittiTracking(Dataset):
         self.streams = _sensor_streams(int(times[0]), cameras, poses)
         if (labels := root / f"label_02/{name}.txt").is_file():
             label = read_tracked_labels(labels, calibration.rectified_from_lidar)
-            self.streams.append(_truth_stream(BOXES, times, lambda row: label(numbers[row])))
+            self.streams.append(truth_stream(times, LIDAR, lambda row: label(numbers[row]), BOXES_WITH_IMAGE))
         self.streams.append(_cloud_stream(times, scans, fields))
 
 
@@ -323,7 +328,7 @@ class KittiOdometry(Dataset):
             return boxes_of(label_files[row], points, label(with_labels[row], len(points)))
 
         self.streams += [
-            _truth_stream("vision_msgs/msg/Detection3DArray", times[with_labels], objects),
+            truth_stream(times[with_labels], LIDAR, objects),
             _cloud_stream(times, scans, fields, label),
         ]
 
@@ -399,12 +404,12 @@ class KittiRaw(Dataset):
         tracklets = folder / "tracklet_labels.xml"
         if tracklets.is_file():
             labelled = read_tracklets(tracklets)
-            none = LabelledBoxes3D(str(tracklets), 0, "", Boxes3D.empty(), (), np.zeros(0, np.float32))
+            none = truth_boxes(Boxes3D.empty(), (), (), str(tracklets))
 
             def label(row: int) -> LabelledBoxes3D:
                 return labelled.get(_number(scans[row]), none)
 
-            self.streams.append(_truth_stream("vision_msgs/msg/Detection3DArray", times, label))
+            self.streams.append(truth_stream(times, LIDAR, label))
         self.streams.append(_cloud_stream(times, scans, fields))
 
 
@@ -528,14 +533,3 @@ def _cloud_stream(
         return points, announced
 
     return cloud_stream(CLOUDS, LIDAR, times, read)
-
-
-def _truth_stream(message_type: str, times: I64, label: Callable[[int], LabelledBoxes3D]) -> Stream:
-    """Return the stream of ground truth in the LiDAR frame. ``label`` returns the labels of a row."""
-
-    def make(row: int) -> Any:
-        labels = label(row)
-        details = labels.labels, labels.ids, labels.image, labels.unusable
-        return encode_labels(int(times[row]), LIDAR, labels.boxes, *details)
-
-    return Stream("/ground_truth", message_type, times, make)

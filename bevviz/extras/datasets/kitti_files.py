@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bevviz.datasets.cloud_files import read_bytes
 from bevviz.datasets.kitti_labels import labelled_boxes, named_rows, split_projection
 from bevviz.errors import UserError
+from bevviz.extras.datasets.ground_truth import truth_boxes
 from bevviz.model import geometry
 from bevviz.model.class_names import KITTI
 from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D
@@ -84,14 +85,8 @@ def read_tracklets(file: Path) -> dict[int, LabelledBoxes3D]:
         labels, ids, values = zip(*objects, strict=True)
         boxed = np.array(values, np.float32)
         boxes = Boxes3D(boxed[:, :3], boxed[:, 3:6], boxed[:, 6])
-        labels_by_scan[scan] = _labelled(file, boxes, labels, ids)
+        labels_by_scan[scan] = truth_boxes(boxes, labels, ids, str(file))
     return labels_by_scan
-
-
-def _labelled(file: Path, boxes: Boxes3D, labels: Sequence[str], ids: Sequence[str]) -> LabelledBoxes3D:
-    """Return the labels of a file."""
-    scores = np.ones(len(labels), np.float32)
-    return LabelledBoxes3D(str(file), 0, "", boxes, tuple(labels), scores, ids=tuple(ids))
 
 
 def _text(item: Any, name: str) -> str:
@@ -149,7 +144,7 @@ def boxes_of(file: Path, points: Any, labels: Any) -> LabelledBoxes3D:
         np.array(sizes, np.float32).reshape(-1, 3),
         np.array(turns, np.float32),
     )
-    return _labelled(file, boxes, names, ids)
+    return truth_boxes(boxes, names, ids, str(file))
 
 
 # --- calibration -------------------------------------------------------------------------------

@@ -31,10 +31,10 @@ from bevviz.datasets.dataset import (
     pose_stream,
 )
 from bevviz.errors import UserError, first_line
-from bevviz.messages.encode import encode_labels
+from bevviz.extras.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
-from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics
+from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 from bevviz.support import progress
 from bevviz.support.files import open_regular
 
@@ -220,8 +220,8 @@ class NuScenes(Dataset):
         order = sorted((time, sample) for sample, time in key_stamps.items())
         times = np.array([time for time, _ in order], np.int64)
 
-        def make(number: int) -> Any:
-            stamp, sample = order[number]
+        def label(number: int) -> LabelledBoxes3D:
+            _, sample = order[number]
             rows = [
                 (row, categories[instances[row["instance_token"]]["category_token"]])
                 for row in labelled[sample]
@@ -237,9 +237,9 @@ class NuScenes(Dataset):
                 np.array([_yaw(row["rotation"]) for row, _ in labelled_rows], np.float32),
             )
             ids = [row["instance_token"] for row, _ in labelled_rows]
-            return encode_labels(stamp, MAP, boxes, [label for _, label in labelled_rows], ids)
+            return truth_boxes(boxes, [name for _, name in labelled_rows], ids)
 
-        yield Stream("/ground_truth", "vision_msgs/msg/Detection3DArray", times, make)
+        yield truth_stream(times, MAP, label)
 
 
 def _pose_stream(poses: Sequence[Record]) -> Stream:
