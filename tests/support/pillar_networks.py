@@ -14,7 +14,7 @@ from bevviz.extras.pillars.stage import PillarStage
 from bevviz.pipeline.stage_loader import StageLoader
 from tests.support.onnx_networks import FLOAT, INT64, Input, answer, node, save
 
-REFERENCES = Path(__file__).with_name("references")
+REFERENCES = Path(__file__).parents[1] / "extras/pillars/references"
 INPUTS: list[Input] = [
     ("voxels", ["n", 32, 4], FLOAT),
     ("num_points", ["n"], INT64),
