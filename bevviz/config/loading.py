@@ -124,10 +124,11 @@ def load(
             prefix = f"{section}.params."
             stated_params = tree[section].get("params", {})
             for name, file in stated_params.items():
-                layer = layers_in_force.get(f"{prefix}{name}")
+                stating_layer = layers_in_force.get(f"{prefix}{name}")
+                folder = None if stating_layer is None else stating_layer.folder
                 is_file = name in model.model_fields and holds_file(model.model_fields[name])
-                if file and is_file and layer is not None and layer.folder is not None:
-                    stated_params[name] = str(layer.folder / str(file))
+                if file and is_file and folder is not None:
+                    stated_params[name] = str(folder / str(file))
             tree[section]["params"] = model.model_validate(stated_params).model_dump(mode="json")
         prefix = ""
         loaded = Config.model_validate(tree)

@@ -351,8 +351,13 @@ def test_a_frame_has_its_objects_from_the_network(tmp_path: Path, monkeypatch: p
     other = load(base=config, settings=["objects.score_threshold=0.9"])
     frame, loader, memo = kept_drives.frame(0), StageLoader(store=False), Memo()
     stages = [loader.load(each) for each in (config, other)]
-    runs, infer = [], PillarNetwork._infer
-    monkeypatch.setattr(PillarNetwork, "_infer", lambda *args: runs.append(1) or infer(*args))
+    runs, infer = list[int](), PillarNetwork._infer
+
+    def counted(network: PillarNetwork, *cloud: Any) -> Any:
+        runs.append(len(cloud[0]))
+        return infer(network, *cloud)
+
+    monkeypatch.setattr(PillarNetwork, "_infer", counted)
     one, few = (perceive(frame, *each, memo) for each in zip((config, other), stages, strict=True))
 
     assert one.failures == few.failures == ()
@@ -401,13 +406,15 @@ def test_boxes_are_kept_in_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return stage(cloud, 0, 0, "lidar")
 
     plain, first = found("store.size=0"), found()
-    infer = PillarNetwork._infer
-    probe = []
-    monkeypatch.setattr(
-        PillarNetwork, "_infer", lambda self, *args: probe.append(len(args[0])) or infer(self, *args)
-    )
+    runs, infer = set[int](), PillarNetwork._infer
+
+    def counted(network: PillarNetwork, *cloud: Any) -> Any:
+        runs.add(len(cloud[0]))
+        return infer(network, *cloud)
+
+    monkeypatch.setattr(PillarNetwork, "_infer", counted)
     again = found()
-    assert set(probe) <= {PROBE_POINTS}, "the network runs on the cloud no second time"
+    assert runs <= {PROBE_POINTS}, "the network runs on the cloud no second time"
     assert len(first[0]) > 1
     for one in (first, again):
         assert one[0].tobytes() == plain[0].tobytes() and one[1].tobytes() == plain[1].tobytes()
