@@ -73,6 +73,16 @@ def test_a_complete_bag_without_an_index_is_read_to_its_end(tmp_path: Path) -> N
     assert not any(HINT in text or "lost" in text or "broken" in text for text in said)
 
 
+def test_a_message_on_the_cut_page_of_a_database_is_not_given(tmp_path: Path) -> None:
+    path = FORMATS["sqlite3"](tmp_path)
+    data = path.read_bytes()
+    for size in range(len(data) // 2, len(data) // 2 + 4096 * 3, 1500):
+        path.write_bytes(data[:size])
+        found, said = read(path)
+        assert found == whole("sqlite3")[: len(found)] and len(found) > 50
+        assert any(HINT in text for text in said)
+
+
 def test_a_log_beside_a_database_is_named(tmp_path: Path) -> None:
     found, said = read(FORMATS["sqlite3, with a log"](tmp_path))
     assert found == whole("sqlite3")[: len(found)]

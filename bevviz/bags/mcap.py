@@ -32,7 +32,7 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATT
 ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
 FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
 FLAT = 1 << 20  # bytes of messages outside chunks that are read together
-MAX_ATTACHMENT = 1 << 26  # bytes; a larger attachment is not read
+MAX_RECORD = 1 << 26  # bytes; a larger attachment or description is not read
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -155,7 +155,7 @@ def read_attachments(path: Path) -> dict[str, bytes]:
         offset = len(MAGIC)
         while len(head := file.read(offset, RECORD.size)) == RECORD.size:
             opcode, length = RECORD.unpack(head)
-            if opcode == ATTACHMENT and length <= MAX_ATTACHMENT:
+            if opcode == ATTACHMENT and length <= MAX_RECORD:
                 record = file.read(offset + RECORD.size, length)
                 with suppress(struct.error, UnicodeDecodeError):
                     name, media = read_strings(record, 16, 2)
@@ -359,7 +359,7 @@ def walk(file: FileBytes, channels: Channels, report: DamageReport) -> Iterator[
         is_known = opcode in range(HEADER, DATA_END + 1) or opcode >= FIRST_PRIVATE
         if end > file.size or not is_known or (opcode == CHUNK and chunk is None):
             break
-        if opcode in (SCHEMA, CHANNEL):
+        if opcode in (SCHEMA, CHANNEL) and length <= MAX_RECORD:
             with suppress(struct.error):
                 channels.note(opcode, file.read(body, length))
         elif opcode == STATISTICS:

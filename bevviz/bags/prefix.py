@@ -10,6 +10,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import apsw
@@ -20,7 +21,7 @@ from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, ChunkReader, Fi
 from bevviz.bags.damage import EXTRA, DamageReport
 from bevviz.bags.mcap import FORMATS, NO_DEFINITION
 from bevviz.bags.reader import LAST_TIME, FileBytes, Message
-from bevviz.bags.sqlite import log_path, open_database
+from bevviz.bags.sqlite import log_path, open_database, page_size_of
 from bevviz.errors import UserError
 from bevviz.model.frame import I64
 from bevviz.support import progress
@@ -101,6 +102,34 @@ class PrefixChunkReader(ChunkReader):
         return self._known_times[number][connection]
 
 
+class _WholePagesFile(apsw.VFSFile):
+    """Database without its last page if that is cut. sqlite3 would read zeros where its bytes are missing."""
+
+    def xFileSize(self) -> int:  # noqa: N802
+        """Return the size of all whole pages."""
+        size, page = super().xFileSize(), page_size_of(super().xRead(100, 0))
+        return size - size % page if page else size
+
+
+class _WholePages(apsw.VFS):
+    """Access to files for sqlite3 that shows whole pages alone."""
+
+    name = "bevviz whole pages"
+
+    def __init__(self) -> None:
+        super().__init__(self.name, "")
+
+    def xOpen(self, name: str | apsw.URIFilename | None, flags: list[int]) -> _WholePagesFile:  # noqa: N802
+        """Open a file."""
+        return _WholePagesFile("", name, flags)
+
+
+@cache
+def _whole_pages() -> _WholePages:
+    """Register the access once. The cache keeps it, since sqlite3 forgets an access without a reference."""
+    return _WholePages()
+
+
 class PrefixSqliteReader:
     """Reader of the rows of a database up to the damage, by sqlite3 itself. The log beside it is not read.
 
@@ -121,7 +150,7 @@ class PrefixSqliteReader:
         self.report = DamageReport()
         rows = array("q")
         try:
-            self._queries = open_database(public)
+            self._queries = open_database(public, _whole_pages().name)
             self._queries.execute("PRAGMA writable_schema = ON")  # Without it, sqlite3 opens no cut file.
             query = "SELECT id, name, type, serialization_format FROM topics"
             rows_of_topics = list(self._queries.execute(query))

@@ -107,11 +107,15 @@ class SqliteReader:
         self._queries.close()
 
 
-def open_database(public: Path) -> apsw.Connection:
-    """Open a database without its log, so that nothing is written beside it."""
-    return apsw.Connection(
-        f"file:{public}?immutable=1", flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-    )
+def open_database(public: Path, access: str | None = None) -> apsw.Connection:
+    """Open a database without its log, so that nothing is written beside it.
+
+    Args:
+        public: file, under a name without special characters.
+        access: name of a registered VFS; None: that of sqlite3.
+    """
+    flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+    return apsw.Connection(f"file:{public}?immutable=1", flags=flags, vfs=access)
 
 
 def page_size_of(head: bytes) -> int | None:
