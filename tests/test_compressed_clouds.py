@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bevviz.bags.bag import Recording
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config
+from bevviz.config.sections import DetectorConfig
 from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.decoders import MessageError
+from bevviz.report.redact import Redactor
 from tests.support import bags
 from tests.support.compressed_clouds import compressed, messages, packed, points
 
@@ -64,6 +67,19 @@ def test_a_raw_cloud_is_preferred_to_its_compressed_copy(
     said = " ".join(capsys.readouterr().out.split())
     assert "/points: LiDAR, by type and name" in said
     assert "/points/zstd: not used: the sensor of /points, by its frame or name" in said
+
+
+def test_a_redacted_report_may_keep_a_compressed_cloud_as_it_is(tmp_path: Path) -> None:
+    made = messages()
+    cloud = made.cloud(bags.START, points(0))
+    content = compressed(made, cloud, "zstd", packed("zstd", cloud.data.tobytes()))
+    path = bags.write(tmp_path / "bag", [bags.Item("/points/zstd", COMPRESSED, bags.START, content)], made)
+    with Recording([path]) as recording:
+        message = recording.first("/points/zstd")
+        assert message is not None and recording.deserialize(message).format == "zstd"
+        for patterns, kept in (((), None), (("/points*",), (message.connection, message.content()))):
+            redactor = Redactor(DetectorConfig(model="demo"), recording, unredacted=patterns)
+            assert redactor(message, message.content()) == kept
 
 
 def test_undecodable_clouds_state_the_reason() -> None:

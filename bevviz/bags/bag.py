@@ -385,8 +385,16 @@ class Recording(Closable):
         )
         return decode_message(message, data, partial(self._deserialized, message), serialization)
 
+    def deserialize(self, message: RawMessage) -> Any:
+        """Return a message as its definition has it, also where its type has a decoder.
+
+        Raises:
+            MessageError: the data does not fit the definition, or there is none.
+        """
+        data = guard(message, RawMessage.content, message)
+        return guard(message, partial(self._deserialized, message), data)
+
     def _deserialized(self, message: RawMessage, data: bytes | memoryview) -> Any:
-        """Return the message as its definition has it."""
         connection, msgtype = message.connection, message.type
         store = self.types.store(connection)
         try:
@@ -399,7 +407,7 @@ class Recording(Closable):
             ) from None
 
     def encode(self, message: RawMessage, content: Any) -> memoryview:
-        """Serialise ``content``, a changed result of ``decode``, in the format of ``message``."""
+        """Serialise ``content``, a changed result of ``deserialize``, in the format of ``message``."""
         store, msgtype = self.types.store(message.connection), normalized(message.connection.msgtype)
         if is_ros1(message.connection):
             return store.serialize_ros1(content, msgtype)

@@ -153,7 +153,7 @@ class Redactor:
             contents = self._contents[key] = ImageFinder(msgtype, definitions)
         if not contents.may_show:
             return data
-        content = self._recording.decode(message)
+        content = self._recording.deserialize(message)
         if msgtype in (CLOUD, OLD_CLOUD):
             if guard(message, is_coloured, content):
                 raise MessageError("its points have the colours of a picture")
