@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bevviz.cli import main
+from bevviz.cli import find_commands, main, make_parser
 from bevviz.recording import entities
 from tests.support.recordings import Recording
 from tools import make_reference
@@ -148,12 +148,18 @@ def test_the_page_of_recordings_has_the_entities_of_the_code() -> None:
     assert rows == [entity.row for entity in entities.table().values()]
 
 
+def test_every_command_is_on_a_page() -> None:
+    text = "\n".join(
+        path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    )
+    assert not [name for name in find_commands() if not re.search(rf"bevviz {name}\b", text)]
+
+
 def test_every_command_and_option_on_a_page_exists() -> None:
     """So that a page cannot tell of an option that was renamed."""
-    from bevviz.cli import _parser
     from bevviz.cli.parser import Parser
 
-    program, _ = _parser()
+    program, _ = make_parser(find_commands())
     (commands,) = (a.choices for a in program._actions if isinstance(a, argparse._SubParsersAction))
     wrong = []
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
@@ -163,7 +169,6 @@ def test_every_command_and_option_on_a_page_exists() -> None:
                 continue
             parser = commands.get(words[1], commands["open"])
             assert isinstance(parser, Parser)
-            parser.complete()
             known = parser._option_string_actions
             options = [w.partition("=")[0] for w in words[1:] if re.match(r"--[a-z]", w)]
             wrong += [f"{path.name}: {command}: {o}" for o in options if o not in known]

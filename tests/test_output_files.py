@@ -191,7 +191,7 @@ def test_an_input_is_never_overwritten(capsys: Capture) -> None:
     assert "is what is read" in error_of(capsys, "compare", "drive", f"--json={bag}")
     assert "there is no folder no" in error_of(capsys, "compare", "drive", "--csv", "no/same.txt")
     both = ("--csv", "same.json", "--json", "same.json")
-    assert "--json same.json: --csv writes that file" in error_of(capsys, "compare", "drive", *both)
+    assert "--csv same.json: --json writes that file" in error_of(capsys, "compare", "drive", *both)
     assert bag.read_bytes() == before and Path("my.yaml").read_text().startswith("voxel")
 
 

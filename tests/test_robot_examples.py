@@ -16,7 +16,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from bevviz.cli import _parser
+from bevviz.cli import find_commands, make_parser
+from bevviz.cli.command import make_options
+from bevviz.cli.live import LiveOptions
+from bevviz.cli.options import collect_settings
 from bevviz.config.reloading import ReloadableConfig
 from tests.support.ros_graphs import own_graph
 from tests.support.waiting import PATIENCE
@@ -35,12 +38,10 @@ def unit() -> configparser.ConfigParser:
 
 def settings_of(arguments: list[str]) -> ReloadableConfig:
     """Return the settings of a command line with the configuration file of the example."""
-    options = _parser()[0].parse_args(arguments)
-    assert options.config in (Path("/etc/bevviz/robot.yaml"), CONFIG)
-    given = [*options.set, f"live.nice={options.nice}"]
-    return ReloadableConfig(
-        CONFIG, given if options.flight is None else [*given, f"live.flight_time={options.flight}"]
-    )
+    parser, _ = make_parser(find_commands())
+    options = make_options(LiveOptions, vars(parser.parse_args(arguments)))
+    assert options.config.file in (Path("/etc/bevviz/robot.yaml"), CONFIG)
+    return ReloadableConfig(CONFIG, collect_settings(options))
 
 
 def test_the_systemd_unit_is_valid(tmp_path: Path) -> None:

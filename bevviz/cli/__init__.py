@@ -9,9 +9,9 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bevviz.cli import (
     bag,
@@ -37,6 +37,7 @@ from bevviz.cli import (
     why,
     workbench,
 )
+from bevviz.cli.command import Command, commands_in, make_options
 from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
@@ -47,6 +48,28 @@ from bevviz.support.version import __version__
 if TYPE_CHECKING:
     from logging import Logger
 
+MODULES = (
+    workbench,
+    bag,
+    batch,
+    causes,
+    fix,
+    info,
+    why,
+    compare,
+    evaluate,
+    export,
+    sweep,
+    calib,
+    report,
+    recover,
+    cut,
+    live,
+    config,
+    store,
+    trust,
+    completion,
+)
 EPILOG = """examples:
   bevviz demo                                 the synthetic drive, in the viewer
   bevviz drive.mcap --model yolo11n.onnx      the workbench: a page where a click on anything answers why
@@ -96,22 +119,27 @@ def _main(arguments: Sequence[str] | None) -> int:
         command_line = join_json_option(
             join_negative_numbers(sys.argv[1:] if arguments is None else arguments)
         )
-        parser, commands = _parser(command_line[0] if command_line else "")
+        word = command_line[0] if command_line else ""
+        commands = find_commands(word)
+        if word and word not in commands and ("://" in word or Path(word).exists()):
+            word, command_line = "open", ["open", *command_line]
+        parser, _ = make_parser(commands, word)
         if "_ARGCOMPLETE" in os.environ:
             completion.complete(parser)
         if not command_line:
             parser.print_help()
             return 2
-        if command_line[0] not in commands and ("://" in command_line[0] or Path(command_line[0]).exists()):
-            command_line = ["open", *command_line]
-        options = parser.parse_args(command_line)
-        if options.verbose:
+        parsed = vars(parser.parse_args(command_line))
+        if parsed["verbose"]:
             _log_to_stderr()
-        outputs.set_up_notes(quiet=options.quiet)
-        follow_recording(options)
-        check_outputs(options)
-        run: Callable[[argparse.Namespace], int] = options.run
-        return run(options)
+        outputs.set_up_notes(quiet=parsed["quiet"])
+        command: Command[Any] = parsed["command"]
+        requested = make_options(parsed["options"], parsed)
+        check_outputs(requested)
+        options = follow_recording(requested)
+        if options is not requested:
+            check_outputs(options)  # The bag of the recording is read, too.
+        return command.run(options)
     except UserError as error:
         _log().debug("what led to the error", exc_info=error)
         print_error(error)
@@ -143,10 +171,33 @@ def _main(arguments: Sequence[str] | None) -> int:
                 gc.freeze()  # A last search for cycles would take a third of a second.
 
 
-def _parser(command: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
-    """Return the parser, and the commands by name.
+def find_commands(word: str = "") -> dict[str, Command[Any]]:
+    """Return the commands by name.
 
-    Registered commands are left out for a ``command`` of the core, because finding them takes 20 ms.
+    Args:
+        word: first of the command line. If it is a command of the core, the registered ones are left out,
+            because finding them takes 20 ms. A broken package costs its own commands only.
+    """
+    commands = {command.name: command for module in MODULES for command in commands_in(module)}
+    if word not in commands:
+        for module in load_all("commands", _warn, but=commands):
+            for command in commands_in(module):
+                commands.setdefault(command.name, command)
+    return commands
+
+
+def _warn(text: str) -> None:
+    outputs.warn([text])
+
+
+def make_parser(
+    commands: Mapping[str, Command[Any]], word: str = ""
+) -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """Return the parser of the program, and those of the commands by name.
+
+    Args:
+        commands: the commands by name.
+        word: first of the command line. Only this command gets its options. Empty: all do.
     """
     parser = Parser(
         prog="bevviz",
@@ -155,41 +206,17 @@ def _parser(command: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, ar
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
-    commands = parser.add_subparsers(required=True, metavar=COMMAND)
-    for module in (
-        workbench,
-        bag,
-        batch,
-        causes,
-        fix,
-        info,
-        why,
-        compare,
-        evaluate,
-        export,
-        sweep,
-        calib,
-        report,
-        recover,
-        cut,
-        live,
-        config,
-        store,
-        trust,
-        completion,
-    ):
-        module.add(commands)
-    if command not in commands.choices:
-        for module in load_all("commands", lambda text: outputs.warn([text]), but=commands.choices):
-            module.add(commands)
-    for command_parser in commands.choices.values():
+    subparsers = parser.add_subparsers(required=True, metavar=COMMAND)
+    for command in commands.values():
+        command.add_to(subparsers, _warn if word in ("", command.name) else None)
+    for command_parser in subparsers.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"
         )
         command_parser.add_argument(
             "--quiet", action="store_true", help="no progress and no notes: only results, and what is wrong"
         )
-    return parser, commands.choices
+    return parser, subparsers.choices
 
 
 def _log() -> Logger:

@@ -2,43 +2,52 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
+from bevviz.cli.command import command
 from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_keep,
-    add_output,
-    add_selection,
+    ConfigOptions,
+    DriveOptions,
+    Keep,
+    RangeOptions,
+    keep_option,
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs
+from bevviz.cli.outputs import Outputs, layout_option
 from bevviz.cli.run import process
 from bevviz.support.contexts import garbage_collection_off
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``bag``."""
-    bag = commands.add_parser(
-        "bag",
-        help="run the pipeline over a recorded bag",
-        description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
-    )
-    group = add_bag(bag)
-    add_selection(group)
-    add_config(bag)
-    add_keep(add_output(bag))
-    bag.set_defaults(run=_bag)
+@dataclass(frozen=True, kw_only=True)
+class BagOutputs(Outputs):
+    """Outputs of ``bag``."""
+
+    blueprint: str = layout_option("debug")
+    keep: Keep = keep_option()
 
 
+@dataclass(frozen=True, kw_only=True)
+class BagOptions:
+    """Options of ``bag``."""
+
+    drive: DriveOptions
+    frames: RangeOptions
+    config: ConfigOptions
+    output: BagOutputs
+
+
+@command(
+    "bag",
+    help="run the pipeline over a recorded bag",
+    description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
+)
 @garbage_collection_off()
-def _bag(options: argparse.Namespace) -> int:
+def _bag(options: BagOptions) -> int:
     from bevviz.drive import Drive
 
     config = load_config(options)
-    with open_bag(options, config) as source:
-        default = Path(options.paths[0].stem + ".rrd")
-        return process(Drive(source, config), Outputs.of(options), default)
+    with open_bag(options.drive, options.frames, config) as source:
+        default = Path(options.drive.paths[0].stem + ".rrd")
+        return process(Drive(source, config), options.output, default)

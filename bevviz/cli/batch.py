@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
+from bevviz.cli.command import Group, command, flag, option
 from bevviz.cli.interrupts import interruptible, wait_for_interrupt
 from bevviz.cli.options import (
     TIMES,
-    Commands,
-    add_bind,
-    add_config,
-    add_keep,
-    add_limits,
-    add_selection,
+    WHAT_TO_RUN,
+    ConfigOptions,
+    Keep,
+    LimitOptions,
+    RangeOptions,
+    keep_option,
     load_config,
-    port,
-    positive,
+    model_option,
 )
-from bevviz.cli.outputs import print_hints, say, warn
+from bevviz.cli.outputs import bind_option, print_hints, say, warn
+from bevviz.cli.values import port, positive
 from bevviz.errors import UserError
 from bevviz.support import progress
 
@@ -35,76 +36,100 @@ if TYPE_CHECKING:
     from bevviz.fleet.table import RunInfo
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``batch``."""
-    batch = commands.add_parser(
-        "batch",
-        help="run the pipeline over many bags",
-        description="Run the pipeline over many bags, each by itself, and sum up. Run again, it goes on.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=TIMES,
+@dataclass(frozen=True, kw_only=True)
+class BatchRange(RangeOptions):
+    """Options that select the frames that are run."""
+
+    force: bool = flag("also what is complete and up to date")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options for the detector."""
+
+    group: ClassVar = WHAT_TO_RUN
+
+    model: str | None = model_option()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """Options for the processes that run the bags."""
+
+    group: ClassVar = Group("where")
+
+    jobs: int | None = option("N", "processes (default: half the cores)", parse=positive)
+    dask: str | None = option("ADDRESS", "on a Dask cluster, e.g. tcp://host:8786")
+    retries: int = option("N", "again, where a process dies (default: 2)", default=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchResults:
+    """Options for the results."""
+
+    group: ClassVar = Group("results")
+
+    keep: Keep = keep_option()
+    blueprint: str = option("NAME|FILE", "layout (default: debug)", file="read", default="debug")
+    top: int = option("N", "worst frames shown (default: 30)", parse=positive, default=30)
+    catalog: str | None = option("URL", "register with this Rerun catalog server")
+    serve_catalog: int | None = option(
+        "PORT", "start one here (default: 51234), and a web viewer; until Ctrl-C", parse=port, const=51234
     )
-    batch.add_argument(
-        "paths",
+    bind: str = bind_option("--serve-catalog")
+    catalog_name: str | None = option("NAME", "of the data set in the catalog (default: name of DIR)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchTruth:
+    """Options for the ground truth."""
+
+    group: ClassVar = Group("ground truth")
+
+    truth: str | None = option(
+        "TOPIC", "evaluate: against the bag's own .../ground_truth, or this Detection3DArray", const=""
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """Options of ``batch``."""
+
+    paths: tuple[Path, ...] = option(
+        "BAG",
+        "bag file or folder, a pattern, or a folder that has bags in it; none: what -o has already",
+        positional=True,
         nargs="*",
-        type=Path,
-        metavar="BAG",
-        help="bag file or folder, a pattern, or a folder that has bags in it; none: what -o has already",
+        file="read",
+        default=(),
     )
-    batch.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where results go")
-    group = batch.add_argument_group("what to run")
-    group.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
-    add_selection(group)
-    group.add_argument("--force", action="store_true", help="also what is complete and up to date")
-    where = batch.add_argument_group("where")
-    where.add_argument("--jobs", type=positive, metavar="N", help="processes (default: half the cores)")
-    where.add_argument("--dask", metavar="ADDRESS", help="on a Dask cluster, e.g. tcp://host:8786")
-    where.add_argument(
-        "--retries", type=int, default=2, metavar="N", help="again, where a process dies (default: 2)"
-    )
-    results = batch.add_argument_group("results")
-    add_keep(results)
-    results.add_argument("--blueprint", default="debug", metavar="NAME|FILE", help="layout (default: debug)")
-    results.add_argument(
-        "--top", type=positive, default=30, metavar="N", help="worst frames shown (default: 30)"
-    )
-    results.add_argument("--catalog", metavar="URL", help="register with this Rerun catalog server")
-    results.add_argument(
-        "--serve-catalog",
-        nargs="?",
-        type=port,
-        const=51234,
-        metavar="PORT",
-        help="start one here (default: 51234), and a web viewer; until Ctrl-C",
-    )
-    add_bind(results, "--serve-catalog")
-    results.add_argument(
-        "--catalog-name", metavar="NAME", help="of the data set in the catalog (default: name of DIR)"
-    )
-    truth = batch.add_argument_group("ground truth")
-    truth.add_argument(
-        "--truth",
-        nargs="?",
-        const="",
-        metavar="TOPIC",
-        help="evaluate: against the bag's own .../ground_truth, or this Detection3DArray",
-    )
-    add_limits(batch)
-    add_config(batch)
-    batch.set_defaults(run=_batch)
+    output: Path = option("DIR", "where results go", names=("-o", "--output"), file="written", required=True)
+    detector: ModelOptions
+    frames: BatchRange
+    workers: WorkerOptions
+    results: BatchResults
+    truth: BatchTruth
+    limits: LimitOptions
+    config: ConfigOptions
 
 
-def _batch(options: argparse.Namespace) -> int:
+@command(
+    "batch",
+    help="run the pipeline over many bags",
+    description="Run the pipeline over many bags, each by itself, and sum up. Run again, it goes on.",
+    epilog=TIMES,
+)
+def _batch(options: BatchOptions) -> int:
     from bevviz.fleet.jobs import intact_results, lock_folder
 
     limits = _limits(options)
-    if options.catalog and options.serve_catalog:
+    if options.results.catalog and options.results.serve_catalog:
         raise UserError("--catalog and --serve-catalog: give one of them")
     failed: list[tuple[str, str]] = []
     with lock_folder(options.output):
         if options.paths:
             jobs = _jobs(options)
-            interrupted = _run(jobs, options, failed)
+            interrupted = _run(jobs, options.workers, options.frames.force, failed)
             complete = [(job.table, info) for job in jobs if (info := job.complete())]
         else:
             interrupted = False
@@ -112,44 +137,45 @@ def _batch(options: argparse.Namespace) -> int:
         return _sum_up(complete, failed, limits, options, interrupted)
 
 
-def _limits(options: argparse.Namespace) -> list[Limit]:
+def _limits(options: BatchOptions) -> list[Limit]:
     from bevviz.evaluate.metrics import parse_limits
 
-    limits = parse_limits(options.min, options.max)
-    if (limits or options.junit) and options.paths and options.truth is None:
+    limits = parse_limits(options.limits.min, options.limits.max)
+    if (limits or options.limits.junit) and options.paths and options.truth.truth is None:
         raise UserError("--min, --max and --junit: held to what? Give --truth, or --truth TOPIC")
     return limits
 
 
-def _jobs(options: argparse.Namespace) -> list[Job]:
+def _jobs(options: BatchOptions) -> list[Job]:
     from bevviz.bags.source import FrameSelection
     from bevviz.fleet.jobs import make_jobs
     from bevviz.model.frame import Scene
     from bevviz.recording import blueprints
     from bevviz.stages.detector import Detector
 
-    config = load_config(options)
-    selection = FrameSelection(options.start, options.end, options.every, options.frames)
-    jobs = make_jobs(options.paths, options.output, config, selection, options.blueprint, options.truth)
+    config, frames, layout = load_config(options), options.frames, options.results.blueprint
+    selection = FrameSelection(frames.start, frames.end, frames.every, frames.frames)
+    jobs = make_jobs(options.paths, options.output, config, selection, layout, options.truth.truth)
     # Report once here an error that every bag would hit.
-    blueprints.load(options.blueprint, Scene("", "lidar"))
+    blueprints.load(layout, Scene("", "lidar"))
     if config.detector.model:
         Detector(config.detector)
     print_hints(Scene("", "lidar", cameras=("any",)), config)
     return jobs
 
 
-def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, str]]) -> bool:
+def _run(jobs: list[Job], workers: WorkerOptions, force: bool, failed: list[tuple[str, str]]) -> bool:
     """Run the unfinished jobs. Return whether the user interrupted them.
 
     Args:
         jobs: all jobs of the batch.
-        options: of the command.
+        workers: the processes that run them.
+        force: whether to run the finished ones, too.
         failed: filled with the name and the error of each failed bag.
     """
     from bevviz.fleet.jobs import unfinished_jobs
 
-    todo = unfinished_jobs(jobs, options.force, _warn)
+    todo = unfinished_jobs(jobs, force, _warn)
     if len(todo) < len(jobs):
         say(f"{len(jobs) - len(todo)} of {len(jobs)} bags are complete and up to date")
     frames = 0
@@ -170,7 +196,7 @@ def _run(jobs: list[Job], options: argparse.Namespace, failed: list[tuple[str, s
                 if ended.is_set():
                     raise KeyboardInterrupt
 
-            with closing(_execute(todo, options, on_frame, tick)) as outcomes:
+            with closing(_execute(todo, workers, on_frame, tick)) as outcomes:
                 for outcome in outcomes:
                     bar.update()
                     if outcome.error:
@@ -186,55 +212,55 @@ def _warn(text: str) -> None:
 
 
 def _execute(
-    todo: list[Job], options: argparse.Namespace, on_frame: Callable[[], None], tick: Callable[[], None]
+    todo: list[Job], workers: WorkerOptions, on_frame: Callable[[], None], tick: Callable[[], None]
 ) -> JobResults:
     if not todo:
         return
     with ExitStack() as stack:
         engine: Cluster | Processes
-        if options.dask:
+        if workers.dask:
             from bevviz.fleet.dask_jobs import Cluster
 
-            engine = stack.enter_context(Cluster(options.dask))
+            engine = stack.enter_context(Cluster(workers.dask))
         else:
             from bevviz.fleet.processes import Processes
 
-            workers = options.jobs or max(1, (os.cpu_count() or 1) // 2)
-            engine = stack.enter_context(Processes(min(workers, len(todo))))
-        yield from stack.enter_context(closing(engine.run(todo, options.retries, on_frame, tick)))
+            count = workers.jobs or max(1, (os.cpu_count() or 1) // 2)
+            engine = stack.enter_context(Processes(min(count, len(todo))))
+        yield from stack.enter_context(closing(engine.run(todo, workers.retries, on_frame, tick)))
 
 
 def _sum_up(
     complete: list[tuple[Path, RunInfo]],
     failed: list[tuple[str, str]],
     limits: list[Limit],
-    options: argparse.Namespace,
+    options: BatchOptions,
     interrupted: bool,
 ) -> int:
     """Write the summary of the complete bags, register them in a catalog, and return the exit status."""
     from bevviz.fleet.summary import write_summary
 
-    folder: Path = options.output
+    folder, results = options.output, options.results
     recordings = [(table.with_suffix(".rrd"), info) for table, info in complete]
     with ExitStack() as stack:
-        link, url, viewer = None, options.catalog, ""
+        link, url, viewer = None, results.catalog, ""
         if interrupted:
             url = None
-        elif options.serve_catalog:
+        elif results.serve_catalog:
             from bevviz.fleet.catalog import serve_catalog
 
-            url, viewer = stack.enter_context(serve_catalog(options.serve_catalog, options.bind))
+            url, viewer = stack.enter_context(serve_catalog(results.serve_catalog, results.bind))
         if url:
             from bevviz.fleet.catalog import register
 
-            dataset = options.catalog_name or folder.resolve().name
-            link = register(url, dataset, recordings, options.blueprint)
+            dataset = results.catalog_name or folder.resolve().name
+            link = register(url, dataset, recordings, results.blueprint)
             say(f"{len(complete)} recordings in dataset '{dataset}' at {url}")
-        page = write_summary(folder, complete, failed, options.top, link, viewer)
+        page = write_summary(folder, complete, failed, results.top, link, viewer)
         if interrupted:
             say(f"interrupted; {len(complete)} bags are complete, the same command goes on. Summary: {page}")
             return 130
-        limits_kept = _gate(complete, failed, limits, options.junit)
+        limits_kept = _gate(complete, failed, limits, options.limits.junit)
         frames = sum(info.frames for _, info in complete)
         done = f"{len(complete)} bag{'s' * (len(complete) != 1)} complete, {len(failed)} failed"
         say(f"{done}, {frames} frames. Summary: {page}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_output, add_selection, load_config, open_bag
-from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
+from bevviz.cli.command import command, option
+from bevviz.cli.options import ConfigOptions, RangeOptions, SensorOptions, load_config, open_bag
+from bevviz.cli.outputs import Outputs, json_option, layout_option, print_result, say, warn
+from bevviz.cli.values import positive
 from bevviz.support import progress
 
 if TYPE_CHECKING:
@@ -19,39 +21,53 @@ if TYPE_CHECKING:
 FRAMES = 30  # Number of frames to use without --every.
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``calib``."""
-    calib = commands.add_parser(
-        "calib",
-        help="is it the calibration or the clock?",
-        description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
-    )
-    group = add_bag(calib, detector=False)
-    add_selection(group)
-    calib.set_defaults(every=None)
-    group.add_argument("--camera", metavar="NAME", help="only this camera, as 'bevviz info' names it")
-    add_config(calib)
-    output = add_output(calib, blueprint="calib")
-    output.add_argument("--write", type=Path, metavar="FILE.yaml", help="write the corrected configuration")
-    add_json(output)
-    calib.set_defaults(run=_calib)
+@dataclass(frozen=True, kw_only=True)
+class CalibFrames(RangeOptions):
+    """Options that select the frames and the camera."""
+
+    every: int = option("N", "run each N-th scan only", parse=positive, default=0)  # for FRAMES of them
+    camera: str | None = option("NAME", "only this camera, as 'bevviz info' names it")
 
 
-def _calib(options: argparse.Namespace) -> int:
+@dataclass(frozen=True, kw_only=True)
+class CalibOutputs(Outputs):
+    """Outputs of ``calib``."""
 
+    blueprint: str = layout_option("calib")
+    write: Path | None = option("FILE.yaml", "write the corrected configuration", file="written at the end")
+    json: Path | None = json_option()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibOptions:
+    """Options of ``calib``."""
+
+    drive: SensorOptions
+    frames: CalibFrames
+    config: ConfigOptions
+    output: CalibOutputs
+
+
+@command(
+    "calib",
+    help="is it the calibration or the clock?",
+    description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
+)
+def _calib(options: CalibOptions) -> int:
     from bevviz.calib import calibrate, gather
     from bevviz.errors import UserError
 
     config = load_config(options)
-    if options.write is not None and options.write.suffix not in (".yaml", ".yml"):
-        raise UserError(f"--write {options.write}: expected a file name that ends in .yaml")
-    every = options.every
-    options.every = every or 1
-    with open_bag(options, config) as source:
+    output = options.output
+    if output.write is not None and output.write.suffix not in (".yaml", ".yml"):
+        raise UserError(f"--write {output.write}: expected a file name that ends in .yaml")
+    frames = replace(options.frames, every=options.frames.every or 1)
+    with open_bag(options.drive, frames, config) as source:
         scene, total = source.scene, source.total
-        names = _cameras(scene, options.camera, source.roles.no_camera)
-    options.every = every or max(1, total // FRAMES)
-    with open_bag(options, config) as source:
+        names = _cameras(scene, frames.camera, source.roles.no_camera)
+    if not options.frames.every:
+        frames = replace(frames, every=max(1, total // FRAMES))
+    with open_bag(options.drive, frames, config) as source:
         bar = progress.bar(source, total=source.total, unit="frame", desc="find edges")
         shots = gather(bar, names, source.pose)
         warn(source.warnings)
@@ -66,10 +82,10 @@ def _calib(options: argparse.Namespace) -> int:
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
     tree: CalibForm = {"cameras": [result.to_dict() for result in results]}
-    print_result(options, "calib", tree, lambda: "\n".join(map(_text, results)))
-    if options.write is not None:
-        _write(results, options.write)
-    _log(results, shots, scene, config, options)
+    print_result(output.json, "calib", tree, lambda: "\n".join(map(_text, results)))
+    if output.write is not None:
+        _write(results, output.write)
+    _log(results, shots, scene, config, output.or_viewer())
     return 0
 
 
@@ -105,16 +121,11 @@ def _write(results: list[Calibration], path: Path) -> None:
 
 
 def _log(
-    results: list[Calibration],
-    shots: dict[str, Shots],
-    scene: Scene,
-    config: Config,
-    options: argparse.Namespace,
+    results: list[Calibration], shots: dict[str, Shots], scene: Scene, config: Config, outputs: Outputs
 ) -> None:
     """Log the results to the requested outputs, or to the viewer if there is a display."""
     from bevviz.calib.log import log_calibration
 
-    outputs = Outputs.of(options).or_viewer()
     if not outputs:
         say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")
         return

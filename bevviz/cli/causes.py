@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.cli.options import Commands, positive
-from bevviz.cli.outputs import add_json, print_result
+from bevviz.cli.command import command, option
+from bevviz.cli.outputs import json_option, print_result
+from bevviz.cli.values import positive
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``causes``."""
-    causes = commands.add_parser(
-        "causes",
-        help="what the missed and false objects of a batch have in common",
-        description="Group the missed objects, false objects and anomalies of a batch by what they have in "
-        "common: class, range, direction, size, brightness, speed, drive and so on.",
-    )
-    causes.add_argument("folder", type=Path, metavar="DIR", help="folder of a batch")
-    causes.add_argument(
-        "--against", type=Path, metavar="DIR", help="an earlier batch: what is new, what is gone"
-    )
-    causes.add_argument("--top", type=positive, default=10, metavar="N", help="causes shown (default: 10)")
-    add_json(causes)
-    causes.set_defaults(run=_causes)
+@dataclass(frozen=True, kw_only=True)
+class CausesOptions:
+    """Options of ``causes``."""
+
+    folder: Path = option("DIR", "folder of a batch", positional=True, required=True)
+    against: Path | None = option("DIR", "an earlier batch: what is new, what is gone")
+    top: int = option("N", "causes shown (default: 10)", parse=positive, default=10)
+    json: Path | None = json_option()
 
 
-def _causes(options: argparse.Namespace) -> int:
+@command(
+    "causes",
+    help="what the missed and false objects of a batch have in common",
+    description="Group the missed objects, false objects and anomalies of a batch by what they have in "
+    "common: class, range, direction, size, brightness, speed, drive and so on.",
+)
+def _causes(options: CausesOptions) -> int:
     from bevviz.fleet.causes import Findings, compare_causes, comparison_lines, find_causes
 
     new = find_causes(Findings.load(options.folder))
     tree = new.as_tree(options.top)
     if options.against is None:
-        print_result(options, "causes", tree, lambda: "\n".join(new.lines(options.top)))
+        print_result(options.json, "causes", tree, lambda: "\n".join(new.lines(options.top)))
         return 0
     compared = compare_causes(new, find_causes(Findings.load(options.against)))
     tree["compared"] = [
@@ -48,5 +48,5 @@ def _causes(options: argparse.Namespace) -> int:
         }
         for c in compared
     ]
-    print_result(options, "causes", tree, lambda: "\n".join(comparison_lines(compared)))
+    print_result(options.json, "causes", tree, lambda: "\n".join(comparison_lines(compared)))
     return 0

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
-from bevviz.cli.options import Commands
+from bevviz.cli.command import command, option
 
 EXAMPLES = """in the shell's start-up file:
   eval "$(bevviz completion bash)"          # ~/.bashrc
@@ -13,21 +14,20 @@ EXAMPLES = """in the shell's start-up file:
   bevviz completion fish | source           # ~/.config/fish/config.fish"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``completion``."""
-    completion = commands.add_parser(
-        "completion",
-        help="what a shell needs to complete commands, options and parameters",
-        description="Print what a shell evaluates to complete commands, options and the keys of --set.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=EXAMPLES,
-    )
-    shells = ("bash", "zsh", "fish")
-    completion.add_argument("shell", choices=shells, metavar="SHELL", help=", ".join(shells))
-    completion.set_defaults(run=_completion)
+@dataclass(frozen=True, kw_only=True)
+class CompletionOptions:
+    """Options of ``completion``."""
+
+    shell: Literal["bash", "zsh", "fish"] = option("SHELL", "bash, zsh, fish", positional=True, required=True)
 
 
-def _completion(options: argparse.Namespace) -> int:
+@command(
+    "completion",
+    help="what a shell needs to complete commands, options and parameters",
+    description="Print what a shell evaluates to complete commands, options and the keys of --set.",
+    epilog=EXAMPLES,
+)
+def _completion(options: CompletionOptions) -> int:
     from argcomplete.shell_integration import shellcode
 
     print(shellcode(["bevviz"], shell=options.shell))
@@ -39,9 +39,9 @@ def complete(parser: argparse.ArgumentParser) -> None:
     import argcomplete
 
     for action in _actions(parser):
-        if "--set" in action.option_strings or action.dest in ("set_a", "set_b", "key"):
+        if {"--set", "--set-a", "--set-b"} & {*action.option_strings} or action.dest == "key":
             action.completer = _keys  # type: ignore[attr-defined]
-        elif action.dest == "blueprint":
+        elif "--blueprint" in action.option_strings:
             action.completer = _blueprints  # type: ignore[attr-defined]
     argcomplete.autocomplete(parser, always_complete_options="long")
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
-from bevviz.cli.options import Commands, add_config, load_config
+from bevviz.cli.command import command, option
+from bevviz.cli.options import ConfigOptions
 
 EXAMPLES = """examples:
   bevviz config > my.yaml                 all, to be changed and given to --config
@@ -12,26 +13,29 @@ EXAMPLES = """examples:
   bevviz config clustering                every parameter of that stage"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``config``."""
-    config = commands.add_parser(
-        "config",
-        help="print the effective configuration, or explain one parameter",
-        description="Print every parameter with its unit and meaning, as YAML that --config reads back; or "
-        "explain one.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=EXAMPLES,
+@dataclass(frozen=True, kw_only=True)
+class ConfigCommandOptions:
+    """Options of ``config``."""
+
+    key: str | None = option(
+        "KEY", "one parameter, or a section, to be explained", positional=True, nargs="?"
     )
-    config.add_argument("key", nargs="?", metavar="KEY", help="one parameter, or a section, to be explained")
-    add_config(config)
-    config.set_defaults(run=_config, keep=None)  # Show ``logging.keep`` as a run would have it.
+    config: ConfigOptions
 
 
-def _config(options: argparse.Namespace) -> int:
-    from bevviz.config import config_yaml, stated_lines
+@command(
+    "config",
+    help="print the effective configuration, or explain one parameter",
+    description="Print every parameter with its unit and meaning, as YAML that --config reads back; or "
+    "explain one.",
+    epilog=EXAMPLES,
+)
+def _config(options: ConfigCommandOptions) -> int:
+    from bevviz.config import config_yaml, load, stated_lines
     from bevviz.config.descriptions import describe_parameters
 
-    config = load_config(options)
+    chosen = options.config
+    config = load(chosen.file, chosen.set, chosen.preset, layers=chosen.project_layers)
     if options.key is not None:
         print(describe_parameters(options.key, config))
         return 0

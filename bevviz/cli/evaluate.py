@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
+from bevviz.cli.command import Group, command
 from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_keep,
-    add_limits,
-    add_output,
-    add_selection,
-    add_truth,
+    ConfigOptions,
+    DriveOptions,
+    Keep,
+    LimitOptions,
+    RangeOptions,
+    TruthOptions,
+    keep_option,
     load_config,
     open_bag,
 )
-from bevviz.cli.outputs import Outputs, add_json, json_on_stdout, print_hints, say, warn, write_json
+from bevviz.cli.outputs import STDOUT, Outputs, json_option, layout_option, print_hints, say, warn, write_json
 from bevviz.cli.run import run_logged, run_with_progress, table_status
 from bevviz.errors import UserError
 
@@ -44,41 +45,52 @@ EPILOG = """examples:
   bevviz evaluate drive.mcap --model yolo11n.onnx --min recall.person=0.8 --max false=2 --junit ci.xml"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``evaluate``."""
-    evaluate = commands.add_parser(
-        "evaluate",
-        help="how right it is, where the truth is known; a gate for CI",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
-    group = add_bag(evaluate)
-    add_selection(group)
-    add_truth(evaluate)
-    add_limits(evaluate)
-    add_config(evaluate)
-    output = add_output(evaluate, blueprint="evaluate")
-    add_keep(output)
-    output.description = "None, but the table. Several can be given at once."
-    add_json(output)
-    evaluate.set_defaults(run=_evaluate)
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOutputs(Outputs):
+    """Outputs of ``evaluate``."""
+
+    group: ClassVar = Group("output", "None, but the table. Several can be given at once.")
+
+    blueprint: str = layout_option("evaluate")
+    keep: Keep = keep_option()
+    json: Path | None = json_option()
 
 
-def _evaluate(options: argparse.Namespace) -> int:
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Options of ``evaluate``."""
+
+    drive: DriveOptions
+    frames: RangeOptions
+    truth: TruthOptions
+    limits: LimitOptions
+    config: ConfigOptions
+    output: EvaluateOutputs
+
+
+@command(
+    "evaluate",
+    help="how right it is, where the truth is known; a gate for CI",
+    description=DESCRIPTION,
+    epilog=EPILOG,
+)
+def _evaluate(options: EvaluateOptions) -> int:
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.ground_truth import truth_in
     from bevviz.evaluate.metrics import parse_limits
     from bevviz.why.false_objects import false_causes
 
-    limits = parse_limits(options.min, options.max)
+    truth, limits = options.truth, parse_limits(options.limits.min, options.limits.max)
     config = load_config(options)
-    with open_bag(options, config) as frames:
-        evaluation = Evaluation(truth_in(frames, options.truth, options.kitti_labels), false_causes)
+    with open_bag(options.drive, options.frames, config) as frames:
+        evaluation = Evaluation(truth_in(frames, truth.truth, truth.kitti_labels), false_causes)
         if not any(limit.metric.startswith(("ground", "object_points")) for limit in limits):
             _check_detector(config)
         status = _run(frames, config, evaluation, options)
         if not evaluation.judged:
-            raise UserError(f"{options.paths[0]}: there is truth for none of the {evaluation.without} frames")
+            raise UserError(
+                f"{options.drive.paths[0]}: there is truth for none of the {evaluation.without} frames"
+            )
         return _report(evaluation, limits, options) or status
 
 
@@ -91,7 +103,7 @@ def _check_detector(config: Config) -> None:
         )
 
 
-def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: argparse.Namespace) -> int:
+def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: EvaluateOptions) -> int:
     """Run the pipeline with an evaluation and return the exit status.
 
     The table is printed before a recording is served.
@@ -101,9 +113,10 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: arg
     from bevviz.findings.run_table import list_keeper
     from bevviz.pipeline.session import Session
 
-    session, failures, outputs = Session(config), FailureSummary(), Outputs.of(options)
+    session, failures, outputs = Session(config), FailureSummary(), options.output
     # The workbench takes stated labels for the frames' own. This run has them apart.
-    keeper = None if options.truth or options.kitti_labels else list_keeper(frames, session)
+    truth = options.truth
+    keeper = None if truth.truth or truth.kitti_labels else list_keeper(frames, session)
     judges: list[Observer[FrameResult]] = [evaluation, failures, *([] if keeper is None else [keeper])]
     if not outputs:
         print_hints(frames.scene, config)
@@ -119,27 +132,27 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: arg
 
     def finish() -> None:
         warn(failures.warnings)
-        if not json_on_stdout(options):
+        if options.output.json != STDOUT:
             print(evaluation.table(), flush=True)
 
     return run_logged(frames, session, config, outputs, observers, finish)
 
 
-def _report(evaluation: Evaluation, limits: list[Limit], options: argparse.Namespace) -> int:
+def _report(evaluation: Evaluation, limits: list[Limit], options: EvaluateOptions) -> int:
     """Print and write the results. Return the exit status of the gate: 1 if a limit is not kept, else 0."""
     from bevviz.bags.remote import beside
     from bevviz.evaluate.metrics import check, write_junit
 
-    if not Outputs.of(options) and not json_on_stdout(options):
+    if not options.output and options.output.json != STDOUT:
         print(evaluation.table())
     results = check(limits, evaluation.metrics)
     gate: list[LimitForm] = [
         {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
     ]
     tree: EvaluateForm = {**evaluation.as_tree(), "limits": gate}
-    write_json(options, "evaluate", tree)
-    if options.junit is not None:
-        write_junit(options.junit, {beside(options.paths[0]).stem: results})
+    write_json(options.output.json, "evaluate", tree)
+    if options.limits.junit is not None:
+        write_junit(options.limits.junit, {beside(options.drive.paths[0]).stem: results})
     for result in results:
         if result.reason:
             say(f"not kept: {result.reason}", always=True)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_selection, load_config, open_bag
+from bevviz.cli.command import Group, command, option
+from bevviz.cli.options import ConfigOptions, DriveOptions, RangeOptions, load_config, open_bag
 from bevviz.cli.outputs import print_hints, say, warn
 from bevviz.cli.run import run_with_progress
+from bevviz.support.extensions import registered
 
-DEFAULT = "kitti"
 DESCRIPTION = """Write a drive, or a part of it, as a data set, with the objects that were found as labels to
 be corrected: the folders of KITTI's object benchmark (velodyne, image_2, calib, label_2), or a scene with the
 tables of nuScenes, with all cameras, poses and tracks. bevviz opens both."""
@@ -21,60 +22,55 @@ EPILOG = """examples:
   bevviz export drive.mcap --model yolo11n.onnx --format nuscenes -o scenes"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``export``."""
-    export = commands.add_parser(
-        "export",
-        help="write frames as KITTI or nuScenes, with what was found as labels",
-        description=DESCRIPTION,
-        epilog=EPILOG,
+@dataclass(frozen=True, kw_only=True)
+class DatasetOutput:
+    """Options for the data set that is written."""
+
+    group: ClassVar = Group("what to write")
+
+    folder: Path = option("FOLDER", "that is made", names=("-o", "--output"), file="written", required=True)
+    format: str = option(
+        "NAME",
+        "%(choices)s (default: %(default)s)",
+        choices=lambda: sorted(registered("exports")),
+        default="kitti",
     )
-    group = add_bag(export)
-    add_selection(group)
-    add_config(export)
-    output = export.add_argument_group("what to write")
-    output.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="that is made")
-    output.add_argument(
-        "--format",
-        choices=_Formats(),
-        default=DEFAULT,
-        metavar="NAME",
-        help=f"%(choices)s (default: {DEFAULT})",
-    )
-    output.add_argument(
-        "--camera",
-        default="",
-        metavar="NAME",
-        help="whose images (default: the first one for KITTI, else all)",
-    )
-    export.set_defaults(run=_export)
+    camera: str = option("NAME", "whose images (default: the first one for KITTI, else all)", default="")
 
 
-class _Formats:
-    """Names of the registered formats. To find them takes 40 ms, so it happens only where they are needed."""
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of ``export``."""
 
-    def __iter__(self) -> Iterator[str]:
-        from bevviz.support.extensions import registered
+    drive: DriveOptions
+    frames: RangeOptions
+    config: ConfigOptions
+    output: DatasetOutput
 
-        return iter(sorted(registered("exports")))
 
-
-def _export(options: argparse.Namespace) -> int:
+@command(
+    "export",
+    help="write frames as KITTI or nuScenes, with what was found as labels",
+    description=DESCRIPTION,
+    epilog=EPILOG,
+)
+def _export(options: ExportOptions) -> int:
     from bevviz.anomalies import FailureSummary
     from bevviz.drive import Drive
     from bevviz.export.folder import FolderExport
-    from bevviz.support.extensions import load_class, registered
+    from bevviz.support.extensions import load_class
 
-    export_class = load_class(registered("exports")[options.format], FolderExport)  # type: ignore[type-abstract]
+    output = options.output
+    export_class = load_class(registered("exports")[output.format], FolderExport)  # type: ignore[type-abstract]
     config = load_config(options)
-    with open_bag(options, config) as source:
+    with open_bag(options.drive, options.frames, config) as source:
         drive = Drive(source, config)
         print_hints(drive.scene, config)
-        export = export_class(options.output, options.camera)
+        export = export_class(output.folder, output.camera)
         failures = FailureSummary()
         end = run_with_progress(drive.frames, drive.new_session(), [export, failures])
         warn([*source.warnings, *failures.warnings])
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
     if export.frames:
-        say(f"{export.frames} frames with {export.labels} labels in {options.output}")
+        say(f"{export.frames} frames with {export.labels} labels in {output.folder}")
     return 130 if end.interrupted else 0 if export.frames else 1

@@ -2,47 +2,54 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_config, add_dataset, add_ros_args, load_config, positive
-from bevviz.cli.outputs import add_json, json_on_stdout, print_result
+from bevviz.cli.command import command, flag, option
+from bevviz.cli.options import ConfigOptions, DatasetOptions, load_config, ros_option
+from bevviz.cli.outputs import STDOUT, json_option, print_result
+from bevviz.cli.values import positive
 from bevviz.errors import UserError
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``info``."""
-    info = commands.add_parser(
-        "info",
-        help="what is in a bag, and what is missing for a full run",
-        description="Topics, rates, gaps and frames of a bag, the role of each topic, what is missing, and "
-        "faults of the sensors in the first seconds.",
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """Options of ``info``."""
+
+    paths: tuple[Path, ...] = option(
+        "PATH",
+        "bag file or folder, or a data set's folder",
+        positional=True,
+        nargs="*",
+        file="read",
+        default=(),
     )
-    info.add_argument(
-        "paths", nargs="*", type=Path, metavar="PATH", help="bag file or folder, or a data set's folder"
+    data: DatasetOptions
+    sensors: bool = flag(
+        "check the sensors in the whole drive, not in its first 100 frames or 2 s of work alone"
     )
-    add_dataset(info)
-    info.add_argument(
-        "--sensors",
-        action="store_true",
-        help="check the sensors in the whole drive, not in its first 100 frames or 2 s of work alone",
+    live: bool = flag("a running robot's topics instead of a bag's")
+    seconds: int | None = option(
+        "SECONDS",
+        "--live: how long to listen, for rates, sizes and delays (default: 3); Ctrl-C ends it earlier",
+        names=("--for",),
+        parse=positive,
     )
-    info.add_argument("--live", action="store_true", help="a running robot's topics instead of a bag's")
-    info.add_argument(
-        "--for",
-        dest="seconds",
-        type=positive,
-        metavar="SECONDS",
-        help="--live: how long to listen, for rates, sizes and delays (default: 3); Ctrl-C ends it earlier",
+    model: str | None = option(
+        "FILE.onnx", "detector that is going to be used", key="detector.model", file="read"
     )
-    info.add_argument("--model", metavar="FILE.onnx", help="detector that is going to be used")
-    add_json(info)
-    add_config(info)
-    add_ros_args(info)
-    info.set_defaults(run=_info)
+    json: Path | None = json_option()
+    config: ConfigOptions
+    ros_args: tuple[str, ...] = ros_option()
 
 
-def _info(options: argparse.Namespace) -> int:
+@command(
+    "info",
+    help="what is in a bag, and what is missing for a full run",
+    description="Topics, rates, gaps and frames of a bag, the role of each topic, what is missing, and "
+    "faults of the sensors in the first seconds.",
+)
+def _info(options: InfoOptions) -> int:
     from bevviz.pipeline.bag_info import (
         BagInfo,
         contents_tree,
@@ -58,7 +65,7 @@ def _info(options: argparse.Namespace) -> int:
 
         seconds = options.seconds or info.LISTEN
         live = info.describe(load_config(options), options.ros_args, seconds)
-        print_result(options, "info", contents_tree(live), lambda: info.render(live))
+        print_result(options.json, "info", contents_tree(live), lambda: info.render(live))
         return 0
     if options.seconds is not None:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
@@ -66,10 +73,10 @@ def _info(options: argparse.Namespace) -> int:
         raise UserError("bevviz info: which bag? Give its path, or --live for a running robot")
 
     def show(info: BagInfo) -> None:
-        if not json_on_stdout(options):
+        if options.json != STDOUT:
             print(render_bag_contents(info), flush=True)
 
     config = load_config(options)
     bag_info = describe_bag(options.paths, config, all_frames=options.sensors, on_contents=show)
-    print_result(options, "info", contents_tree(bag_info), lambda: render_missing(bag_info))
+    print_result(options.json, "info", contents_tree(bag_info), lambda: render_missing(bag_info))
     return 0

@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
+from bevviz.cli.command import command, extensions, flag, option
 from bevviz.cli.interrupts import interruptible
 from bevviz.cli.options import (
-    Commands,
-    add_config,
-    add_keep,
-    add_output,
-    add_ros_args,
-    port,
-    project_layers,
+    WHAT_TO_RUN,
+    ConfigOptions,
+    Keep,
+    collect_settings,
+    keep_option,
+    model_option,
+    ros_option,
 )
-from bevviz.cli.outputs import has_display, say, warn
+from bevviz.cli.outputs import ViewerOptions, has_display, layout_option, say, warn
+from bevviz.cli.values import port
 from bevviz.errors import UserError
 from bevviz.support import progress
-from bevviz.support.extensions import load_all
 
 if TYPE_CHECKING:
-    from bevviz.cli.parser import Parser
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.publish import ResultSink, Watch
+    from bevviz.live.publish import ResultSink
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
@@ -42,125 +42,115 @@ if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import StageLoader
 
 
-def add(commands: Commands) -> None:
-    """Add the commands ``live`` and ``snap``."""
-    live = commands.add_parser(
-        "live",
-        help="run the pipeline beside a robot",
-        description="Run the pipeline on a running ROS 2 graph. It is never behind: the newest frame wins.",
-    )
-    choice = live.add_argument_group("what to run")
-    choice.add_argument("--model", metavar="FILE.onnx", help="detector: YOLOv5, v8, v10, 11, 26 or YOLOX")
-    choice.add_argument(
-        "--observe", action="store_true", help="no pipeline: show only what the robot itself publishes"
-    )
-    choice.add_argument(
-        "--publish", action="store_true", help="publish the results, as the nodes of the tutorial do"
-    )
-    choice.add_argument(
-        "--diagnostics",
-        action="store_true",
-        help="publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too",
-    )
-    choice.add_argument(
-        "--robot",
-        nargs="?",
-        const="",
-        metavar="TOPIC",
-        help="compare our objects with the robot's (default: its fused Detection3DArray), frame by frame",
-    )
-    choice.add_argument("--every", metavar="N", help="run each N-th scan only")
-    choice.add_argument("--max-rate", metavar="HZ", help="frames a second at most")
-    choice.add_argument("--points", metavar="N", help="points kept of each scan")
-    choice.add_argument("--nice", metavar="0..19", help="priority given up to other processes")
-    add_config(live)
-    output = add_output(live, blueprint="live", raw=True)
-    add_keep(output)
-    output.add_argument(
-        "--split", type=_split, metavar="SIZE|TIME", help="--save in parts, e.g. 500MB or 10min"
-    )
-    output.add_argument(
-        "--workbench",
-        nargs="?",
-        type=port,
-        const=0,
-        metavar="PORT",
-        help="a page where a click answers why and parameters are changed (default: a free port)",
-    )
-    output.add_argument(
-        "--flight", metavar="TIME", help="what the flight recorder holds (default: 30 s), for 'bevviz snap'"
-    )
-    add_ros_args(live)
-    live.set_defaults(run=_live)
-    live.add_later(lambda: _add_watches(live, choice))
-
-    snap = commands.add_parser(
-        "snap",
-        help="save the last seconds of a running 'bevviz live'",
-        description="Have a running 'bevviz live' save its flight recorder: FILE.rrd, and beside it "
-        "FILE.mcap, the messages that it was made of. SIGUSR1 does the same.",
-    )
-    snap.add_argument("path", nargs="?", type=Path, metavar="FILE.rrd", help="default: named by the time")
-    snap.add_argument("--pid", type=int, metavar="PID", help="which process, where several run")
-    snap.set_defaults(run=_snap)
-
-
-def _add_watches(live: Parser, group: argparse._ArgumentGroup) -> None:
-    """Add the options of what is registered to watch the results."""
-    watches = [*load_all("watches", lambda text: warn([text]))]
-    for watch in watches:
-        watch.add_options(group)
-    live.set_defaults(watches=watches)
-
-
 def _split(text: str) -> str:
     """Return the setting for a size or a time, as ``key=value``."""
     return f"live.split_{'size' if text.strip().endswith('B') else 'time'}={text}"
 
 
-def _live(options: argparse.Namespace) -> int:
+@dataclass(frozen=True, kw_only=True)
+class LiveRun:
+    """Options that select what is run."""
+
+    group: ClassVar = WHAT_TO_RUN
+
+    model: str | None = model_option()
+    observe: bool = flag("no pipeline: show only what the robot itself publishes")
+    publish: bool = flag("publish the results, as the nodes of the tutorial do")
+    diagnostics: bool = flag(
+        "publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too"
+    )
+    robot: str | None = option(
+        "TOPIC",
+        "compare our objects with the robot's (default: its fused Detection3DArray), frame by frame",
+        const="",
+    )
+    every: str | None = option("N", "run each N-th scan only", key="live.every")
+    max_rate: str | None = option("HZ", "frames a second at most", key="live.max_rate")
+    points: str | None = option("N", "points kept of each scan", key="live.points")
+    nice: str | None = option("0..19", "priority given up to other processes", key="live.nice")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOutputs(ViewerOptions):
+    """Outputs of ``live``."""
+
+    save: tuple[Path, ...] = option(
+        "FILE.rrd|FILE.mcap",
+        "save the recording, blueprint included; the messages as they come; both, given twice",
+        repeat=True,
+    )
+    blueprint: str = layout_option("live")
+    keep: Keep = keep_option()
+    split: str | None = option("SIZE|TIME", "--save in parts, e.g. 500MB or 10min", parse=_split)
+    workbench: int | None = option(
+        "PORT",
+        "a page where a click answers why and parameters are changed (default: a free port)",
+        parse=port,
+        const=0,
+    )
+    flight: str | None = option(
+        "TIME", "what the flight recorder holds (default: 30 s), for 'bevviz snap'", key="live.flight_time"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """Options of ``live``."""
+
+    run: LiveRun
+    config: ConfigOptions
+    output: LiveOutputs
+    ros_args: tuple[str, ...] = ros_option()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapOptions:
+    """Options of ``snap``."""
+
+    path: Path | None = option("FILE.rrd", "default: named by the time", positional=True, nargs="?")
+    pid: int | None = option("PID", "which process, where several run")
+
+
+@command(
+    "live",
+    help="run the pipeline beside a robot",
+    description="Run the pipeline on a running ROS 2 graph. It is never behind: the newest frame wins.",
+    extended_by="watches",
+)
+def _live(options: LiveOptions) -> int:
     # Silence Rerun's warning about files without an index. They get one when they are complete.
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
-    option_values = {
-        "detector.model": options.model,
-        "live.every": options.every,
-        "live.max_rate": options.max_rate,
-        "live.points": options.points,
-        "live.nice": options.nice,
-        "logging.keep": options.keep,
-        "live.flight_time": options.flight,
-    }
-    option_settings = [f"{key}={value}" for key, value in option_values.items() if value is not None]
-    if options.split is not None:
-        option_settings.append(options.split)
-    _files(options.save)
-    if options.split is not None and not options.save:
+    chosen, output, config = options.run, options.output, options.config
+    values = collect_settings(options)
+    if output.split is not None:
+        values.append(output.split)
+    _files(output.save)
+    if output.split is not None and not output.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
-    if options.observe and options.publish:
+    if chosen.observe and chosen.publish:
         raise UserError("--observe makes no results that --publish could send: leave one of them out")
-    if options.observe and options.robot is not None:
+    if chosen.observe and chosen.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
-    settings = ReloadableConfig(
-        options.config, [*options.set, *option_settings], options.preset, project_layers(options)
-    )
-    _check_outputs(options)
+    settings = ReloadableConfig(config.file, values, config.preset, config.project_layers)
+    _check_outputs(output)
     loader = StageLoader()
-    if not options.observe:
+    if not chosen.observe:
         loader.load(settings.config)
     notes = Notes(say)
     with ExitStack() as open_sinks:
-        watches: list[Watch] = options.watches
-        sinks = [open_sinks.enter_context(sink) for watch in watches if (sink := watch.open_sink(options))]
+        watches = extensions(options)
+        requested = [watch.open_sink(given, observe=chosen.observe) for watch, given in watches]
+        sinks = [open_sinks.enter_context(sink) for sink in requested if sink is not None]
         return _run(settings, options, notes, loader, sinks)
 
 
 def _run(
     settings: ReloadableConfig,
-    options: argparse.Namespace,
+    options: LiveOptions,
     notes: Notes,
     loader: StageLoader,
     sinks: Sequence[ResultSink],
@@ -171,12 +161,12 @@ def _run(
 
     raw = RawRecorder(settings.config.live)
     with LiveSource(
-        settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.observe
+        settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.run.observe
     ) as robot:
         return _watch_robot(robot, settings, options, notes, loader, raw, sinks)
 
 
-def _check_outputs(options: argparse.Namespace) -> None:
+def _check_outputs(options: LiveOutputs) -> None:
     """Check the outputs before waiting for a robot."""
     from bevviz.model.frame import Scene
     from bevviz.recording import blueprints
@@ -196,7 +186,7 @@ def _check_outputs(options: argparse.Namespace) -> None:
 def _watch_robot(
     source: LiveSource,
     settings: ReloadableConfig,
-    options: argparse.Namespace,
+    options: LiveOptions,
     notes: Notes,
     loader: StageLoader,
     raw: RawRecorder,
@@ -207,6 +197,8 @@ def _watch_robot(
     from bevviz.live.requests import Control, RosRequests, answer_sigusr1
     from bevviz.live.source_wrappers import warm_up
     from bevviz.live.status import Diagnostics
+
+    chosen = options.run
 
     def refuse(path: Path | None = None) -> Path:
         raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
@@ -224,7 +216,7 @@ def _watch_robot(
         orders: RosRequests | None = None
         orders = RosRequests(source.node, settings.config, take, refuse)
         orders.config = settings.config
-        if not options.observe:  # Warm up while waiting for the robot.
+        if not chosen.observe:  # Warm up while waiting for the robot.
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
         reported_missing = ""
@@ -236,11 +228,11 @@ def _watch_robot(
                     say(f"waiting: {reported_missing}")
         if ended.is_set():
             return 1
-        sinks: list[ResultSink] = [RosTopics(source.node, notes.warn)] if options.publish else []
+        sinks: list[ResultSink] = [RosTopics(source.node, notes.warn)] if chosen.publish else []
         sinks += watching_sinks
         publisher = Publisher(settings.config, sinks) if sinks else None
         diagnostics: Diagnostics | None = None
-        if options.publish or options.diagnostics:
+        if chosen.publish or chosen.diagnostics:
             try:
                 diagnostics = Diagnostics(source.node)
             except UserError as error:
@@ -272,7 +264,7 @@ def _watch_robot(
 def _watch(
     source: Items[Frame],
     settings: ReloadableConfig,
-    options: argparse.Namespace,
+    options: LiveOptions,
     notes: Notes,
     loader: StageLoader,
     on_result: Callable[[FrameResult], None] | None,
@@ -283,24 +275,25 @@ def _watch(
     """Run until the source ends or the user ends it."""
     from bevviz.live.runtime import Live, Outputs
 
-    show_window = options.viewer
-    save, messages = _files(options.save)
-    viewer_options = options.serve, options.connect, options.workbench
-    no_output = not options.save and all(option is None for option in viewer_options) and not show_window
+    output = options.output
+    show_window = output.viewer
+    save, messages = _files(output.save)
+    viewer_options = output.serve, output.connect, output.workbench
+    no_output = not output.save and all(option is None for option in viewer_options) and not show_window
     show_window = show_window or (no_output and has_display())
-    connect = [options.connect] if options.connect else []
-    outputs = Outputs(save, show_window, options.serve, options.bind, connect, options.blueprint, messages)
+    connect = [output.connect] if output.connect else []
+    outputs = Outputs(save, show_window, output.serve, output.bind, connect, output.blueprint, messages)
     live = Live(
         source,
         settings,
         outputs,
         notes,
-        observe=options.observe,
+        observe=options.run.observe,
         on_result=on_result,
         loader=loader,
         control=control,
         raw=raw,
-        robot=options.robot,
+        robot=options.run.robot,
     )
     live.on_change = follow(live)
     for url in live.urls:
@@ -310,7 +303,7 @@ def _watch(
     with (
         suppress(KeyboardInterrupt),
         interruptible(twice=True),
-        _page(options, live),
+        _page(output.workbench, live),
         progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
 
@@ -342,9 +335,9 @@ def _watch(
     return 0 if live.frames else 1
 
 
-def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[object]:
+def _page(workbench: int | None, live: Live) -> AbstractContextManager[object]:
     """Return the workbench's page for the run, if it is requested."""
-    if options.workbench is None:
+    if workbench is None:
         return nullcontext()
     try:
         from bevviz.workbench.running_robot import robot_session
@@ -353,7 +346,7 @@ def _page(options: argparse.Namespace, live: Live) -> AbstractContextManager[obj
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    page = LivePage(robot_session(live), options.workbench or None)
+    page = LivePage(robot_session(live), workbench or None)
     say(f"workbench at {page.address}", always=True)
     return page
 
@@ -373,7 +366,13 @@ def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
     return paths_by_suffix.get(".rrd"), paths_by_suffix.get(".mcap")
 
 
-def _snap(options: argparse.Namespace) -> int:
+@command(
+    "snap",
+    help="save the last seconds of a running 'bevviz live'",
+    description="Have a running 'bevviz live' save its flight recorder: FILE.rrd, and beside it "
+    "FILE.mcap, the messages that it was made of. SIGUSR1 does the same.",
+)
+def _snap(options: SnapOptions) -> int:
     from bevviz.live.requests import snap
 
     recording = snap(options.path, options.pid)

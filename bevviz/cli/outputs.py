@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import atexit
 import html
 import math
@@ -16,13 +15,16 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from getpass import getuser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import unquote
 
+from bevviz.cli.command import Group, flag, option, option_values
 from bevviz.cli.interrupts import wait_for_interrupt
+from bevviz.cli.values import port
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.text import printable
@@ -38,23 +40,39 @@ TOKEN = "token="  # in the address of a page that needs one
 BROWSER_START = 60.0  # seconds until the file that leads a browser to such a page is deleted
 
 
-class Outputs(NamedTuple):
-    """Outputs that the options of ``add_output`` request."""
+def layout_option(default: str) -> Any:
+    """Return the option for the layout of the viewer."""
+    text = "debug, live, explain, bug_report, compare, a .py or a .rbl (default: %(default)s)"
+    return option("NAME|FILE", text, default=default, file="read")
 
-    save: Path | None = None
-    serve: int | None = None  # Port of the web viewer.
-    bind: str = "127.0.0.1"  # Address at which it listens.
-    connect: str | None = None  # URL of a running viewer.
-    viewer: bool = False
-    blueprint: str | Blueprint = "debug"
+
+def bind_option(server: str) -> Any:
+    """Return the option for the address at which a server listens."""
+    text = "at this address (default: 127.0.0.1, for this machine alone; 0.0.0.0: for everybody)"
+    return option("ADDRESS", f"{server} {text}", default="127.0.0.1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerOptions:
+    """Options for viewers. A subclass states what is saved, and the layout."""
+
+    group: ClassVar = Group("output", "The viewer, where there is a display. Several can be given at once.")
+
+    save: Path | tuple[Path, ...] | None = None
+    serve: int | None = option("PORT", "web viewer on this machine (default: 9090)", parse=port, const=9090)
+    bind: str = bind_option("--serve")
+    connect: str | None = option("URL", "a viewer elsewhere, e.g. rerun+http://laptop:9876/proxy")
+    viewer: bool = flag("open the viewer, beside the other outputs")
+    blueprint: str = "debug"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs(ViewerOptions):
+    """Outputs of a command."""
+
+    save: Path | None = option("FILE.rrd", "save the recording, blueprint included", file="written")
     unseen: bool = False  # Saved because nothing could be shown.
     browser: bool = False  # Whether to open the page of ``serve``.
-
-    @staticmethod
-    def of(options: argparse.Namespace) -> Outputs:
-        """Return the outputs that the options request."""
-        blueprint = getattr(options, "blueprint", "debug")
-        return Outputs(options.save, options.serve, options.bind, options.connect, options.viewer, blueprint)
 
     def __bool__(self) -> bool:
         """Return whether any output is requested."""
@@ -64,7 +82,7 @@ class Outputs(NamedTuple):
 
     def or_viewer(self) -> Outputs:
         """Return the requested outputs. If there are none and there is a display, return the viewer."""
-        return self if self or not has_display() else self._replace(viewer=True)
+        return self if self or not has_display() else replace(self, viewer=True)
 
     def or_file(self, default: Path) -> Outputs:
         """Return the requested outputs. If there are none, return the viewer, the browser or a file."""
@@ -74,13 +92,21 @@ class Outputs(NamedTuple):
         if has_browser():
             from bevviz.recording.ports import free_port
 
-            return chosen._replace(serve=free_port(9090), browser=True)
+            return replace(chosen, serve=free_port(9090), browser=True)
         say(f"no display: saving {default}")
-        return chosen._replace(save=default, unseen=True)
+        return replace(chosen, save=default, unseen=True)
 
     @contextmanager
-    def opened(self, scene: Scene, config: Config) -> Iterator[OpenRecording]:
-        """Open a recording with these outputs and print their addresses."""
+    def opened(
+        self, scene: Scene, config: Config, layout: Blueprint | None = None
+    ) -> Iterator[OpenRecording]:
+        """Open a recording with these outputs, and print their addresses.
+
+        Args:
+            scene: names of the sensors.
+            config: configuration of the run.
+            layout: layout of the viewer; None: that of ``--blueprint``.
+        """
         from bevviz.recording.sinks import open_recording
 
         with open_recording(
@@ -91,7 +117,7 @@ class Outputs(NamedTuple):
             bind=self.bind,
             connect=self.connect,
             spawn=self.viewer,
-            blueprint=self.blueprint,
+            blueprint=self.blueprint if layout is None else layout,
         ) as sinks:
             for url in sinks.urls:
                 say(f"viewer at {url}", always=True)
@@ -242,19 +268,13 @@ def has_display() -> bool:
 # --- --json: the result for other programs, in one format for each command (docs/api.md) -------
 
 OPTION = "--json"
-STDOUT = "-"
+STDOUT = Path("-")
 
 
-def add_json(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
-    """Add the option ``--json``."""
-    group.add_argument(
-        OPTION,
-        nargs="?",
-        const=STDOUT,
-        type=Path,
-        metavar="FILE.json",
-        help="the result for programs, instead of the text; into a file: beside it",
-    )
+def json_option() -> Any:
+    """Return the option ``--json``."""
+    text = "the result for programs, instead of the text; into a file: beside it"
+    return option("FILE.json", text, const=STDOUT, file="written at the end")
 
 
 def join_json_option(arguments: Iterable[str]) -> list[str]:
@@ -267,23 +287,18 @@ def join_json_option(arguments: Iterable[str]) -> list[str]:
     return joined
 
 
-def json_on_stdout(options: argparse.Namespace) -> bool:
-    """Return whether JSON replaces the text on standard output."""
-    return str(options.json) == STDOUT
-
-
-def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) -> None:
+def write_json(target: Path | None, form: str, tree: Mapping[str, Any]) -> None:
     """Print or write the result if ``--json`` is given.
 
     Args:
-        options: of the command.
+        target: value of ``--json``.
         form: name of the format, see ``bevviz.model.json_forms``.
         tree: the result: values that JSON can represent, NaN, and tuples.
 
     Raises:
         UserError: the file cannot be written.
     """
-    if options.json is None:
+    if target is None:
         return
     import json
 
@@ -291,19 +306,17 @@ def write_json(options: argparse.Namespace, form: str, tree: Mapping[str, Any]) 
     from bevviz.support.files import save_text
 
     text = json.dumps({"form": form_name(form), **_plain(tree)}, indent=1, allow_nan=False)
-    if json_on_stdout(options):
+    if target == STDOUT:
         print(text, flush=True)
     else:
-        save_text(options.json, f"{text}\n", OPTION)
+        save_text(target, f"{text}\n", OPTION)
 
 
-def print_result(
-    options: argparse.Namespace, form: str, tree: Mapping[str, Any], text: Callable[[], str]
-) -> None:
+def print_result(target: Path | None, form: str, tree: Mapping[str, Any], text: Callable[[], str]) -> None:
     """Print the result as text or as JSON, and write it as ``--json FILE`` says; see ``write_json``."""
-    if not json_on_stdout(options):
+    if target != STDOUT:
         print(text(), flush=True)
-    write_json(options, form, tree)
+    write_json(target, form, tree)
 
 
 def _plain(value: Any) -> Any:
@@ -317,51 +330,38 @@ def _plain(value: Any) -> Any:
 
 # --- the check that no output overwrites an input or another output ----------------------------
 
-READ = ("paths", "recording", "config", "model", "a", "b", "kitti_labels", "note_file", "blueprint")
-WRITTEN = {
-    "save": "--save",
-    "output": "-o",
-    "csv": "--csv",
-    "json": "--json",
-    "junit": "--junit",
-    "write": "--write",
-}
-# Files written at the end of the run. Only ``check_outputs`` checks their folder before.
-TEXTS = ("csv", "json", "write")
 
-
-def check_outputs(options: argparse.Namespace) -> None:
+def check_outputs(options: object) -> None:
     """Check the output paths before the run starts.
 
     Raises:
         UserError: an output is one of the inputs, also by another name or link. Or two outputs are the same
-            file. Or the folder of an output does not exist.
+            file. Or the folder of an output does not exist, where only the end of the run would tell.
     """
     if getattr(options, "check", False):  # It writes nothing.
         return
-    inputs = {identity: path for path in _inputs(options) for identity in _identities(path)}
+    files = [(bound, value) for bound, value in option_values(options) if bound.option.file]
+    inputs = {
+        identity: path
+        for bound, value in files
+        if bound.option.file == "read"
+        for path in map(Path, value if isinstance(value, tuple) else [value] if value else [])
+        for identity in _identities(path)
+    }
     outputs: dict[Path, str] = {}
-    for name, option in WRITTEN.items():
-        target = getattr(options, name, None)
-        if not isinstance(target, Path) or target.is_dir() or target == Path(STDOUT):
+    for bound, target in files:
+        name, use = bound.names[0], bound.option.file
+        if use == "read" or not isinstance(target, Path) or target.is_dir() or target == STDOUT:
             continue
-        other = outputs.setdefault(target.resolve(), option)
-        if other != option and (target.is_file() or not target.exists()):
-            raise UserError(f"{option} {target}: {other} writes that file; give another name")
-        if name in TEXTS and not target.parent.is_dir():
-            raise UserError(f"{option} {target}: there is no folder {target.parent}")
+        other = outputs.setdefault(target.resolve(), name)
+        if other != name and (target.is_file() or not target.exists()):
+            raise UserError(f"{name} {target}: {other} writes that file; give another name")
+        if use == "written at the end" and not target.parent.is_dir():
+            raise UserError(f"{name} {target}: there is no folder {target.parent}")
         for identity in _identities(target):
             if identity in inputs:
                 other_name = "" if inputs[identity] == target else f" ({inputs[identity]})"
-                raise UserError(f"{option} {target}: is what is read{other_name}; give another name")
-
-
-def _inputs(options: argparse.Namespace) -> Iterator[Path]:
-    for name in READ:
-        values = getattr(options, name, None)
-        for value in values if isinstance(values, list) else [values]:
-            if isinstance(value, str | Path) and str(value):
-                yield Path(value)
+                raise UserError(f"{name} {target}: is what is read{other_name}; give another name")
 
 
 def _identities(path: Path) -> Iterator[tuple[int, int]]:

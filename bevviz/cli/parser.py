@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from bevviz.cli.outputs import print_error
 from bevviz.support.text import did_you_mean, printable
@@ -21,24 +21,10 @@ _CHOICE = re.compile(r"invalid choice: '(?P<given>.*)' \(choose from (?P<known>.
 class Parser(argparse.ArgumentParser):
     """Parser of the program or of a command. An error is one line, followed by the command's usage."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._adders: list[Callable[[], object]] = []
-
-    def add_later(self, add: Callable[[], object]) -> None:
-        """Have options added when this parser is used, if it takes time to know them."""
-        self._adders.append(add)
-
-    def complete(self) -> None:
-        """Add the options that were left for later."""
-        while self._adders:
-            self._adders.pop()()
-
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str], namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse arguments like argparse. The command that got an unknown option reports it first."""
-        self.complete()
         for option in self._own_options(args):
             name = option.partition("=")[0]
             known = self._option_string_actions

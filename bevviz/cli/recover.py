@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.cli.options import Commands
+from bevviz.cli.command import command, option
 from bevviz.cli.outputs import say, warn
 from bevviz.errors import UserError
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``recover``."""
-    recover = commands.add_parser(
-        "recover",
-        help="a sound copy of a damaged bag",
-        description="Write all messages that can be read of a damaged bag, or of one without an index, to an "
-        "MCAP file, byte for byte.",
+@dataclass(frozen=True, kw_only=True)
+class RecoverOptions:
+    """Options of ``recover``."""
+
+    path: Path = option(
+        "DAMAGED", "bag: .mcap, .db3, .bag or a folder", positional=True, file="read", required=True
     )
-    recover.add_argument(
-        "paths", nargs=1, type=Path, metavar="DAMAGED", help="bag: .mcap, .db3, .bag or a folder"
-    )
-    recover.add_argument("-o", "--output", type=Path, required=True, metavar="FIXED.mcap", help="the copy")
-    recover.set_defaults(run=_recover)
+    output: Path = option("FIXED.mcap", "the copy", names=("-o", "--output"), file="written", required=True)
 
 
-def _recover(options: argparse.Namespace) -> int:
+@command(
+    "recover",
+    help="a sound copy of a damaged bag",
+    description="Write all messages that can be read of a damaged bag, or of one without an index, to an "
+    "MCAP file, byte for byte.",
+)
+def _recover(options: RecoverOptions) -> int:
     from bevviz.bags.bag import Recording
     from bevviz.report.bag_window import ReportWindow, cut_bag
 
-    (path,), output = options.paths, options.output
+    path, output = options.path, options.output
     if output.suffix != ".mcap":
         raise UserError(f"--output {output}: expected a file name that ends in .mcap")
     if output.exists():

@@ -2,103 +2,124 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
+from bevviz.cli.command import Group, command, flag, option
 from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_keep,
-    add_subject,
+    WHAT_TO_RUN,
+    ConfigOptions,
+    DriveOptions,
+    Keep,
+    SubjectOptions,
+    keep_option,
     load_config,
-    parse_real,
-    selected_subject,
 )
 from bevviz.cli.outputs import say, warn
+from bevviz.cli.values import seconds
 from bevviz.errors import UserError
 from bevviz.support.files import CONFIG_LIMIT, read_text
 
-_seconds = parse_real(lambda seconds: 0 <= seconds < 1e6, "is no time in seconds")
+
+@dataclass(frozen=True, kw_only=True)
+class ReportWindowOptions:
+    """Options that select the time of the report."""
+
+    group: ClassVar = WHAT_TO_RUN
+
+    at: str | None = option("TIME", "the time that the report is about")
+    before: float = option("SECONDS", "(default: 5)", parse=seconds, default=5.0)
+    after: float = option("SECONDS", "(default: 5)", parse=seconds, default=5.0)
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``report``."""
-    report = commands.add_parser(
-        "report",
-        help="a bug report that stands on its own, and its check",
-        description="Cut a window out of a bag, run it, and save a recording (bug.rrd), a page for any "
-        "browser (bug.html) and the raw messages (bug.mcap) to send on. With --check: run a report again and "
-        "compare.",
-        epilog="examples:\n"
-        "  bevviz report drive.mcap --at 12.5 --model yolo11n.onnx --class person --note 'no match for her'\n"
-        "  bevviz report --check bug.rrd",
+@dataclass(frozen=True, kw_only=True)
+class ReportSubject(SubjectOptions):
+    """Options that select the object of the report."""
+
+    group: ClassVar = Group(
+        "what to explain", "The object that the report is about. Nothing: the worst of the frame."
     )
-    group = add_bag(report)
-    group.add_argument("--at", metavar="TIME", help="the time that the report is about")
-    group.add_argument("--before", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
-    group.add_argument("--after", type=_seconds, default=5.0, metavar="SECONDS", help="(default: 5)")
-    add_subject(report, "The object that the report is about. Nothing: the worst of the frame.")
-    add_config(report)
-    content = report.add_argument_group("the report")
-    content.add_argument(
-        "-o", "--output", type=Path, default=Path("bug.rrd"), metavar="FILE.rrd", help="(default: bug.rrd)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContentOptions:
+    """Options for the content of the report."""
+
+    group: ClassVar = Group("the report")
+
+    output: Path = option(
+        "FILE.rrd", "(default: bug.rrd)", names=("-o", "--output"), file="written", default=Path("bug.rrd")
     )
-    note = content.add_mutually_exclusive_group()
-    note.add_argument("--note", default="", metavar="TEXT", help="what went wrong, in your words")
-    note.add_argument("--note-file", type=Path, metavar="FILE", help="the same, from a text file")
-    content.add_argument(
-        "--topics",
+    note: str = option("TEXT", "what went wrong, in your words", one_of="note text", default="")
+    note_file: Path | None = option("FILE", "the same, from a text file", one_of="note text", file="read")
+    topics: tuple[str, ...] | None = option(
+        "TOPIC",
+        "topics (* and ? match) in the bag beside those that the pipeline reads; default: all",
         nargs="*",
-        metavar="TOPIC",
-        help="topics (* and ? match) in the bag beside those that the pipeline reads; default: all",
     )
-    content.add_argument(
-        "--redact", action="store_true", help="hide the people and vehicles that the detector finds"
-    )
-    content.add_argument(
-        "--unredacted",
+    redact: bool = flag("hide the people and vehicles that the detector finds")
+    unredacted: tuple[str, ...] = option(
+        "TOPIC",
+        "with --redact: topics that are kept although nobody can tell what they show",
         nargs="+",
-        default=[],
-        metavar="TOPIC",
-        help="with --redact: topics that are kept although nobody can tell what they show",
+        default=(),
     )
-    content.add_argument("--include-model", action="store_true", help="copy the detector's file beside it")
-    add_keep(content)
-    content.add_argument("--force", action="store_true", help="overwrite an older report")
-    report.add_argument(
-        "--check", action="store_true", help="PATH is a report's .rrd: run its bag again and compare"
-    )
-    report.set_defaults(run=_report)
+    include_model: bool = flag("copy the detector's file beside it")
+    keep: Keep = keep_option()
+    force: bool = flag("overwrite an older report")
 
 
-def _report(options: argparse.Namespace) -> int:
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """Options of ``report``."""
+
+    drive: DriveOptions
+    window: ReportWindowOptions
+    subject: ReportSubject
+    config: ConfigOptions
+    content: ContentOptions
+    check: bool = flag("PATH is a report's .rrd: run its bag again and compare")
+
+
+@command(
+    "report",
+    help="a bug report that stands on its own, and its check",
+    description="Cut a window out of a bag, run it, and save a recording (bug.rrd), a page for any "
+    "browser (bug.html) and the raw messages (bug.mcap) to send on. With --check: run a report again and "
+    "compare.",
+    epilog="examples:\n"
+    "  bevviz report drive.mcap --at 12.5 --model yolo11n.onnx --class person --note 'no match for her'\n"
+    "  bevviz report --check bug.rrd",
+)
+def _report(options: ReportOptions) -> int:
     if options.check:
         return _check(options)
     from bevviz.bags.reader import megabytes
     from bevviz.pipeline.notes import Notes
     from bevviz.report.make import ReportRequest, make
 
-    if options.at is None:
+    window, content = options.window, options.content
+    if window.at is None:
         raise UserError("--at TIME is missing: the time that the report is about")
-    if options.unredacted and not options.redact:
+    if content.unredacted and not content.redact:
         raise UserError("--unredacted: everything is, without --redact")
     report = make(
         ReportRequest(
-            paths=options.paths,
+            paths=options.drive.paths,
             config=load_config(options),
-            at=options.at,
-            before=options.before,
-            after=options.after,
-            output=options.output,
-            selection=selected_subject(options),
-            note=options.note if options.note_file is None else _read(options.note_file),
-            topics=options.topics,
-            redact=options.redact,
-            unredacted=options.unredacted,
-            include_model=options.include_model,
-            force=options.force,
-            notes=list(Notes(options.paths)),
+            at=window.at,
+            before=window.before,
+            after=window.after,
+            output=content.output,
+            selection=options.subject.selection(),
+            note=content.note if content.note_file is None else _read(content.note_file),
+            topics=content.topics,
+            redact=content.redact,
+            unredacted=content.unredacted,
+            include_model=content.include_model,
+            force=content.force,
+            notes=list(Notes(options.drive.paths)),
         )
     )
     warn(report.warnings)
@@ -110,13 +131,14 @@ def _report(options: argparse.Namespace) -> int:
     return 0 if report.frames else 1
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: ReportOptions) -> int:
     from bevviz.report.check import check
 
-    if len(options.paths) != 1:
+    drive = options.drive
+    if len(drive.paths) != 1:
         raise UserError("--check takes one report: bevviz report --check bug.rrd")
     verdict = check(
-        options.paths[0], model=None if options.model is None else Path(options.model), settings=options.set
+        drive.paths[0], model=None if drive.model is None else Path(drive.model), settings=options.config.set
     )
     for line in verdict.lines():
         print(line)

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
-from bevviz.cli.options import Commands
+from bevviz.cli.command import command, flag
 from bevviz.errors import UserError
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``store``."""
-    store = commands.add_parser(
-        "store",
-        help="the results that are kept on disk, so that no command makes them twice",
-        description="Print where detections of images and results of stages are kept, how many there are, "
-        "and what they take. --set store.size=0 makes a command do without them.",
-    )
-    store.add_argument("--clear", action="store_true", help="delete all results")
-    store.set_defaults(run=_store)
+@dataclass(frozen=True, kw_only=True)
+class StoreOptions:
+    """Options of ``store``."""
+
+    clear: bool = flag("delete all results")
 
 
-def _store(options: argparse.Namespace) -> int:
+@command(
+    "store",
+    help="the results that are kept on disk, so that no command makes them twice",
+    description="Print where detections of images and results of stages are kept, how many there are, "
+    "and what they take. --set store.size=0 makes a command do without them.",
+)
+def _store(options: StoreOptions) -> int:
     from bevviz.config import load
     from bevviz.pipeline.result_store import ResultStore, store_folder
 

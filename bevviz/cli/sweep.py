@@ -2,77 +2,68 @@
 
 from __future__ import annotations
 
-import argparse
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from bevviz.cli.options import (
-    Commands,
-    add_bag,
-    add_config,
-    add_output,
-    add_selection,
-    add_truth,
-    collect_settings,
-    find_truth,
-    load_config_from,
-    open_bag,
-)
-from bevviz.cli.outputs import Outputs, add_json, print_hints, print_result, warn
+from bevviz.cli.command import command, option
+from bevviz.cli.options import ConfigOptions, DriveOptions, RangeOptions, TruthOptions, load_config, open_bag
+from bevviz.cli.outputs import Outputs, json_option, print_hints, print_result, warn
 from bevviz.cli.run import run_with_progress, table_status
 
-if TYPE_CHECKING:
-    from bevviz.config import Config
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOutputs(Outputs):
+    """Outputs of ``sweep``."""
+
+    json: Path | None = json_option()
+    csv: Path | None = option("FILE", "the table, with each stage and class", file="written at the end")
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``sweep``."""
-    sweep = commands.add_parser(
-        "sweep",
-        help="a parameter over a range: counts, times, precision and recall",
-        description="Run every value of one or two parameters on the same frames. --set takes ranges "
-        "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
-    )
-    group = add_bag(sweep)
-    add_selection(group)
-    add_truth(sweep)
-    add_config(sweep)
-    output = add_output(sweep, blueprint=None)
-    add_json(output)
-    output.add_argument("--csv", type=Path, metavar="FILE", help="the table, with each stage and class")
-    sweep.set_defaults(run=_sweep)
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Options of ``sweep``."""
+
+    drive: DriveOptions
+    frames: RangeOptions
+    truth: TruthOptions
+    config: ConfigOptions
+    output: SweepOutputs
 
 
-def _sweep(options: argparse.Namespace) -> int:
+@command(
+    "sweep",
+    help="a parameter over a range: counts, times, precision and recall",
+    description="Run every value of one or two parameters on the same frames. --set takes ranges "
+    "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
+)
+def _sweep(options: SweepOptions) -> int:
     from bevviz.config import flatten
     from bevviz.pipeline.session import common_frames
     from bevviz.sweep import Sweep, combine, parse
     from bevviz.sweep.log import layout, log_sweep
 
-    parameters, options.set = parse(options.set)
-
-    def configured(settings: list[str]) -> Config:
-        return load_config_from(
-            options, options.config, [*collect_settings(options), *settings], options.preset
-        )
-
+    parameters, constant = parse(options.config.set)
+    unswept = replace(options, config=replace(options.config, set=tuple(constant)))
+    configured = partial(load_config, unswept)
     configs = combine(parameters, configured)
     config = common_frames(configs.values())
-    with open_bag(options, config) as source:
-        sweep = Sweep(parameters, configs, find_truth(options, source))
-        outputs = Outputs.of(options)._replace(blueprint=layout(sweep))
+    with open_bag(options.drive, options.frames, config) as source:
+        sweep = Sweep(parameters, configs, options.truth.find(source))
+        outputs = options.output
         with ExitStack() as stack:
             # The run may take long. Report an output that cannot be opened before it.
-            sinks = stack.enter_context(outputs.opened(source.scene, source.config)) if outputs else None
+            opened = outputs.opened(source.scene, source.config, layout(sweep)) if outputs else nullcontext()
+            sinks = stack.enter_context(opened)
             print_hints(source.scene, config)
             end = run_with_progress(source, sweep, [])
             warn(source.warnings)
-            print_result(options, "sweep", sweep.as_tree(), sweep.table)
-            if options.csv is not None:
-                sweep.write_csv(options.csv)
+            print_result(outputs.json, "sweep", sweep.as_tree(), sweep.table)
+            if outputs.csv is not None:
+                sweep.write_csv(outputs.csv)
             if sinks is not None:
-                values = flatten(configured([]).model_dump())
+                values = flatten(configured().model_dump())
                 present = {p.key: f"{values.get(p.key, '')}" for p in parameters}
                 log_sweep(sinks.recording, sweep, source.scene.name, present)
                 if not end.interrupted:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevviz.cli.options import Commands
+from bevviz.cli.command import command, flag, option
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -19,31 +19,29 @@ EXAMPLES = """examples:
   bevviz trust --revoke robot.yaml"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``trust``."""
-    trust = commands.add_parser(
-        "trust",
-        help="let the functions of a project file, or of a YAML file, run",
-        description="A project file or a YAML file can name functions (module:function), which are code. "
-        "They run once you trust the file. After an edit of the file or of a module beside it, bevviz asks "
-        "again. Read them first: a module may import each Python file of the folder.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=EXAMPLES,
-    )
-    trust.add_argument(
-        "path",
+@dataclass(frozen=True, kw_only=True)
+class TrustOptions:
+    """Options of ``trust``."""
+
+    path: Path | None = option(
+        "PATH",
+        "project file, YAML file, or folder (default: the project of this folder)",
+        positional=True,
         nargs="?",
-        type=Path,
-        metavar="PATH",
-        help="project file, YAML file, or folder (default: the project of this folder)",
     )
-    instead = trust.add_mutually_exclusive_group()
-    instead.add_argument("--list", action="store_true", help="print what is trusted")
-    instead.add_argument("--revoke", action="store_true", help="trust PATH no longer")
-    trust.set_defaults(run=_trust)
+    list: bool = flag("print what is trusted", one_of="instead")
+    revoke: bool = flag("trust PATH no longer", one_of="instead")
 
 
-def _trust(options: argparse.Namespace) -> int:
+@command(
+    "trust",
+    help="let the functions of a project file, or of a YAML file, run",
+    description="A project file or a YAML file can name functions (module:function), which are code. "
+    "They run once you trust the file. After an edit of the file or of a module beside it, bevviz asks "
+    "again. Read them first: a module may import each Python file of the folder.",
+    epilog=EXAMPLES,
+)
+def _trust(options: TrustOptions) -> int:
     from bevviz.config.project import named_code
     from bevviz.config.trust import grant_trust, revoke_trust
 

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
-from bevviz.cli.options import (
-    Commands,
-    add_at,
-    add_bag,
-    add_config,
-    add_output,
-    add_subject,
-    load_config,
-    positive,
-    selected_subject,
-)
-from bevviz.cli.outputs import Outputs, add_json, print_result, say, warn
+from bevviz.cli.command import Group, command, extensions, flag, option
+from bevviz.cli.options import ConfigOptions, DriveOptions, FrameOptions, SubjectOptions, load_config
+from bevviz.cli.outputs import Outputs, json_option, layout_option, print_result, say, warn
+from bevviz.cli.values import positive
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.contexts import garbage_collection_off
-from bevviz.support.extensions import load_all
 
 if TYPE_CHECKING:
-    from bevviz.cli.parser import Parser
     from bevviz.model.frame import Scene
     from bevviz.model.json_forms import WhyForm
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, FrameExplainer, Selection
-    from bevviz.why.robot_questions import Question
 
 EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx                  whatever went wrong in that frame
@@ -40,41 +29,47 @@ EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --point 8.2,-1.5,-0.8 --serve         what is there, shown in a browser"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``why``."""
-    why = commands.add_parser(
-        "why",
-        help="why an object was reported, or was not",
-        description="Follow an object through the stages of one frame: where it was lost, by which number, "
-        "and which change of the configuration would keep it, which is tried before it is said.",
-        epilog=EXAMPLES,
-    )
-    group = add_bag(why)
-    add_at(group, "the scan nearest to this time", required=True)
-    targets = add_subject(why, "Nothing: what did not end as an object of its own.")
-    targets.add_argument(
-        "--limit", type=positive, default=5, metavar="N", help="the N worst with their chain (default: 5)"
-    )
-    targets.add_argument(
-        "--all", action="store_true", help="also what went well, and what nothing could be done about"
-    )
-    add_json(why)
-    add_config(why)
-    add_output(why, blueprint="explain").description = "None, unless one is given."
-    why.set_defaults(run=_why)
-    why.add_later(lambda: _add_questions(why, targets))
+@dataclass(frozen=True, kw_only=True)
+class WhySubject(SubjectOptions):
+    """Options that select the explained objects."""
+
+    group: ClassVar = Group("what to explain", "Nothing: what did not end as an object of its own.")
+
+    limit: int = option("N", "the N worst with their chain (default: 5)", parse=positive, default=5)
+    all: bool = flag("also what went well, and what nothing could be done about")
 
 
-def _add_questions(why: Parser, group: argparse._ArgumentGroup) -> None:
-    """Add the options of the questions that are registered."""
-    questions = [*load_all("questions", lambda text: warn([text]))]
-    for question in questions:
-        question.add_options(group)
-    why.set_defaults(questions=questions)
+@dataclass(frozen=True, kw_only=True)
+class WhyOutputs(Outputs):
+    """Outputs of ``why``."""
+
+    group: ClassVar = Group("output", "None, unless one is given.")
+
+    blueprint: str = layout_option("explain")
 
 
+@dataclass(frozen=True, kw_only=True)
+class WhyOptions:
+    """Options of ``why``."""
+
+    drive: DriveOptions
+    frame: FrameOptions
+    subject: WhySubject
+    json: Path | None = json_option()
+    config: ConfigOptions
+    output: WhyOutputs
+
+
+@command(
+    "why",
+    help="why an object was reported, or was not",
+    description="Follow an object through the stages of one frame: where it was lost, by which number, "
+    "and which change of the configuration would keep it, which is tried before it is said.",
+    epilog=EXAMPLES,
+    extended_by="questions",
+)
 @garbage_collection_off()
-def _why(options: argparse.Namespace) -> int:
+def _why(options: WhyOptions) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
@@ -82,36 +77,39 @@ def _why(options: argparse.Namespace) -> int:
     from bevviz.why import FrameExplainer
     from bevviz.why.answer_text import plain_text
 
-    config, selection = load_config(options), selected_subject(options)
-    with BagSource(options.paths, config, at=options.at) as source:
+    config, subject, at = load_config(options), options.subject, options.frame.at
+    selection = subject.selection()
+    with BagSource(options.drive.paths, config, at=at) as source:
         loader = StageLoader()
         session = Session(config, loader=loader)
-        row = options.at_frame
+        row = options.frame.at_frame
         frame = next(iter(source), None) if row is None else source.frame(row)
         warn(source.warnings)
         if frame is None:
-            option = f"--at {options.at}" if row is None else f"--at-frame {row}"
+            option = f"--at {at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{option}: the scan there cannot be read")
-        questions: list[Question] = options.questions
-        answered = (question.answer(options, source, frame, selection) for question in questions)
+        answered = (
+            question.answer(asked, source, frame, selection, subject.limit, subject.all)
+            for question, asked in extensions(options)
+        )
         if (further := next(filter(None, answered), None)) is not None:
             tree, lines = further
-            print_result(options, "why", tree, lambda: "\n".join(map(printable, lines)))
+            print_result(options.json, "why", tree, lambda: "\n".join(map(printable, lines)))
             return 0
-        outputs = Outputs.of(options)
+        outputs = options.output
         result = session.run(frame) if outputs else session.run_explained(frame)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
-        answers = questioner.explain(selection, options.limit, bar, everything=options.all)
+        answers = questioner.explain(selection, subject.limit, bar, everything=subject.all)
         neighbours = _neighbours(questioner, selection, answers)
         unseen = _unseen(questioner, selection, answers)
         headline = _headline(questioner, selection)
         text = printable(f"frame {frame.index}, preset {config.preset}: {headline}")
         if answers:
-            text = f"{text}\n\n{plain_text(answers, options.limit, neighbours, unseen)}"
-        print_result(options, "why", _tree(result, answers, neighbours, headline), lambda: text)
+            text = f"{text}\n\n{plain_text(answers, subject.limit, neighbours, unseen)}"
+        print_result(options.json, "why", _tree(result, answers, neighbours, headline), lambda: text)
         if outputs:
-            _show(result, answers, source.scene, outputs, options.limit)
+            _show(result, answers, source.scene, outputs, subject.limit)
     return 0
 
 

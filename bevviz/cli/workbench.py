@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 from urllib.parse import urlencode
 
+from bevviz.cli.command import Group, command, flag, option
 from bevviz.cli.interrupts import interruptible, wait_for_interrupt
-from bevviz.cli.options import Commands, add_at, add_bag, add_config, add_truth, load_config, port
+from bevviz.cli.options import ConfigOptions, DriveOptions, FrameOptions, TruthOptions, load_config
 from bevviz.cli.outputs import announce, has_display, print_hints, say, warn
+from bevviz.cli.values import port
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,37 +32,50 @@ EXAMPLES = """examples:
   bevviz bag drive.mcap --viewer                        Rerun's own viewer (or --connect URL), no questions"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``open``."""
-    command = commands.add_parser(
-        "open",
-        help="the workbench: a page where a click on anything answers why",
-        description="Open a drive in the workbench: a page of this machine alone, with Rerun's viewer and a "
-        "panel. A click on a box, a point or a pixel answers why it is what it is; what was missed is "
-        "listed; hints and parameters are tried on the shown frame at once.",
-        epilog=EXAMPLES,
-    )
-    group = add_bag(command)
-    add_at(group, "show the scan nearest to this time first")
-    add_truth(command)
-    add_config(command)
-    page = command.add_argument_group("page")
-    page.add_argument(
-        "--port", type=port, metavar="N", help="of the page (default: 9880, else one that is free)"
-    )
-    page.add_argument(
-        "--no-browser", dest="browser", action="store_false", help="print the address, open nothing"
-    )
-    command.set_defaults(run=_open, shows_recordings=True)
+@dataclass(frozen=True, kw_only=True)
+class FirstFrameOptions(FrameOptions):
+    """Options that select the frame that is shown first."""
+
+    at: str | None = option("TIME", "show the scan nearest to this time first", one_of="frame")
 
 
-def _open(options: argparse.Namespace) -> int:
-    if (recording := getattr(options, "shown", None)) is not None:
-        return _show(recording, options)
+@dataclass(frozen=True, kw_only=True)
+class PageOptions:
+    """Options for the page."""
+
+    group: ClassVar = Group("page")
+
+    port: int | None = option("N", "of the page (default: 9880, else one that is free)", parse=port)
+    browser: bool = flag("print the address, open nothing", names=("--no-browser",), default=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenOptions:
+    """Options of ``open``."""
+
+    drive: DriveOptions
+    frame: FirstFrameOptions
+    truth: TruthOptions
+    config: ConfigOptions
+    page: PageOptions
+    shown: Path | None = None  # recording without a bag
+
+
+@command(
+    "open",
+    help="the workbench: a page where a click on anything answers why",
+    description="Open a drive in the workbench: a page of this machine alone, with Rerun's viewer and a "
+    "panel. A click on a box, a point or a pixel answers why it is what it is; what was missed is "
+    "listed; hints and parameters are tried on the shown frame at once.",
+    epilog=EXAMPLES,
+)
+def _open(options: OpenOptions) -> int:
+    if options.shown is not None:
+        return _show(options.shown, options.page.port)
     return open_page(options, load_config(options))
 
 
-def open_page(options: argparse.Namespace, config: Config, shown: Mapping[str, str] = EMPTY) -> int:
+def open_page(options: OpenOptions, config: Config, shown: Mapping[str, str] = EMPTY) -> int:
     """Serve the workbench until the user ends it.
 
     Args:
@@ -77,37 +92,36 @@ def open_page(options: argparse.Namespace, config: Config, shown: Mapping[str, s
         ) from None
     from bevviz.bags.remote import beside
 
+    paths, truth, page = options.drive.paths, options.truth, options.page
+    at, number = options.frame.at, options.frame.at_frame or 0
     with ExitStack() as stack:
-        source = stack.enter_context(LabelledSource(options.paths, config))
-        number = options.at_frame or 0
-        first = source.checked(number) if options.at is None else source.number_at(options.at)
+        source = stack.enter_context(LabelledSource(paths, config))
+        first = source.checked(number) if at is None else source.number_at(at)
         warn(source.warnings)
 
         def make() -> WorkbenchSession:
             _arrow_without_pandas()
-            second_source = stack.enter_context(LabelledSource(options.paths, config))
+            second_source = stack.enter_context(LabelledSource(paths, config))
             print_hints(source.scene, config)
             from bevviz.drive import Drive
-            from bevviz.evaluate import truth_source
             from bevviz.workbench.recorded_drive import recorded_session
 
-            truth_of = truth_source(source.roles, options.truth, options.kitti_labels, len(source.scans))
-            if options.truth is not None or options.kitti_labels is not None:
+            truth_of, labels = truth.find(source), (truth.truth, truth.kitti_labels)
+            if labels != (None, None):
                 source.truth_of = second_source.truth_of = truth_of
-            labels = options.truth, options.kitti_labels
             drive = Drive(source, config)
-            return recorded_session(drive, second_source, options.paths, truth_of, first, labels)
+            return recorded_session(drive, second_source, paths, truth_of, first, labels)
 
         def ready(address: str) -> None:
-            announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, options.browser)
+            announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, page.browser)
 
         with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
-            drive = "\n".join(str(beside(path)) for path in options.paths)
-            serve(make, drive, options.port, ready)
+            drive = "\n".join(str(beside(path)) for path in paths)
+            serve(make, drive, page.port, ready)
     return 0
 
 
-def _show(recording: Path, options: argparse.Namespace) -> int:
+def _show(recording: Path, port: int | None) -> int:
     """Show a recording without a bag. It can be looked at, but not asked."""
     from bevviz.recording import rerun_cli
 
@@ -117,7 +131,7 @@ def _show(recording: Path, options: argparse.Namespace) -> int:
         return 0
     if larger := rerun_cli.too_large_for_web(recording, recording.stat().st_size):
         warn([larger])
-    with rerun_cli.serve_in_browser(recording, options.port) as address:
+    with rerun_cli.serve_in_browser(recording, port) as address:
         announce("viewer", address)
         wait_for_interrupt()
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D, Cloud, Image
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult, Tracks
-
-if TYPE_CHECKING:
-    import argparse
 
 BEV = "/visualization/bev_image"
 OBSTACLES = "/lidar/points_no_ground"
@@ -67,11 +64,14 @@ class ClosableSink(ResultSink, AbstractContextManager[Any], Protocol):
 class Watch(Protocol):
     """Program beside a live run that shows the results, registered in the group ``bevviz.watches``."""
 
-    def add_options(self, group: argparse._ArgumentGroup) -> None:
-        """Add the options of ``bevviz live`` by which a user asks for it."""
+    OPTIONS: type  # dataclass of the options of ``bevviz live`` by which a user asks for it
 
-    def open_sink(self, options: argparse.Namespace) -> ClosableSink | None:
+    def open_sink(self, options: Any, *, observe: bool) -> ClosableSink | None:
         """Return what takes the results. None: the options do not ask for it.
+
+        Args:
+            options: values of ``OPTIONS``.
+            observe: whether the run makes no results.
 
         Raises:
             UserError: it cannot be started.

@@ -11,8 +11,6 @@ from bevviz.model.json_forms import WhyForm
 from bevviz.support.extensions import find
 
 if TYPE_CHECKING:
-    import argparse
-
     from bevviz.why.selection import Selection
 
 
@@ -40,13 +38,26 @@ class RobotQuestions(Protocol):
 class Question(Protocol):
     """Question of ``bevviz why`` and of the workbench, registered in the group ``bevviz.questions``."""
 
-    def add_options(self, group: argparse._ArgumentGroup) -> None:
-        """Add the options of ``bevviz why`` by which a user asks it."""
+    OPTIONS: type  # dataclass of the options of ``bevviz why`` by which a user asks it
 
     def answer(
-        self, options: argparse.Namespace, source: BagSource, frame: Frame, selection: Selection
+        self,
+        options: Any,
+        source: BagSource,
+        frame: Frame,
+        selection: Selection,
+        limit: int,
+        everything: bool,
     ) -> tuple[WhyForm, Sequence[str]] | None:
         """Return the answer as JSON and as lines. None: the options do not ask it.
+
+        Args:
+            options: values of ``OPTIONS``.
+            source: frames of the drive.
+            frame: the asked frame.
+            selection: the asked objects.
+            limit: objects that are told with their steps.
+            everything: tell also what went well.
 
         Raises:
             UserError: the selection is none of the question, or there is no answer.

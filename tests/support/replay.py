@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from bevviz.model.frame import Frame, Scene
 
 if TYPE_CHECKING:
-    import argparse
-
+    from bevviz.cli.live import LiveOptions
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.publish import ResultSink
     from bevviz.live.status import Notes
@@ -88,7 +87,7 @@ def main() -> int:
 
     def run(
         settings: ReloadableConfig,
-        options: argparse.Namespace,
+        options: LiveOptions,
         notes: Notes,
         loader: StageLoader,
         sinks: Sequence[ResultSink],

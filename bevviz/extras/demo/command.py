@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bevviz
-from bevviz.cli.options import Commands, add_config, add_keep, add_output, positive
-from bevviz.cli.outputs import Outputs, say
+from bevviz.cli.command import command, flag, option
+from bevviz.cli.options import ConfigOptions, DriveOptions, Keep, TruthOptions, keep_option
+from bevviz.cli.outputs import Outputs, layout_option, say
 from bevviz.cli.run import process
+from bevviz.cli.values import positive
 from bevviz.errors import UserError
 from bevviz.support import progress
 from bevviz.support.files import atomic_write, write_all
@@ -42,86 +44,90 @@ bevviz why flat.mcap --at 3 --class car --model demo --preset reference
 'bevviz calib' finds the last three: bevviz demo --weave --plant late_image -o late.mcap"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``demo``."""
-    demo = commands.add_parser(
-        "demo",
-        help="a missed pedestrian in a synthetic drive, and why",
-        description="Take a simulated drive past cars, pedestrians and cyclists, say why one of them is "
-        "missed, and open the workbench on it. With an output: run the pipeline on the drive instead. The "
-        "options of the simulator make another drive, with Open3D.",
+@dataclass(frozen=True, kw_only=True)
+class SimulatorOptions:
+    """Options for another drive than the one that ships with bevviz."""
+
+    frames: int | None = option("N", "simulate a drive of N scans at 10 Hz (default: 100)", parse=positive)
+    seed: int = option("SEED", "simulate another street (default: 0)", default=0)
+    plant: tuple[str, ...] = option(
+        "NAME",
+        "simulate a fault that perception gets wrong, see below; several times for several",
+        repeat=True,
     )
-    demo.add_argument(
-        "--frames", type=positive, metavar="N", help="simulate a drive of N scans at 10 Hz (default: 100)"
-    )
-    demo.add_argument("--seed", type=int, default=0, help="simulate another street (default: 0)")
-    demo.add_argument(
-        "--plant",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="simulate a fault that perception gets wrong, see below; several times for several",
-    )
-    demo.add_argument(
-        "--weave",
-        action="store_true",
-        help="simulate a vehicle that swerves, as it should to calibrate sensors",
-    )
-    demo.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="FILE.mcap",
-        help="write the drive as a ROS 2 bag instead of running on it",
-    )
-    demo.formatter_class = argparse.RawDescriptionHelpFormatter
-    demo.epilog = PLANTS
-    add_config(demo)
-    add_keep(add_output(demo))
-    demo.set_defaults(run=_demo)
+    weave: bool = flag("simulate a vehicle that swerves, as it should to calibrate sensors")
+
+    def __bool__(self) -> bool:
+        """Return whether such a drive is asked for."""
+        return bool(self.plant or self.frames or self.seed or self.weave)
+
+    def source(self, frames: int) -> SyntheticSource:
+        """Return the simulated drive; ``frames`` is its length if none is stated."""
+        from bevviz.extras.demo.drive import SyntheticSource
+
+        return SyntheticSource(self.frames or frames, self.seed, plant=self.plant, weave=self.weave)
 
 
-def _demo(options: argparse.Namespace) -> int:
-    outputs = Outputs.of(options)
-    if options.output is not None:
-        frames = _make_bag(options, options.output)
-        print(f"{options.output}: {frames} scans; 'bevviz bag {options.output} --model demo' runs on it")
+@dataclass(frozen=True, kw_only=True)
+class DemoOutputs(Outputs):
+    """Outputs of ``demo``."""
+
+    blueprint: str = layout_option("debug")
+    keep: Keep = keep_option()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Options of ``demo``."""
+
+    simulator: SimulatorOptions
+    bag: Path | None = option(
+        "FILE.mcap",
+        "write the drive as a ROS 2 bag instead of running on it",
+        names=("-o", "--output"),
+        file="written",
+    )
+    config: ConfigOptions
+    output: DemoOutputs
+
+
+@command(
+    "demo",
+    help="a missed pedestrian in a synthetic drive, and why",
+    description="Take a simulated drive past cars, pedestrians and cyclists, say why one of them is "
+    "missed, and open the workbench on it. With an output: run the pipeline on the drive instead. The "
+    "options of the simulator make another drive, with Open3D.",
+    epilog=PLANTS,
+)
+def _demo(options: DemoOptions) -> int:
+    outputs, simulator, bag = options.output, options.simulator, options.bag
+    if bag is not None:
+        frames = _make_bag(simulator, bag)
+        print(f"{bag}: {frames} scans; 'bevviz bag {bag} --model demo' runs on it")
         return 0
     if not outputs and find_spec("rerun_notebook") is not None:
         return _show_missed(options)
     from bevviz.drive import Drive
 
-    config = _config(options, options.preset)
-    if _is_simulated(options):
-        return process(Drive(_simulated(options, FRAMES), config), outputs, Path("demo.rrd"))
+    config = _config(options.config, options.config.preset)
+    if simulator:
+        return process(Drive(simulator.source(FRAMES), config), outputs, Path("demo.rrd"))
     from bevviz.bags.source import BagSource
 
     with BagSource([SHIPPED], config) as source:
         return process(Drive(source, config), outputs, Path("demo.rrd"))
 
 
-def _is_simulated(options: argparse.Namespace) -> bool:
-    """Return whether a drive is asked for that does not ship with bevviz."""
-    return bool(options.plant or options.frames or options.seed or options.weave)
-
-
-def _config(options: argparse.Namespace, preset: Preset | None) -> Config:
+def _config(options: ConfigOptions, preset: Preset | None) -> Config:
     """Return the configuration. It ignores the project's sensors and network, to be the same everywhere."""
     from bevviz.config import Layer, load
 
-    return load(options.config, options.set, preset, layers=[Layer("demo", {"detector.model": "demo"})])
+    return load(options.file, options.set, preset, layers=[Layer("demo", {"detector.model": "demo"})])
 
 
-def _simulated(options: argparse.Namespace, frames: int) -> SyntheticSource:
-    """Return the simulated drive; ``frames`` is its length if none is stated."""
-    from bevviz.extras.demo.drive import SyntheticSource
-
-    return SyntheticSource(options.frames or frames, options.seed, plant=options.plant, weave=options.weave)
-
-
-def _make_bag(options: argparse.Namespace, path: Path, frames: int = FRAMES) -> int:
+def _make_bag(simulator: SimulatorOptions, path: Path, frames: int = FRAMES) -> int:
     """Copy the shipped drive, or simulate one of ``frames`` scans. Return the number of its scans."""
-    if not _is_simulated(options):
+    if not simulator:
         if path.suffix != ".mcap":
             raise UserError(f"{path}: a bag is written as MCAP, so its name must end in .mcap")
         if path.exists():
@@ -131,24 +137,25 @@ def _make_bag(options: argparse.Namespace, path: Path, frames: int = FRAMES) -> 
         return SHIPPED_FRAMES
     from bevviz.extras.demo.bag import write_bag
 
-    source = _simulated(options, frames)
+    source = simulator.source(frames)
     write_bag(source, path, progress.bar(source, total=source.total, unit="scan", desc="simulate"))
     return source.total
 
 
-def _show_missed(options: argparse.Namespace) -> int:
+def _show_missed(options: DemoOptions) -> int:
     """Say why the nearest missed object is missed, and open the workbench on it."""
     from bevviz.bags.source import BagSource
-    from bevviz.cli.workbench import open_page
+    from bevviz.cli.workbench import FirstFrameOptions, OpenOptions, PageOptions, open_page
     from bevviz.pipeline.session import Session
     from bevviz.why import FrameExplainer
 
-    config = _config(options, options.preset or (None if options.config else "reference"))
-    number = _frame_of_interest(options)
-    if BAG.exists() and not _is_simulated(options):
+    chosen, simulator = options.config, options.simulator
+    config = _config(chosen, chosen.preset or (None if chosen.file else "reference"))
+    number = _frame_of_interest(simulator)
+    if BAG.exists() and not simulator:
         say(f"{BAG} is there already and is opened again; remove it for a new one")
     else:
-        _make_bag(options, BAG, number + FURTHER)
+        _make_bag(simulator, BAG, number + FURTHER)
     with BagSource([BAG], config) as source:
         frame = source.frame(min(number, len(source.scans) - 1))
         if frame is None:
@@ -160,15 +167,20 @@ def _show_missed(options: argparse.Namespace) -> int:
     for answer in missed[:1]:
         print(f"{number / 10:.1f} s into {BAG}: {explainer.with_hints(answer).text}", flush=True)
         where["pick"] = str(answer.selection)
-    page = argparse.Namespace(**vars(options), paths=[BAG], at=None, at_frame=number, port=None, browser=True)
-    page.truth = page.kitti_labels = None
+    page = OpenOptions(
+        drive=DriveOptions(paths=(BAG,)),
+        frame=FirstFrameOptions(at_frame=number),
+        truth=TruthOptions(),
+        config=options.config,
+        page=PageOptions(),
+    )
     return open_page(page, config, where)
 
 
-def _frame_of_interest(options: argparse.Namespace) -> int:
+def _frame_of_interest(simulator: SimulatorOptions) -> int:
     """Return the frame in which the first planted fault is seen best."""
-    if not _is_simulated(options):
+    if not simulator:
         return SHIPPED_CHILD
     from bevviz.extras.demo.faults import FAULTS
 
-    return next((round(10 * FAULTS[name].time) for name in options.plant if name in FAULTS), 0)
+    return next((round(10 * FAULTS[name].time) for name in simulator.plant if name in FAULTS), 0)

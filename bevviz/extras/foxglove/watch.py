@@ -4,51 +4,17 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
-from bevviz.cli.options import port
+from bevviz.cli.command import option
+from bevviz.cli.options import WHAT_TO_RUN
 from bevviz.cli.outputs import say
+from bevviz.cli.values import port
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.extras.foxglove.server import FoxgloveServer
-
-
-def add_options(group: argparse._ArgumentGroup) -> None:
-    """Add ``--foxglove`` and ``--foxglove-origin``."""
-    group.add_argument(
-        "--foxglove",
-        nargs="?",
-        type=port,
-        const=8765,
-        metavar="PORT",
-        help="serve the results to Foxglove on this machine (default: 8765)",
-    )
-    group.add_argument(
-        "--foxglove-origin",
-        action="append",
-        type=_web_origin,
-        default=[],
-        metavar="ORIGIN",
-        help="further web site whose pages may connect to --foxglove, as http://localhost:8080",
-    )
-
-
-def open_sink(options: argparse.Namespace) -> FoxgloveServer | None:
-    """Start the server, if it is requested.
-
-    Raises:
-        UserError: a package is missing, the port is in use, or there are no results to serve.
-    """
-    if options.foxglove is None:
-        return None
-    if options.observe:
-        raise UserError("--observe makes no results that --foxglove could serve: leave one of them out")
-    from bevviz.extras.foxglove.server import FoxgloveServer
-
-    server = FoxgloveServer(options.foxglove, options.foxglove_origin, say)
-    say(f"Foxglove: open the connection {server.address}", always=True)
-    return server
 
 
 def _web_origin(text: str) -> str:
@@ -56,3 +22,40 @@ def _web_origin(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no origin, such as http://localhost:8080")
     return text
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoxgloveOptions:
+    """Options for the server for Foxglove."""
+
+    group: ClassVar = WHAT_TO_RUN
+
+    foxglove: int | None = option(
+        "PORT", "serve the results to Foxglove on this machine (default: 8765)", parse=port, const=8765
+    )
+    foxglove_origin: tuple[str, ...] = option(
+        "ORIGIN",
+        "further web site whose pages may connect to --foxglove, as http://localhost:8080",
+        parse=_web_origin,
+        repeat=True,
+    )
+
+
+OPTIONS = FoxgloveOptions
+
+
+def open_sink(options: FoxgloveOptions, *, observe: bool) -> FoxgloveServer | None:
+    """Start the server, if it is requested.
+
+    Raises:
+        UserError: a package is missing, the port is in use, or there are no results to serve.
+    """
+    if options.foxglove is None:
+        return None
+    if observe:
+        raise UserError("--observe makes no results that --foxglove could serve: leave one of them out")
+    from bevviz.extras.foxglove.server import FoxgloveServer
+
+    server = FoxgloveServer(options.foxglove, options.foxglove_origin, say)
+    say(f"Foxglove: open the connection {server.address}", always=True)
+    return server

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.cli.options import Commands, add_bag, add_config, add_truth, load_config
+from bevviz.cli.command import command, option, option_values
+from bevviz.cli.options import ConfigOptions, DriveOptions, TruthOptions, load_config
 from bevviz.cli.outputs import say, set_up_notes, warn
 from bevviz.errors import UserError
 
@@ -15,28 +16,24 @@ EXAMPLES = """examples:
   bevviz mcp drive.mcap --allow-write reports           may also write reports and pictures, there"""
 
 
-def add(commands: Commands) -> None:
-    """Add the command ``mcp``."""
-    command = commands.add_parser(
-        "mcp",
-        help="a server for agents (Model Context Protocol) over a drive or a batch",
-        description="Serve questions about a drive to an agent, by the Model Context Protocol on standard "
-        "input and output: findings, why, other values, compare, evaluate. It reads only what is named here.",
-        epilog=EXAMPLES,
-    )
-    add_bag(command)
-    command.add_argument(
-        "--allow-write",
-        type=Path,
-        metavar="FOLDER",
-        help="reports and pictures may be written in this folder",
-    )
-    add_truth(command)
-    add_config(command)
-    command.set_defaults(run=_mcp)
+@dataclass(frozen=True, kw_only=True)
+class McpOptions:
+    """Options of ``mcp``."""
+
+    drive: DriveOptions
+    allow_write: Path | None = option("FOLDER", "reports and pictures may be written in this folder")
+    truth: TruthOptions
+    config: ConfigOptions
 
 
-def _mcp(options: argparse.Namespace) -> int:
+@command(
+    "mcp",
+    help="a server for agents (Model Context Protocol) over a drive or a batch",
+    description="Serve questions about a drive to an agent, by the Model Context Protocol on standard "
+    "input and output: findings, why, other values, compare, evaluate. It reads only what is named here.",
+    epilog=EXAMPLES,
+)
+def _mcp(options: McpOptions) -> int:
     try:
         from bevviz.extras.mcp.drives import AskedDrive, batch_drives
         from bevviz.extras.mcp.server import serve
@@ -47,15 +44,14 @@ def _mcp(options: argparse.Namespace) -> int:
         ) from None
     from bevviz.fleet.jobs import intact_results
 
-    folder: Path | None = options.allow_write
+    folder, paths = options.allow_write, options.drive.paths
     if folder is not None and not folder.is_dir():
         raise UserError(f"--allow-write {folder}: there is no such folder")
-    paths: list[Path] = options.paths
     results = intact_results(paths[0].resolve(), lambda text: warn([text])) if paths[0].is_dir() else []
     if results:
         drives = batch_drives(results)
     else:
-        config, truth = load_config(options), (options.truth, options.kitti_labels)
+        config, truth = load_config(options), (options.truth.truth, options.truth.kitti_labels)
         asked = AskedDrive.of(_words(options), paths, config, truth)
         warn(asked.source.warnings)
         drives = {paths[0].name: lambda: asked}
@@ -67,11 +63,11 @@ def _mcp(options: argparse.Namespace) -> int:
     return 0
 
 
-def _words(options: argparse.Namespace) -> list[str]:
+def _words(options: McpOptions) -> list[str]:
     """Return the words that open the drive as it is opened here, for other commands."""
-    words = [str(path) for path in options.paths]
-    for name in ("source_dataset", "source_sequence", "model", "preset", "config", "truth", "kitti_labels"):
-        if (value := getattr(options, name, None)) is not None:
-            words += [f"--{name.removeprefix('source_').replace('_', '-')}", str(value)]
-    repeated = (("--results", options.source_results or ()), ("--set", options.set))
-    return words + [word for option, given in repeated for value in given for word in (option, value)]
+    words = [str(path) for path in options.drive.paths]
+    for bound, value in option_values(options):
+        if not bound.option.positional and bound.names[0] not in ("--bag", "--allow-write"):
+            values = value if isinstance(value, tuple) else [value]
+            words += [word for each in values if each is not None for word in (bound.names[0], str(each))]
+    return words

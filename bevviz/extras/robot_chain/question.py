@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
+from bevviz.cli.command import Group, flag
 from bevviz.errors import UserError
 
 if TYPE_CHECKING:
@@ -16,13 +17,18 @@ if TYPE_CHECKING:
     from bevviz.why import Selection
 
 
-def add_options(group: argparse._ArgumentGroup) -> None:
-    """Add ``--robot``."""
-    group.add_argument(
-        "--robot",
-        action="store_true",
-        help="which of the robot's own nodes lost, renamed, delayed or moved it (alone, --class or --point)",
+@dataclass(frozen=True, kw_only=True)
+class RobotChainOptions:
+    """Option for questions about the robot's own nodes."""
+
+    group: ClassVar = Group("what to explain")
+
+    robot: bool = flag(
+        "which of the robot's own nodes lost, renamed, delayed or moved it (alone, --class or --point)"
     )
+
+
+OPTIONS = RobotChainOptions
 
 
 def around(source: BagSource, frame: Frame) -> RobotQuestions:
@@ -37,7 +43,12 @@ def around(source: BagSource, frame: Frame) -> RobotQuestions:
 
 
 def answer(
-    options: argparse.Namespace, source: BagSource, frame: Frame, selection: Selection
+    options: RobotChainOptions,
+    source: BagSource,
+    frame: Frame,
+    selection: Selection,
+    limit: int,
+    everything: bool,
 ) -> tuple[WhyForm, Sequence[str]] | None:
     """Say which steps of the robot's own chain lost or changed objects.
 
@@ -53,11 +64,11 @@ def answer(
     if selection.label:
         followed = [one for one in followed if one.label.lower() == selection.label.lower()]
     changed = [one for one in followed if one.change is not None]
-    shown = followed if selection.point or options.all else changed
+    shown = followed if selection.point or everything else changed
     head = f"frame {frame.index}: {len(changed)} of the robot's {len(followed)} objects lost or changed"
     lines = [head, "", *questions.lines()]
     for number, one in enumerate(shown):
-        steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < options.limit else []
+        steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < limit else []
         lines += ["", one.text, *steps] if steps else [one.text]
     tree: WhyForm = {
         "frame": frame.index,
