@@ -10,7 +10,7 @@ from typing import Protocol
 from bevviz.bags.reader import Reader, megabytes
 
 REPAIR = "'bevviz recover' writes a sound copy"
-EXTRA = "the extra rescue reads more of it: pip install 'bevviz[rescue]'"
+EXTRA = "the extra rescue searches it for more: pip install 'bevviz[rescue]'"
 
 
 @dataclass

@@ -302,9 +302,9 @@ def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
     if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
         public = scratch.new() / f"bag{kind.suffix}"
         public.symlink_to(path.resolve())
-    rescuer = registered("rescuers").get(kind.suffix.removeprefix("."))
 
     def damaged() -> DamagedReader:
+        rescuer = registered("rescuers").get(kind.suffix.removeprefix("."))
         if rescuer is not None:
             reader: DamagedReader = load(rescuer)(path)
             return reader
