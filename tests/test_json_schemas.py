@@ -7,7 +7,7 @@ import json
 import pytest
 from jsonschema import Draft202012Validator
 
-from bevviz.cli import find_commands, make_parser
+from bevviz.cli import make_parser
 from bevviz.model.json_forms import FORMS, schema
 from tests.support import documented_json
 from tools.make_schemas import FOLDER, text_of
@@ -35,7 +35,7 @@ def test_the_kept_schemas_are_those_of_the_code() -> None:
 
 
 def test_every_command_with_json_has_a_schema() -> None:
-    _, commands = make_parser(find_commands())
+    _, commands = make_parser()
     with_json = {name for name, parser in commands.items() if "--json" in parser._option_string_actions}
     assert with_json == set(FORMS)
 

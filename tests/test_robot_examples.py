@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from bevviz.cli import find_commands, make_parser
+from bevviz.cli import make_parser
 from bevviz.cli.command import make_options
 from bevviz.cli.live import LiveOptions
 from bevviz.cli.options import collect_settings
@@ -38,7 +38,7 @@ def unit() -> configparser.ConfigParser:
 
 def settings_of(arguments: list[str]) -> ReloadableConfig:
     """Return the settings of a command line with the configuration file of the example."""
-    parser, _ = make_parser(find_commands())
+    parser, _ = make_parser()
     options = make_options(LiveOptions, vars(parser.parse_args(arguments)))
     assert options.config.file in (Path("/etc/bevviz/robot.yaml"), CONFIG)
     return ReloadableConfig(CONFIG, collect_settings(options))

@@ -9,67 +9,47 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.cli import (
-    bag,
-    batch,
-    calib,
-    causes,
-    compare,
-    completion,
-    config,
-    cut,
-    evaluate,
-    export,
-    fix,
-    info,
-    interrupts,
-    live,
-    outputs,
-    recover,
-    report,
-    store,
-    sweep,
-    trust,
-    why,
-    workbench,
-)
+from bevviz.cli import interrupts, outputs
 from bevviz.cli.command import Command, commands_in, make_options
 from bevviz.cli.options import follow_recording, join_negative_numbers
 from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
-from bevviz.support.extensions import load_all
+from bevviz.support.extensions import load_all, registered
 from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
     from logging import Logger
 
-MODULES = (
-    workbench,
-    bag,
-    batch,
-    causes,
-    fix,
-    info,
-    why,
-    compare,
-    evaluate,
-    export,
-    sweep,
-    calib,
-    report,
-    recover,
-    cut,
-    live,
-    config,
-    store,
-    trust,
-    completion,
-)
+# Commands in the order of the help text: the module that has it, and its line.
+CORE = {
+    "open": ("workbench", "the workbench: a page where a click on anything answers why"),
+    "bag": ("bag", "run the pipeline over a recorded bag"),
+    "batch": ("batch", "run the pipeline over many bags"),
+    "causes": ("causes", "what the missed and false objects of a batch have in common"),
+    "fix": ("fix", "search parameters that find the missed objects, and check what they break"),
+    "info": ("info", "what is in a bag, and what is missing for a full run"),
+    "why": ("why", "why an object was reported, or was not"),
+    "compare": ("compare", "what if? two configurations, or the robot"),
+    "evaluate": ("evaluate", "how right it is, where the truth is known; a gate for CI"),
+    "export": ("export", "write frames as KITTI or nuScenes, with what was found as labels"),
+    "sweep": ("sweep", "a parameter over a range: counts, times, precision and recall"),
+    "calib": ("calib", "is it the calibration or the clock?"),
+    "report": ("report", "a bug report that stands on its own, and its check"),
+    "recover": ("recover", "a sound copy of a damaged bag"),
+    "cut": ("cut", "a window of a drive with chosen topics, as a bag"),
+    "live": ("live", "run the pipeline beside a robot"),
+    "snap": ("live", "save the last seconds of a running 'bevviz live'"),
+    "config": ("config", "print the effective configuration, or explain one parameter"),
+    "store": ("store", "the results that are kept on disk, so that no command makes them twice"),
+    "trust": ("trust", "let the functions of a project file, or of a YAML file, run"),
+    "completion": ("completion", "what a shell needs to complete commands, options and parameters"),
+}
 EPILOG = """examples:
   bevviz demo                                 the synthetic drive, in the viewer
   bevviz drive.mcap --model yolo11n.onnx      the workbench: a page where a click on anything answers why
@@ -120,12 +100,13 @@ def _main(arguments: Sequence[str] | None) -> int:
             join_negative_numbers(sys.argv[1:] if arguments is None else arguments)
         )
         word = command_line[0] if command_line else ""
-        commands = find_commands(word)
-        if word and word not in commands and ("://" in word or Path(word).exists()):
+        if _is_input(word):
             word, command_line = "open", ["open", *command_line]
-        parser, _ = make_parser(commands, word)
+        parser, _ = make_parser(word)
         if "_ARGCOMPLETE" in os.environ:
-            completion.complete(parser)
+            from bevviz.cli.completion import complete
+
+            complete(parser)
         if not command_line:
             parser.print_help()
             return 2
@@ -171,32 +152,36 @@ def _main(arguments: Sequence[str] | None) -> int:
                 gc.freeze()  # A last search for cycles would take a third of a second.
 
 
-def find_commands(word: str = "") -> dict[str, Command[Any]]:
-    """Return the commands by name.
+def _is_input(word: str) -> bool:
+    """Return whether the first word of the command line is an input, and no command."""
+    is_command = not word or word in CORE or word in registered("commands")
+    return not is_command and ("://" in word or Path(word).exists())
 
-    Args:
-        word: first of the command line. If it is a command of the core, the registered ones are left out,
-            because finding them takes 20 ms. A broken package costs its own commands only.
+
+def _find_commands(word: str) -> Iterator[tuple[str, str, Command[Any] | None]]:
+    """Yield name, line in the list, and the command if it is the first ``word`` of the command line.
+
+    A module of the core is imported only for its command. For such a command the registered ones are left
+    out, because finding them takes 20 ms.
     """
-    commands = {command.name: command for module in MODULES for command in commands_in(module)}
-    if word not in commands:
-        for module in load_all("commands", _warn, but=commands):
-            for command in commands_in(module):
-                commands.setdefault(command.name, command)
-    return commands
+    for name, (module, line) in CORE.items():
+        commands = commands_in(import_module(f"bevviz.cli.{module}")) if word in ("", name) else []
+        yield name, line, next((command for command in commands if command.name == name), None)
+    if word in CORE:
+        return
+    for extension in load_all("commands", _warn, but=CORE):
+        for command in commands_in(extension):
+            yield command.name, command.help, command if word in ("", command.name) else None
 
 
 def _warn(text: str) -> None:
     outputs.warn([text])
 
 
-def make_parser(
-    commands: Mapping[str, Command[Any]], word: str = ""
-) -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+def make_parser(word: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
     """Return the parser of the program, and those of the commands by name.
 
     Args:
-        commands: the commands by name.
         word: first of the command line. Only this command gets its options. Empty: all do.
     """
     parser = Parser(
@@ -207,8 +192,10 @@ def make_parser(
     )
     parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar=COMMAND)
-    for command in commands.values():
-        command.add_to(subparsers, _warn if word in ("", command.name) else None)
+    for name, line, command in _find_commands(word):
+        command_parser = subparsers.add_parser(name, help=line)
+        if command is not None:
+            command.fill(command_parser, _warn)
     for command_parser in subparsers.choices.values():
         command_parser.add_argument(
             "--verbose", action="store_true", help="also say on stderr where in the code something failed"

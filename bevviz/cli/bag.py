@@ -40,7 +40,6 @@ class BagOptions:
 
 @command(
     "bag",
-    help="run the pipeline over a recorded bag",
     description="Run the pipeline over a bag: MCAP, sqlite3 (.db3) or ROS 1 (.bag), compressed or not.",
 )
 @garbage_collection_off()

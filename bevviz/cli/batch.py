@@ -115,7 +115,6 @@ class BatchOptions:
 
 @command(
     "batch",
-    help="run the pipeline over many bags",
     description="Run the pipeline over many bags, each by itself, and sum up. Run again, it goes on.",
     epilog=TIMES,
 )

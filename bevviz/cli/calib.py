@@ -50,7 +50,6 @@ class CalibOptions:
 
 @command(
     "calib",
-    help="is it the calibration or the clock?",
     description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
 )
 def _calib(options: CalibOptions) -> int:

@@ -22,7 +22,6 @@ class CausesOptions:
 
 @command(
     "causes",
-    help="what the missed and false objects of a batch have in common",
     description="Group the missed objects, false objects and anomalies of a batch by what they have in "
     "common: class, range, direction, size, brightness, speed, drive and so on.",
 )

@@ -206,7 +206,7 @@ class Command(Generic[T]):
     Attributes:
         name: its name.
         run: runs it with its options, and returns the exit status.
-        help: its line in the list of commands.
+        help: its line in the list of commands; ``bevviz.cli`` has those of the core.
         description: the text above its options.
         epilog: the text below them, printed as it is.
         extended_by: group of extensions whose options it has, too: a dataclass ``OPTIONS`` of each.
@@ -234,13 +234,9 @@ class Command(Generic[T]):
         ]
         return make_dataclass(own.__name__, further, bases=(own,), frozen=True, kw_only=True)
 
-    def add_to(
-        self, commands: argparse._SubParsersAction[Any], tell: Callable[[str], object] | None = None
-    ) -> None:
-        """Add the command to a parser; without ``tell`` only to its list of commands. See ``options``."""
-        parser = commands.add_parser(self.name, help=self.help, description=self.description)
-        if tell is None:
-            return
+    def fill(self, parser: argparse.ArgumentParser, tell: Callable[[str], object]) -> None:
+        """Add description and options to the parser of the command; for ``tell`` see ``options``."""
+        parser.description = self.description
         options = self.options(tell)
         parser.set_defaults(command=self, options=options)
         containers: dict[str, argparse._ActionsContainer] = {}
@@ -264,7 +260,7 @@ class Command(Generic[T]):
 
 
 def command(
-    name: str, *, help: str, description: str, epilog: str = "", extended_by: Kind | None = None
+    name: str, *, description: str, help: str = "", epilog: str = "", extended_by: Kind | None = None
 ) -> Callable[[Callable[[T], int]], Command[T]]:
     """Return a decorator that makes a command of a function; see ``Command``."""
     return lambda run: Command(name, run, help, description, epilog, extended_by)

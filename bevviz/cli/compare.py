@@ -73,7 +73,7 @@ class CompareOptions:
     output: CompareOutputs
 
 
-@command("compare", help="what if? two configurations, or the robot", description=DESCRIPTION)
+@command("compare", description=DESCRIPTION)
 def _compare(options: CompareOptions) -> int:
     return _configurations(options) if options.sides.robot is None else _robot(options, options.sides.robot)
 

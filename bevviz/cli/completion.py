@@ -23,7 +23,6 @@ class CompletionOptions:
 
 @command(
     "completion",
-    help="what a shell needs to complete commands, options and parameters",
     description="Print what a shell evaluates to complete commands, options and the keys of --set.",
     epilog=EXAMPLES,
 )

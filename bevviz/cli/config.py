@@ -25,7 +25,6 @@ class ConfigCommandOptions:
 
 @command(
     "config",
-    help="print the effective configuration, or explain one parameter",
     description="Print every parameter with its unit and meaning, as YAML that --config reads back; or "
     "explain one.",
     epilog=EXAMPLES,

@@ -29,7 +29,6 @@ class CutOptions:
 
 @command(
     "cut",
-    help="a window of a drive with chosen topics, as a bag",
     description="Write the messages of a window to an MCAP file, byte for byte, with what was published "
     f"once before it. Data sets and network captures become a bag. {TIMES}",
 )

@@ -70,7 +70,6 @@ class EvaluateOptions:
 
 @command(
     "evaluate",
-    help="how right it is, where the truth is known; a gate for CI",
     description=DESCRIPTION,
     epilog=EPILOG,
 )

@@ -50,7 +50,6 @@ class ExportOptions:
 
 @command(
     "export",
-    help="write frames as KITTI or nuScenes, with what was found as labels",
     description=DESCRIPTION,
     epilog=EPILOG,
 )

@@ -50,7 +50,6 @@ class FixOptions:
 
 @command(
     "fix",
-    help="search parameters that find the missed objects, and check what they break",
     description="Search the parameters that the misses depend on, several at a time, on frames of some "
     "drives with ground truth. Confirm the best on frames of other drives, and write them as YAML.",
     epilog="PATH may also be the folder of a batch: its drives, with its configuration.",

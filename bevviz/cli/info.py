@@ -45,7 +45,6 @@ class InfoOptions:
 
 @command(
     "info",
-    help="what is in a bag, and what is missing for a full run",
     description="Topics, rates, gaps and frames of a bag, the role of each topic, what is missing, and "
     "faults of the sensors in the first seconds.",
 )

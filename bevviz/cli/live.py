@@ -113,7 +113,6 @@ class SnapOptions:
 
 @command(
     "live",
-    help="run the pipeline beside a robot",
     description="Run the pipeline on a running ROS 2 graph. It is never behind: the newest frame wins.",
     extended_by="watches",
 )
@@ -368,7 +367,6 @@ def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
 
 @command(
     "snap",
-    help="save the last seconds of a running 'bevviz live'",
     description="Have a running 'bevviz live' save its flight recorder: FILE.rrd, and beside it "
     "FILE.mcap, the messages that it was made of. SIGUSR1 does the same.",
 )

@@ -84,7 +84,6 @@ class ReportOptions:
 
 @command(
     "report",
-    help="a bug report that stands on its own, and its check",
     description="Cut a window out of a bag, run it, and save a recording (bug.rrd), a page for any "
     "browser (bug.html) and the raw messages (bug.mcap) to send on. With --check: run a report again and "
     "compare.",

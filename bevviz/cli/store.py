@@ -17,7 +17,6 @@ class StoreOptions:
 
 @command(
     "store",
-    help="the results that are kept on disk, so that no command makes them twice",
     description="Print where detections of images and results of stages are kept, how many there are, "
     "and what they take. --set store.size=0 makes a command do without them.",
 )

@@ -34,7 +34,6 @@ class SweepOptions:
 
 @command(
     "sweep",
-    help="a parameter over a range: counts, times, precision and recall",
     description="Run every value of one or two parameters on the same frames. --set takes ranges "
     "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
 )

@@ -35,7 +35,6 @@ class TrustOptions:
 
 @command(
     "trust",
-    help="let the functions of a project file, or of a YAML file, run",
     description="A project file or a YAML file can name functions (module:function), which are code. "
     "They run once you trust the file. After an edit of the file or of a module beside it, bevviz asks "
     "again. Read them first: a module may import each Python file of the folder.",

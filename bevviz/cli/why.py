@@ -62,7 +62,6 @@ class WhyOptions:
 
 @command(
     "why",
-    help="why an object was reported, or was not",
     description="Follow an object through the stages of one frame: where it was lost, by which number, "
     "and which change of the configuration would keep it, which is tried before it is said.",
     epilog=EXAMPLES,

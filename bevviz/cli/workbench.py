@@ -63,7 +63,6 @@ class OpenOptions:
 
 @command(
     "open",
-    help="the workbench: a page where a click on anything answers why",
     description="Open a drive in the workbench: a page of this machine alone, with Rerun's viewer and a "
     "panel. A click on a box, a point or a pixel answers why it is what it is; what was missed is "
     "listed; hints and parameters are tried on the shown frame at once.",
