@@ -17,7 +17,8 @@ from bevviz import UserError
 from bevviz.cli import main
 from bevviz.datasets.cloud_files import read_cloud, read_points
 from bevviz.datasets.dataset import read_table
-from bevviz.support.files import CONFIG_LIMIT, SENSOR_LIMIT, TABLE_LIMIT, drive_files
+from bevviz.support.files import drive_files
+from bevviz.support.limits import CONFIG_LIMIT, SENSOR_LIMIT, TABLE_LIMIT
 from tests.support import bags, datasets
 from tests.support.commands import Capture, error_of
 

@@ -47,6 +47,7 @@ from bevviz.model.frame import I64
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
 from bevviz.support.files import bag_files, drive_files, full_disk_error, read_text
+from bevviz.support.limits import CONFIG_LIMIT, MAX_TOPICS
 from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.support.text import path_text
 
@@ -56,6 +57,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # first fields of Foxglove messages whose layout is that of a Header
 REWIND = 2_000_000_000  # nanoseconds of the first search for a key frame; each next one spans four times more
 LONGEST_SCAN = 1_000_000_000  # nanoseconds from the first packet of a scan to the last
+MANY = 12  # longest list of files in a sentence
 MAX_HEADERS = 16  # messages at the start of a video that may be codec headers
 
 
@@ -90,6 +92,7 @@ class Recording(Closable):
         self._config = config or SourceConfig()
         self._aside: dict[str, str] = {}
         self._scan_times: dict[str, I64] = {}
+        self._grouped: dict[BagFile, tuple[Sequence[Connection], dict[str, list[Connection]]]] = {}
         self.files: list[BagFile] = []
         self._datasets: dict[BagFile, DatasetReader] = {}
         self._notes: list[str] = []
@@ -98,6 +101,8 @@ class Recording(Closable):
         try:
             for path in self.paths:
                 self._open(path)
+            if (count := len(self._types_by_topic)) > MAX_TOPICS:
+                raise UserError(f"{self.name}: it has {count:,} topics: {MAX_TOPICS:,} at most are read")
             self.calibrations = {**self._config.lidar_calibration, **self._attached()}
             if not self.message_count:
                 raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
@@ -195,13 +200,19 @@ class Recording(Closable):
         Connections of one type with different definitions are all among them: each message is decoded by the
         definition of its own connection.
         """
-        # A damaged file may show a topic that no index has named.
-        types = self._types_by_topic
-        return [
-            c
-            for c in file.connections
-            if (msgtype := normalized(c.msgtype)) == types.setdefault(c.topic, msgtype)
-        ]
+        return [c for connections in self._by_topic(file).values() for c in connections]
+
+    def _by_topic(self, file: BagFile) -> Mapping[str, list[Connection]]:
+        """Return the connections of ``_typed`` by topic."""
+        connections, by_topic = self._grouped.get(file, ((), {}))
+        if connections is not file.connections:  # A damaged file may show a topic that no index has named.
+            connections, by_topic = file.connections, {}
+            for connection in connections:
+                msgtype = normalized(connection.msgtype)
+                if msgtype == self._types_by_topic.setdefault(connection.topic, msgtype):
+                    by_topic.setdefault(connection.topic, []).append(connection)
+            self._grouped[file] = connections, by_topic
+        return by_topic
 
     def messages(
         self,
@@ -240,7 +251,8 @@ class Recording(Closable):
         A merge draws the first item of every file at once. The empty item defers opening the file until its
         time.
         """
-        connections = [c for c in self._typed(file) if c.topic in topics]
+        by_topic = self._by_topic(file)
+        connections = [c for topic in topics for c in by_topic.get(topic, ())]
         if not connections:
             return
         yield file.span[0], None
@@ -340,7 +352,7 @@ class Recording(Closable):
 
     def times(self, topic: str) -> I64:
         """Return the sorted log times in nanoseconds of all messages of a topic. Their data is not read."""
-        parts = [f.times([c for c in self._typed(f) if c.topic == topic]) for f in self.files]
+        parts = [f.times(self._by_topic(f).get(topic, [])) for f in self.files]
         return np.sort(np.concatenate(parts))
 
     def packets(self, topic: str, received: int) -> list[VideoPacket]:
@@ -507,7 +519,8 @@ class Recording(Closable):
         except (TypeError, ValueError):
             expected, listed = 0, set()
         if missing := sorted(listed - {f.name for f in files}):
-            self._notes.append(f"{folder}: {', '.join(missing)} of {METADATA} is missing: read without")
+            names = f"{', '.join(missing[:MANY])}{' ...' if missing[MANY:] else ''}"
+            self._notes.append(f"{folder}: {names} of {METADATA} is missing: read without")
         found = sum(c.msgcount for f in self.files[before:] for c in f.connections)
         if found < expected:
             self._notes.append(
@@ -540,7 +553,7 @@ class Recording(Closable):
                 )
             return {}
         try:
-            content = parse_yaml(read_text(path), str(path))["rosbag2_bagfile_information"]
+            content = parse_yaml(read_text(path, CONFIG_LIMIT), str(path))["rosbag2_bagfile_information"]
             distro = content.get("ros_distro")
             if f"ros2_{distro}" in {s.value for s in Stores}:
                 self.types.release = Stores(f"ros2_{distro}")

@@ -34,6 +34,7 @@ from bevviz.bags.damage import DamageReport
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
+from bevviz.support.limits import MAX_CHUNK
 
 ChunkMessage = tuple[int, int, bytes | memoryview]
 """Log time, connection and data."""
@@ -60,7 +61,7 @@ class Chunk:
     def unpack(self, file: FileBytes) -> tuple[bytes, str]:
         """Return the content and its damage: empty for a sound chunk and for one that is cut."""
         crc = int.from_bytes(file.read(self.checksum, 4), "little") if self.checksum else 0
-        packed = file.read(self.data, self.packed)
+        packed = file.read(self.data, min(self.packed, MAX_CHUNK))
         cut = self.cut or len(packed) < self.packed
         return unpack(self.compression, packed, self.size, crc, cut=cut)
 

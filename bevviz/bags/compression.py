@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from binascii import crc32
 from bz2 import BZ2Decompressor
 from collections.abc import Callable
@@ -12,13 +13,13 @@ from typing import Any
 from backports import zstd
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
-from bevviz.bags.reader import FileBytes
-from bevviz.errors import first_line
+from bevviz.bags.reader import FileBytes, megabytes
+from bevviz.errors import UserError, first_line
 from bevviz.support import progress
+from bevviz.support.limits import FREE_DISK, MAX_CHUNK, MAX_RATIO, MIN_CHUNK, MIN_FILE
 
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a zstd file or message
 ZSTD_FRAME = re.compile(re.escape(ZSTD))
-LEAST, LONGEST = 1 << 26, 1 << 30  # limits of unpacked bytes, independent of the stated size
 PIECE = 1 << 12  # compressed bytes unpacked at once where the following bytes may be damaged
 
 
@@ -37,7 +38,7 @@ def unpack(
     Returns:
         Content, and a description of its damage. The description is empty for a sound chunk.
     """
-    limit, whole = min(max(size, LEAST), LONGEST), True
+    limit, whole = min(max(size, MIN_CHUNK), MAX_CHUNK), True
     if compression in ("", "none"):
         data = packed
     elif compression not in _STREAMS:
@@ -102,8 +103,12 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
 
     Returns:
         Number of damaged places, and whether the last frame is complete.
+
+    Raises:
+        UserError: the content has more than ``MAX_RATIO`` times the file's bytes, or would fill the disk.
     """
     source, damaged, stream = FileBytes(path), 0, zstd.ZstdDecompressor()
+    limit = max(MIN_FILE, MAX_RATIO * source.size)
     bar = progress.bar(total=source.size, unit="B", unit_scale=True, desc=f"unpack {path.name}", delay=1)
     try:
         with target.open("wb") as out, bar:
@@ -112,7 +117,9 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
                 # The decompressor drops its output for the piece with the damage, so pieces are small.
                 piece = source.read(offset, PIECE)
                 try:
-                    out.write(stream.decompress(piece))
+                    content = stream.decompress(piece)
+                    _check_room(path, target, out.tell() + len(content), limit)
+                    out.write(content)
                     offset += len(piece) - len(stream.unused_data)
                     next_frame = offset if stream.eof else None
                 except zstd.ZstdError:
@@ -126,3 +133,21 @@ def unpack_file(path: Path, target: Path) -> tuple[int, bool]:
     finally:
         source.close()
     return damaged, stream.eof
+
+
+def _check_room(path: Path, target: Path, size: int, limit: int) -> None:
+    """Check that ``size`` bytes of a compressed file may be written into ``target``.
+
+    Raises:
+        UserError: they are too many for the file, or for the disk.
+    """
+    if size > limit:
+        raise UserError(
+            f"{path}: it unpacks to more than {megabytes(limit)}, from {megabytes(path.stat().st_size)}: "
+            "'zstd -d' unpacks it if you trust it"
+        )
+    if shutil.disk_usage(target.parent).free < FREE_DISK:
+        raise UserError(
+            f"{path}: unpacked, it would fill the disk of {target.parent.parent}: make room there, or name "
+            "another folder for temporary files with TMPDIR"
+        )

@@ -20,6 +20,8 @@ from bevviz.bags.reader import (
     Message,
     Reader,
     UnindexedError,
+    check_count,
+    check_names,
     megabytes,
 )
 from bevviz.bags.remote import address_of, name_of, open_bytes
@@ -126,6 +128,8 @@ class BagFile:
             self._opened.append(self._reader)
         except DamageError as error:
             self._reader = self._rescue_after(error)
+        check_count(path, len(self.connections))
+        check_names(path, self.connections)
 
     @property
     def connections(self) -> Sequence[Connection]:

@@ -23,16 +23,23 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
 from bevviz.bags.damage import DamageReport
-from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, as_damage
+from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, as_damage, megabytes
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
+from bevviz.support.limits import (
+    MAX_ATTACHMENT,
+    MAX_ATTACHMENTS,
+    MAX_INDEX,
+    MAX_PROFILE,
+    MAX_PROFILES,
+    MAX_RECORD,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
 ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
 FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
 FLAT = 1 << 20  # bytes of messages outside chunks that are read together
-MAX_RECORD = 1 << 26  # bytes; a larger attachment or description is not read
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -89,13 +96,18 @@ class Channels:
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
         connections = []
+        profiles_by_text: dict[str, list[Qos]] = {"": []}
         for number, (schema, topic, encoding, metadata) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
             digest, profiles = "", list[Qos]()
             with suppress(DamageError), as_damage():
                 stated = read_metadata(metadata)
                 digest = stated.get("topic_type_hash", "")
-                profiles = parse_qos(stated.get("offered_qos_profiles", ""))
+                text = stated.get("offered_qos_profiles", "")
+                is_new = text not in profiles_by_text and len(profiles_by_text) <= MAX_PROFILES
+                if is_new and len(text) <= MAX_PROFILE:
+                    profiles_by_text[text] = parse_qos(text)
+                profiles = profiles_by_text.get(text, [])
             extra = ConnectionExtRosbag2(encoding, profiles)
             count = counts.get(number, 0)
             connections.append(Connection(number, topic, msgtype, definition, digest, count, extra, None))
@@ -122,6 +134,8 @@ def read_index(path: Path) -> FileIndex:
             raise UnindexedError("it has no index")
         if not len(MAGIC) <= start <= end:
             raise DamageError("its footer is damaged")
+        if file.size - start > MAX_INDEX:
+            raise UnindexedError(f"its index has more than {megabytes(MAX_INDEX)}")
         summary = file.read(start, file.size - start)
         if crc and crc32(summary[: -len(MAGIC) - 4]) != crc:
             raise DamageError("its index does not fit its checksum")
@@ -152,10 +166,13 @@ def read_attachments(path: Path) -> dict[str, bytes]:
     try:
         if file.read(0, len(MAGIC)) != MAGIC:
             return attachments
-        offset = len(MAGIC)
-        while len(head := file.read(offset, RECORD.size)) == RECORD.size:
+        offset, left = len(MAGIC), MAX_ATTACHMENT
+        for _ in range(MAX_ATTACHMENTS):
+            if len(head := file.read(offset, RECORD.size)) < RECORD.size:
+                break
             opcode, length = RECORD.unpack(head)
-            if opcode == ATTACHMENT and length <= MAX_RECORD:
+            if opcode == ATTACHMENT and length <= left:
+                left -= length
                 record = file.read(offset + RECORD.size, length)
                 with suppress(struct.error, UnicodeDecodeError):
                     name, media = read_strings(record, 16, 2)

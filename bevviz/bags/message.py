@@ -16,12 +16,13 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
-from bevviz.bags.compression import LONGEST, ZSTD
+from bevviz.bags.compression import ZSTD
 from bevviz.bags.reader import normalized
 from bevviz.errors import first_line
 from bevviz.messages import definitions, foxglove
 from bevviz.messages.decoders import MessageError, Scan, read_header
 from bevviz.messages.guard import guard
+from bevviz.support.limits import MAX_DEFINITION, MAX_MESSAGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +52,12 @@ class RawMessage:
         """Return the serialised message. A compressed message is unpacked.
 
         Raises:
-            zstd.ZstdError: the message cannot be unpacked, or it has more than ``LONGEST`` bytes.
+            zstd.ZstdError: the message cannot be unpacked, or it has more than ``MAX_MESSAGE`` bytes.
         """
         if self.data[:4] != ZSTD:
             return self.data
         stream = zstd.ZstdDecompressor()
-        data = stream.decompress(self.data, LONGEST)
+        data = stream.decompress(self.data, MAX_MESSAGE)
         if not stream.eof:
             raise zstd.ZstdError("the end of the compressed message is missing, or it is too long")
         return data
@@ -164,6 +165,8 @@ class MessageTypes:
 def _defined(connection: Connection) -> Typestore:
     """Build a store of the types in the definition of a connection."""
     text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
+    if len(text) > MAX_DEFINITION:
+        raise ValueError(f"it has {len(text):,} characters: {MAX_DEFINITION:,} at most are read")
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         types = get_types_from_msg(text, msgtype)
     else:

@@ -16,8 +16,9 @@ import rosbags.rosbag2
 from backports import zstd
 from rosbags.interfaces import Connection
 
-from bevviz.errors import first_line
+from bevviz.errors import UserError, first_line
 from bevviz.model.frame import I64
+from bevviz.support.limits import MAX_CONNECTIONS, MAX_NAME
 
 Message = tuple[Connection, int, bytes | memoryview]
 """Where it was recorded, log time in nanoseconds, and the serialised message."""
@@ -151,6 +152,21 @@ class MemoryBytes(FileBytes):
     def search(self, pattern: re.Pattern[bytes], start: int, reach: int = 64) -> Iterator[int]:
         """Return the offsets from ``start`` on where ``pattern`` matches."""
         return (match.start() for match in pattern.finditer(self._data, start))
+
+
+def check_count(path: Path, count: int) -> None:
+    """Raise UserError if a file has too many connections."""
+    if count > MAX_CONNECTIONS:
+        raise UserError(f"{path}: it has {count:,} connections: {MAX_CONNECTIONS:,} at most are read")
+
+
+def check_names(path: Path, connections: Sequence[Connection]) -> None:
+    """Raise UserError if the name of a topic is too long."""
+    longest = max((len(connection.topic) for connection in connections), default=0)
+    if longest > MAX_NAME:
+        raise UserError(
+            f"{path}: the name of a topic has {longest:,} characters: {MAX_NAME:,} at most are read"
+        )
 
 
 def megabytes(size: int) -> str:

@@ -13,14 +13,13 @@ from urllib.parse import unquote, urljoin, urlsplit
 
 from bevviz.bags.reader import FileBytes
 from bevviz.errors import UserError, first_line
+from bevviz.support.limits import MAX_REDIRECTS, MAX_REQUEST
 
 _ADDRESS = re.compile(r"(https?|s3|gs|gcs|az|abfs):/+(?=[^/])")  # a Path has one slash of two
 PART = 1 << 16  # bytes loaded at least: many records of an index lie in one part
 CACHE = 1 << 26  # bytes kept in memory
-MAX_REQUEST = 1 << 28  # bytes asked for at once; an index or a chunk has at most some megabytes
 TIMEOUT = 20.0  # seconds without a byte after which a request is given up
 LEAST_RATE = 10_000  # bytes per second of a whole request, after the first ``TIMEOUT`` seconds
-MAX_REDIRECTS = 5
 TRIES = 3
 PAUSE = 0.5  # seconds before the second try; twice as long before the third
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}

@@ -13,13 +13,21 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefiniti
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
 from bevviz.bags.damage import DamageReport
-from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, MemoryBytes, normalized
+from bevviz.bags.reader import (
+    LAST_TIME,
+    DamageError,
+    FileBytes,
+    MemoryBytes,
+    UnindexedError,
+    megabytes,
+    normalized,
+)
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
+from bevviz.support.limits import LONGEST_HEADER, MAX_INDEX
 
 MAGIC = b"#ROSBAG V2.0\n"
 LENGTH = struct.Struct("<I")
-LONGEST_HEADER = 1 << 16  # bytes; the data of a connection has the form of a header and may be longer
 
 # The fields of a record determine its kind. A damaged opcode leaves no trace; damaged fields do.
 RECORD_FIELDS: Mapping[str, Mapping[str, int | None]] = {  # field sizes in bytes; None: any
@@ -174,6 +182,8 @@ def read_index(path: Path) -> FileIndex:
             raise DamageError("the bag's index is missing (not closed)")
         if not head.end <= start <= file.size:
             raise DamageError("the bag's index is missing (cut)")
+        if file.size - start > MAX_INDEX:
+            raise UnindexedError(f"the bag's index has more than {megabytes(MAX_INDEX)}")
         return _read_index(file, start, head.number("conn_count"), head.number("chunk_count"))
     except (struct.error, KeyError, ValueError, MemoryError) as error:
         raise DamageError(f"the bag's index is damaged ({error})") from None

@@ -26,6 +26,7 @@ from bevviz.messages.topics import CLOUDS
 from bevviz.messages.transforms import StampedTransform, decode_transforms
 from bevviz.model.frame import F64, I64, Frame, LabelledBoxes3D, Scene
 from bevviz.support.contexts import Closable
+from bevviz.support.limits import MAX_LATCHED
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import LARGE_LOSS, UnusableMessages, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
@@ -37,7 +38,6 @@ SECOND = 1_000_000_000
 MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
 NEAR = SECOND // 2  # the same for clouds and images before a single cloud, at least
 WHOLE_IMAGES = ("Image", "CompressedImage")  # kinds that are decoded without the images before
-MAX_LATCHED = 2000  # latched transform messages read before a start in the middle of a drive
 EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader as PublicReader
 
-from bevviz.bags.reader import LAST_TIME, DamageError, Message, as_damage, megabytes
+from bevviz.bags.reader import LAST_TIME, DamageError, Message, as_damage, check_count, megabytes
 from bevviz.model.frame import I64
 
 MAGIC = b"SQLite format 3\0"
@@ -49,8 +49,9 @@ class SqliteReader:
             raise DamageError(f"the recorder did not close it, messages lie in {log.name}")
         self._public = PublicReader(public)
         with as_damage():
-            self._public.open()
             self._queries = open_database(public)
+            check_count(path, self._numbers("SELECT count(*) FROM topics")[0][0])  # rosbags reads all of them
+            self._public.open()
         self.connections: Sequence[Connection] = list(self._public.connections)
         self._check()
 

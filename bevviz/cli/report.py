@@ -19,7 +19,8 @@ from bevviz.cli.options import (
 from bevviz.cli.outputs import say, warn
 from bevviz.cli.values import seconds
 from bevviz.errors import UserError
-from bevviz.support.files import CONFIG_LIMIT, read_text
+from bevviz.support.files import read_text
+from bevviz.support.limits import CONFIG_LIMIT
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,10 +16,8 @@ from bevviz.config.sections import Config
 from bevviz.config.trust import RECEIVED, NamedCode, Trust, trust_in
 from bevviz.config.values_by_key import flatten
 from bevviz.errors import UserError, first_line
-from bevviz.support.files import CONFIG_LIMIT, read_text
-
-MOST_DOTS = 1000  # Most dots in a line of TOML. The time that tomllib needs grows with their square.
-MOST_VALUES = 1_000_000  # Most values in a YAML file. An alias counts as often as it is used.
+from bevviz.support.files import read_text
+from bevviz.support.limits import CONFIG_LIMIT, MOST_DOTS, MOST_VALUES
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,8 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from bevviz.errors import UserError
-from bevviz.support.files import CONFIG_LIMIT, read_bytes
+from bevviz.support.files import read_bytes
+from bevviz.support.limits import CONFIG_LIMIT
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ from bevviz.config.value_types import (
     Seconds,
     with_default_sizes,
 )
+from bevviz.support.limits import MAX_SENSORS, MAX_SETTINGS
 
 MAX_SIDE = 65_500  # pixels of a bird's-eye image: the JPEG encoder takes no more
 MAX_CELLS = 300_000_000  # cells of a bird's-eye image: 0.9 GB of pixels
@@ -59,12 +60,20 @@ class SourceConfig(Section):
     dataset: str = Field("", description="data set that PATH is; empty: recognised by its folders")
     sequence: str = Field("", description="drive of a data set that has several in one folder")
     lidar_topics: tuple[str, ...] = Field(
-        (), description="PointCloud2 or LaserScan topics; several are merged in base_frame"
+        (),
+        max_length=MAX_SENSORS,
+        description="PointCloud2 or LaserScan topics; several are merged in base_frame",
     )
-    camera_topics: tuple[str, ...] = Field((), description="Image or CompressedImage topics")
-    camera_info_topics: Mapping[str, str] = Field({}, description="camera topic -> its CameraInfo topic")
+    camera_topics: tuple[str, ...] = Field(
+        (), max_length=MAX_SENSORS, description="Image or CompressedImage topics"
+    )
+    camera_info_topics: Mapping[str, str] = Field(
+        {}, max_length=MAX_SENSORS, description="camera topic -> its CameraInfo topic"
+    )
     lidar_calibration: Mapping[str, str] = Field(
-        {}, description="topic with a LiDAR's packets -> its angles: a Hesai's CSV, an Ouster's metadata"
+        {},
+        max_length=MAX_SENSORS,
+        description="topic with a LiDAR's packets -> its angles: a Hesai's CSV, an Ouster's metadata",
     )
     boxes: Mapping[str, str] = Field(
         {},
@@ -72,7 +81,9 @@ class SourceConfig(Section):
         "center, size, orientation or yaw, label, score, id",
     )
     results: Mapping[str, str] = Field(
-        {}, description="name -> file with a detector's results, which appear on the topic /results/NAME"
+        {},
+        max_length=MAX_SENSORS,
+        description="name -> file with a detector's results, which appear on the topic /results/NAME",
     )
     odometry_topic: str = Field("", description="nav_msgs/Odometry used where /tf has no fixed frame")
     base_frame: str = Field("base_link", description="frame that several LiDARs are merged in")
@@ -81,7 +92,7 @@ class SourceConfig(Section):
         "auto", description="image is already free of distortion; auto: from the topic's name"
     )
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float, float]] = Field(
-        {}, description="'parent child' -> x y z (metres) qx qy qz qw; wins over TF"
+        {}, max_length=MAX_SETTINGS, description="'parent child' -> x y z (metres) qx qy qz qw; wins over TF"
     )
 
 
@@ -89,7 +100,9 @@ class SyncConfig(Section):
     """Settings of the search for the images and transforms of a cloud."""
 
     tolerance: Seconds = Field(0.1, gt=0, le=10, description="largest |image stamp - cloud stamp|")
-    offsets: Mapping[str, Seconds] = Field({}, description="topic -> time added to its stamps")
+    offsets: Mapping[str, Seconds] = Field(
+        {}, max_length=MAX_SETTINGS, description="topic -> time added to its stamps"
+    )
     by: Literal["stamp", "received"] = Field(
         "stamp", description="time of a message: its own stamp, or the time of receipt"
     )
@@ -181,7 +194,9 @@ class DetectorConfig(StageSection):
     max_candidates: int = Field(
         100, ge=1, le=10_000, description="candidates kept for explanation, duplicates last"
     )
-    classes: tuple[str, ...] = Field((), description="only these class names; empty: all")
+    classes: tuple[str, ...] = Field(
+        (), max_length=MAX_SETTINGS, description="only these class names; empty: all"
+    )
     provider: str = Field(
         "auto", description="onnxruntime's: auto (a GPU's, where it works), CPU, CUDA, TensorRT"
     )

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from bevviz.config.module_folder import WORKING_DIRECTORY, ModuleFolder, find_source, hash_sources
 from bevviz.errors import UserError
-from bevviz.support.files import CONFIG_LIMIT, check_owned, read_bytes, save_text
+from bevviz.support.files import check_owned, read_bytes, save_text
+from bevviz.support.limits import CONFIG_LIMIT
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.errors import UserError, first_line
-from bevviz.messages.clouds import MOST_POINTS
 from bevviz.messages.encode import POINT_FIELD
 from bevviz.model.frame import F32, F64, I64
-from bevviz.support.files import LFS_HINT, LFS_POINTER, SENSOR_LIMIT, open_regular, read_head
+from bevviz.support.files import LFS_HINT, LFS_POINTER, open_regular, read_head
 from bevviz.support.files import read_bytes as read_limited
+from bevviz.support.limits import MAX_UNPACKED, MOST_POINTS, SENSOR_LIMIT
 
 CLOUDS = (".pcd", ".ply", ".bin", ".npy")
 SAMPLE_BYTES = 500_000  # bytes of a BIN file from which the number of columns is estimated
@@ -31,7 +31,6 @@ MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables h
 # Nearest types that a PointCloud2 can hold.
 NEAREST_TYPES = {"i8": "<f8", "u8": "<f8", "f2": "<f4", "b1": "u1"}
 MAX_HEADER_LINES = 50  # lines of a PCD's header
-MAX_UNPACKED = 1 << 30  # bytes of a compressed PCD
 MAX_PLY_HEADER = 1 << 16  # bytes
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

@@ -36,7 +36,8 @@ from bevviz.messages.encode import (
     encode_transforms,
 )
 from bevviz.model.frame import F64, I64, Cloud, Intrinsics
-from bevviz.support.files import LFS_HINT, TABLE_LIMIT, read_lines
+from bevviz.support.files import LFS_HINT, read_lines
+from bevviz.support.limits import TABLE_LIMIT
 
 SECOND = 1_000_000_000
 MAP, BASE = "map", "base_link"  # frames of the world and of the vehicle

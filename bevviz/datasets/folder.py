@@ -36,7 +36,8 @@ from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
 from bevviz.support.extensions import load, registered
-from bevviz.support.files import CONFIG_LIMIT, TABLE_LIMIT, read_lines, read_text
+from bevviz.support.files import read_lines, read_text
+from bevviz.support.limits import CONFIG_LIMIT, TABLE_LIMIT
 
 MAX_COLUMNS = 64  # columns of an NPY file; height grids and transposed tables have more
 NOTE_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".txt", ".toml")

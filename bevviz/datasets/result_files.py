@@ -17,17 +17,18 @@ import numpy as np
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
 from bevviz.datasets.kitti_labels import Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
+from bevviz.messages.foreign_boxes import check_box_count
 from bevviz.messages.topics import Topic
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
 from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.stages.detector.names import COCO_CATEGORIES
-from bevviz.support.files import TABLE_LIMIT, read_text
+from bevviz.support.files import read_text
+from bevviz.support.limits import JSON_LIMIT, TABLE_LIMIT
 
 RESULTS = "/results/"  # topics of result files begin with it
 BOXES_3D, BOXES_2D = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/Detection2DArray"
 NUMBER = re.compile(r"(\d+)\D*$")
-JSON_LIMIT = 1 << 30  # bytes of a JSON file
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 IMAGE_COLUMNS = ("x0", "y0", "x1", "y1")
 NAME_COLUMNS = ("name", "label", "class", "class_name")
@@ -70,7 +71,8 @@ class ResultFile(ABC):
         """
 
     def placed(self, frame: Frame, boxes: Boxes3D, labels: Sequence[str], scores: Any) -> LabelledBoxes3D:
-        """Return boxes in the frame of the points."""
+        """Return boxes in the frame of the points. Raise ValueError if there are too many."""
+        check_box_count(len(labels))
         values = np.asarray(scores, np.float32)
         about = self.topic, frame.stamp, frame.points_frame
         return LabelledBoxes3D(*about, boxes, tuple(labels), values, frame.pose, frame.received)
@@ -78,7 +80,8 @@ class ResultFile(ABC):
     def in_image(
         self, frame: Frame, xyxy: Any, labels: Sequence[str], scores: Any, camera: str
     ) -> LabelledBoxes2D:
-        """Return boxes in the image of a camera."""
+        """Return boxes in the image of a camera. Raise ValueError if there are too many."""
+        check_box_count(len(labels))
         array = np.asarray(xyxy, np.float32).reshape(-1, 4)
         values = np.asarray(scores, np.float32)
         about = self.topic, frame.stamp, ""

@@ -11,8 +11,8 @@ from bevviz.errors import first_line
 from bevviz.messages.clouds import unpack_cloud
 from bevviz.messages.decoders import Decoder, decoders
 from bevviz.model.frame import Cloud
+from bevviz.support.limits import MAX_MESSAGE, MIN_CLOUD
 
-LEAST, LONGEST = 1 << 24, 1 << 30  # limits in bytes of a decompressed cloud; its message may state any size
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 
 
@@ -44,8 +44,10 @@ def decompress(msg: Any) -> Cloud:
 
 def _unpack(stream: Any, data: bytes, size: int) -> bytes:
     """Decompress a cloud. ``size`` is the number of bytes that the message states, and limits the memory."""
+    if size > MAX_MESSAGE:
+        raise ValueError(f"it states {size:,} bytes after unpacking: {MAX_MESSAGE:,} at most are taken")
     try:
-        content: bytes = stream.decompress(data, min(max(size, LEAST), LONGEST))
+        content: bytes = stream.decompress(data, max(size, MIN_CLOUD))
     except (zlib.error, zstd.ZstdError) as error:
         raise ValueError(f"its compressed data is damaged ({first_line(error)})") from None
     if not stream.eof:

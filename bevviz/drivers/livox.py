@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.messages.clouds import MOST_POINTS, make_cloud
+from bevviz.messages.clouds import make_cloud
 from bevviz.messages.decoders import Bytes, Decoder, Serialization, read_list_message
 from bevviz.model.frame import Cloud
+from bevviz.support.limits import MOST_POINTS
 
 # Fields of a CustomPoint of both drivers. A definition in the bag takes precedence.
 FIELDS = (

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
 from bevviz.model.frame import F32, U8, Cloud
+from bevviz.support.limits import MOST_POINTS
 
-MOST_POINTS = 100_000_000  # largest cloud
 MOST_FIELDS = 1024  # fields of a point; each element of a field counts
 # Metres from the cloud's origin. No sensor measures so far, and coordinates on Earth are smaller (UTM: 1e7).
 # Stages compute squares and higher powers, which do not fit into float32 for larger numbers.

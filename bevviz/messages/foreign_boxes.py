@@ -16,6 +16,7 @@ from bevviz.messages.decoders import frame_name, stamp_ns
 from bevviz.messages.guard import describe_kind, field_names
 from bevviz.messages.poses import UPRIGHT, quaternion_of, vector_of, yaw_of
 from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes3D
+from bevviz.support.limits import MAX_BOXES
 
 T = TypeVar("T")
 
@@ -227,7 +228,11 @@ def box_columns(
         rows: boxes of the message.
         width: how many numbers a box has.
         name: returns the name of an unusable box by number, label and identity; None: ``box_name``.
+
+    Raises:
+        ValueError: there are more than ``MAX_BOXES`` boxes.
     """
+    check_box_count(len(rows))
     values = np.array([row.numbers for row in rows]).reshape(-1, width)
     usable = (np.abs(values) < LARGEST).all(axis=1) & (values[:, 3:6] >= 0).all(axis=1)
     kept = [row for row, is_usable in zip(rows, usable, strict=True) if is_usable]
@@ -245,6 +250,12 @@ def box_columns(
         usable,
         tuple(unusable),
     )
+
+
+def check_box_count(count: int) -> None:
+    """Raise ValueError if a message or a frame of a file has more than ``MAX_BOXES`` boxes."""
+    if count > MAX_BOXES:
+        raise ValueError(f"it has {count:,} boxes: {MAX_BOXES:,} at most are taken")
 
 
 def boxes_3d(columns: BoxColumns, topic: str, received: int, stamp: int, frame_id: str) -> LabelledBoxes3D:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import MISSING, fields, is_dataclass
+from itertools import islice
 from numbers import Integral, Real
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
@@ -13,9 +14,13 @@ from rosbags.interfaces import Nodetype
 from bevviz.errors import UserError, first_line
 from bevviz.messages.decoders import Bytes, MessageError, Serialization, find_decoder
 from bevviz.messages.definitions import typestore
+from bevviz.support.limits import MAX_OBJECTS
 from bevviz.support.loggers import logger
 
 NO_FIELD = "structure_needs_at_least_one_member"  # ROS's name for the byte of an empty message
+# Types whose many values are one array of numbers. Those of other types become Python objects.
+BULK = frozenset({"PointCloud2", "Image", "CompressedImage", "LaserScan", "OccupancyGrid", "GridMap"})
+MANY = 1000  # values of a list that are compared with their definition to explain an error
 _log = logger(__name__)
 
 C = TypeVar("C")
@@ -87,6 +92,10 @@ def decode_message(
     decoder = find_decoder(serialization.type)
     if decoder is not None and decoder.from_bytes is not None:
         return guard(message, decoder.from_bytes, data, serialization)
+    if len(data) > MAX_OBJECTS and decoder is None and message.type.rpartition("/")[2] not in BULK:
+        raise MessageError(
+            f"{message.topic}: a {message.type} of {len(data):,} bytes is not taken: {MAX_OBJECTS:,} at most"
+        )
     content = guard(message, deserialize, data)
     if decoder is None or decoder.from_message is None:
         return content
@@ -145,7 +154,7 @@ def _wrong_fields(content: Any, msgtype: str, path: str) -> Iterator[str]:
 def _wrong_values(values: Iterable[Any], kind: tuple[Any, Any], path: str) -> Iterator[str]:
     """Compare the values of a field with its type. Yield a sentence for each difference."""
     node, about = kind
-    for value in values:
+    for value in islice(values, MANY):
         if node == Nodetype.NAME:
             if field_names(value) is None:
                 yield f"the field '{path}' is {describe_kind(value)}, not a {about}"

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from bevviz.messages.decoders import MessageError, frame_name, stamp_ns
 from bevviz.messages.topics import VIDEO
 from bevviz.model.frame import U8, Image
-
-MOST_PIXELS = 100_000_000  # largest image
+from bevviz.support.limits import MOST_PIXELS
 
 
 class _Encoding(NamedTuple):

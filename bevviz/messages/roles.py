@@ -30,6 +30,7 @@ from bevviz.messages.topics import (
     unsupported_reason,
 )
 from bevviz.model.frame import Scene
+from bevviz.support.limits import MAX_SENSORS
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +167,12 @@ def find_roles(
     set_note(notes, [t for t in topics if t.name in metadata], "metadata of the LiDAR")
     lidars = find_lidars([t for t in topics if t not in obstacles], config, notes)
     images = find_images(topics, config, notes)
+    for sensors, noun, key in ((lidars, "LiDARs", "lidar_topics"), (images, "cameras", "camera_topics")):
+        if len(sensors) > MAX_SENSORS:
+            raise UserError(
+                f"{len(sensors):,} topics look like {noun}: {MAX_SENSORS} at most are taken, choose some: "
+                f"--set source.{key}=[{sensors[0].name}]"
+            )
     names = unique_names(
         [(entity_name(t.name, t.frame_id), t) for t in lidars] + [(entity_name(t.name), t) for t in images]
     )
@@ -180,11 +187,12 @@ def find_roles(
         )
 
     transforms = [t for t in topics if t.kind.lower() == "tfmessage"]
-    others = [t for t in transforms if _of_another_robot(t, topics, [*lidars, *images])]
+    others = _of_other_robots(transforms, of_kind(topics, "PointCloud2", *IMAGES), [*lidars, *images])
     set_note(notes, others, "not used: transforms of another robot, whose sensors are not")
-    transforms = [t for t in transforms if t not in others]
+    foreign = set(names_of(others))
+    transforms = [t for t in transforms if t.name not in foreign]
     static = [t for t in transforms if t.name.endswith("tf_static")]
-    moving = [t for t in transforms if t not in static]
+    moving = [t for t in transforms if not t.name.endswith("tf_static")]
     set_note(notes, static, "static transforms")
     set_note(notes, moving, "transforms")
     odometry = _find_odometry(topics, config, notes)
@@ -231,14 +239,23 @@ def find_roles(
     )
 
 
-def _of_another_robot(topic: Topic, topics: Sequence[Topic], used: Sequence[Topic]) -> bool:
-    """Return whether the namespace of transforms has sensors, and none of them is used.
+def _of_other_robots(
+    transforms: Sequence[Topic], sensors: Sequence[Topic], used: Sequence[Topic]
+) -> list[Topic]:
+    """Return the transforms in whose namespace there are sensors, but none that is used.
 
     Robots of one kind have equal frame names, so their transforms must not be mixed.
     """
-    namespace = topic.name.rpartition("/")[0] + "/"
-    sensors = [t for t in of_kind(topics, "PointCloud2", *IMAGES) if t.name.startswith(namespace)]
-    return bool(sensors and used) and not any(t in used for t in sensors)
+    if not used:
+        return []
+    names, used_names = names_of(sensors), names_of(used)
+    others = []
+    for topic in transforms:
+        namespace = topic.name.rpartition("/")[0] + "/"
+        in_use = any(name.startswith(namespace) for name in used_names)
+        if not in_use and any(name.startswith(namespace) for name in names):
+            others.append(topic)
+    return others
 
 
 def _with_boxes(topics: list[Topic], config: SourceConfig) -> list[Topic]:

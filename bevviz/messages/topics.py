@@ -330,12 +330,14 @@ def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
         else:
             usable.append(topic)
 
+    infos = [t for t in of_kind(topics, "CameraInfo") if t.count != 0]
+
     def distance(topic: Topic) -> tuple[bool, bool, bool, int, int, str]:
         name = topic.name.lower()
         return (
             not _RECTIFIED.search(name),
             bool(_COLOURLESS.search(name)),
-            not _info_topic(topic, topics),
+            not _near_infos(topic, infos),
             IMAGES.index(topic.kind),  # the robot's detector mostly uses the first kind
             len(name),
             name,
@@ -361,7 +363,7 @@ def camera_role(
     """
     stated = config.camera_info_topics.get(topic.name)
     if stated is None:
-        info = _info_topic(topic, topics)
+        info = _info_topic(topic, [t for t in of_kind(topics, "CameraInfo") if t.count != 0])
     else:
         info = stated_topic(stated, topics, "source.camera_info_topics", "CameraInfo").name
     rectified = bool(_RECTIFIED.search(topic.name.lower()))
@@ -371,23 +373,26 @@ def camera_role(
     return CameraRole(name, topic.name, info, rectified, topic.kind)
 
 
-def _info_topic(image: Topic, topics: Sequence[Topic]) -> str:
-    """Return the CameraInfo of an image; empty if there is none.
-
-    ROS puts it beside the image. Otherwise one in the same frame or in a namespace above is used.
-    """
+def _info_topic(image: Topic, infos: Sequence[Topic]) -> str:
+    """Return the CameraInfo of an image, that with the most common namespaces; empty if there is none."""
     base = TRANSPORT.sub("", image.name)
-    infos = [t for t in of_kind(topics, "CameraInfo") if t.count != 0]
-    beside = [base.rpartition("/")[0] + "/camera_info", base + "/camera_info"]
-    for name in beside:
-        if any(t.name == name for t in infos):
-            return name
 
     def shared(topic: Topic) -> int:
         return len(commonprefix([topic.name.split("/"), base.split("/")]))
 
+    return max(_near_infos(image, infos), key=shared, default=Topic("", "")).name
+
+
+def _near_infos(image: Topic, infos: Sequence[Topic]) -> list[Topic]:
+    """Return the CameraInfos that may be an image's.
+
+    ROS puts it beside the image. Otherwise one in the same frame or in a namespace above is used.
+    """
+    base = TRANSPORT.sub("", image.name)
+    for name in (base.rpartition("/")[0] + "/camera_info", base + "/camera_info"):
+        if beside := [t for t in infos if t.name == name]:
+            return beside
     same_frame = [t for t in infos if image.frame_id and t.frame_id == image.frame_id]
-    above = [
+    return same_frame or [
         t for t in infos if t.name != "/camera_info" and base.startswith(t.name.removesuffix("camera_info"))
     ]
-    return max(same_frame or above, key=shared).name if same_frame or above else ""

@@ -22,16 +22,11 @@ from typing import BinaryIO
 
 from bevviz.errors import UserError
 from bevviz.support import cleanup
+from bevviz.support.limits import LINE_LIMIT, TEXT_LIMIT
 
 # Beginning of a file that Git LFS has not fetched, and the hint for the user.
 LFS_POINTER = b"version https://git-lfs.github.com/"
 LFS_HINT = "a Git LFS pointer, not the file itself: 'git lfs pull' fetches it"
-# Size limits of files, in bytes. They keep a damaged or hostile file from using up all memory.
-CONFIG_LIMIT = 1 << 20  # a configuration, a project file, a list of names: usually a few kilobytes
-TEXT_LIMIT = 1 << 24  # a calibration, the labels or the stamps of a drive: usually at most a megabyte
-TABLE_LIMIT = 1 << 27  # a table with a line for each pose: an hour at 200 Hz is 115 MB
-LINE_LIMIT = 1 << 16  # characters of a line of a table
-SENSOR_LIMIT = 1 << 30  # a scan or an image: 100 million points without colour
 
 
 # End of the stem of an unfinished file. It is random, so that no attacker can plant a link under that name.

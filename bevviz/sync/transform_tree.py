@@ -20,6 +20,7 @@ from bevviz.errors import UserError
 from bevviz.messages.transforms import StampedTransform
 from bevviz.model import geometry
 from bevviz.model.frame import F64
+from bevviz.support.limits import MAX_FRAMES
 
 
 class TransformError(UserError):
@@ -147,6 +148,9 @@ class TransformBuffer:
             self._problems[f"the transform {about} is not a finite rotation and translation: ignored"] += 1
             return
         edge = self._edges.get(child)
+        if edge is None and len(self._edges) >= MAX_FRAMES:
+            self._problems[f"there are more than {MAX_FRAMES:,} frames: the others are ignored"] += 1
+            return
         if edge is not None and origin < edge.origin:
             if edge.origin is Origin.CONFIG:
                 self._problems[f"{about} is ignored: source.extrinsics states the parent of '{child}'"] += 1

@@ -14,8 +14,8 @@ import numpy as np
 from bevviz.drivers.video import Continuity, VideoPacket
 from bevviz.errors import first_line
 from bevviz.messages.decoders import MessageError
-from bevviz.messages.images import MOST_PIXELS
 from bevviz.model.frame import U8, Codec, Image, VideoClip
+from bevviz.support.limits import MOST_PIXELS
 
 if TYPE_CHECKING:
     import av

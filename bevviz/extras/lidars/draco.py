@@ -9,9 +9,10 @@ import numpy as np
 
 from bevviz.drivers.compressed_clouds import COMPRESSED
 from bevviz.errors import first_line
-from bevviz.messages.clouds import MOST_POINTS, SCALARS, unpack_cloud
+from bevviz.messages.clouds import SCALARS, unpack_cloud
 from bevviz.messages.decoders import Decoder
 from bevviz.model.frame import Cloud
+from bevviz.support.limits import MOST_POINTS
 
 
 def decode(msg: Any) -> Cloud:

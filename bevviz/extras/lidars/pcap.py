@@ -27,6 +27,7 @@ from bevviz.extras.lidars.scan_messages import encode_scan
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_message
 from bevviz.model.frame import I64
+from bevviz.support.limits import MAX_PACKET
 
 SECOND = 1_000_000_000
 # Of files in either byte order: nanoseconds of a unit of the fraction of a second.
@@ -42,7 +43,6 @@ LITTLE = (b"\xd4", b"\x4d")  # first bytes of little-endian files
 LINKS = {1: 12, 113: 14, 276: 0, 0: None, 101: None, 108: None, 228: None}
 LOOPBACK = (0, 108)  # links with four bytes before IP
 VLAN = (0x8100, 0x88A8)
-MAX_PACKET = 1 << 18  # bytes; a longer one is damage
 VELODYNE, OUSTER, HESAI = "velodyne", "ouster", "hesai"
 VELODYNE_SIZE, HESAI_SIZE = 1206, 1500
 VELODYNE_AZIMUTH = 2  # offset in a packet

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 
 from bevviz.bags.chunks import Chunk
-from bevviz.bags.ros1 import LONGEST_HEADER, MAGIC, Connections, Record, chunk_of, is_sane, read_record
+from bevviz.bags.ros1 import MAGIC, Connections, Record, chunk_of, is_sane, read_record
 from bevviz.extras.rescue.chunks import RecordWalker
+from bevviz.support.limits import LONGEST_HEADER
 
 OPCODE = re.compile(rb"(?=\x04\0\0\0op=)")  # Every header contains an opcode.
 SEARCH_BACK = 160  # bytes of a header before its opcode that are searched

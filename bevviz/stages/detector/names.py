@@ -10,7 +10,8 @@ from typing import Any
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.errors import UserError
 from bevviz.stages.detector.session import clip
-from bevviz.support.files import CONFIG_LIMIT, read_text
+from bevviz.support.files import read_text
+from bevviz.support.limits import CONFIG_LIMIT
 
 DEFAULT_SIZE = 640  # pixels a side for an open input; most families are trained with this size
 DEFAULT_STRIDE, MAX_STRIDE = 32, 256  # pixels; the coarsest grids of known families have 128

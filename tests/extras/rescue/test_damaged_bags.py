@@ -17,7 +17,7 @@ import zstandard
 
 from bevviz.bags import chunks, mcap
 from bevviz.bags.bag import Recording
-from bevviz.bags.compression import LEAST, unpack
+from bevviz.bags.compression import unpack
 from bevviz.bags.reader import DamageError, FileBytes
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
@@ -25,6 +25,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.extras.rescue.sqlite import checksum_of
 from bevviz.pipeline.bag_info import describe_bag, render_bag_info
+from bevviz.support.limits import MIN_CHUNK
 from tests.support.bag_formats import FORMATS
 from tests.support.commands import error_of
 from tests.support.damaged_bags import Found, change, missing, read, records, whole
@@ -205,8 +206,8 @@ def test_the_size_that_a_chunk_claims_costs_nothing(tmp_path: Path, size: int) -
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
 def test_a_chunk_is_unpacked_to_a_limit(compression: str) -> None:
     bomb = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression]
-    data, damage = unpack(compression, bomb(bytes(LEAST + (1 << 20))), 1000)
-    assert len(data) == LEAST
+    data, damage = unpack(compression, bomb(bytes(MIN_CHUNK + (1 << 20))), 1000)
+    assert len(data) == MIN_CHUNK
     assert damage == "a chunk ends early"
 
 
