@@ -70,7 +70,7 @@ def dark(row: Row) -> str:
 def test_planted_causes_are_found_and_named() -> None:
     table = findings(batch(lambda row: far_persons(row) or dark(row)))
     causes = find_causes(table).causes
-    named = {cause.reason: {bound.attribute for bound in cause.bounds} for cause in causes}
+    named = {cause.reason: {bound.attribute for bound in cause.conditions} for cause in causes}
     assert named == {
         "ground": {"class", "range_m", "bearing_deg"},
         "not detected": {"brightness", "height_m"},
@@ -95,7 +95,7 @@ def test_two_causes_of_one_reason_are_told_apart() -> None:
         return "ground" if low or far_persons(row) else ""
 
     causes = find_causes(findings(batch(miss))).causes
-    assert [{bound.attribute for bound in cause.bounds} for cause in causes] == [
+    assert [{bound.attribute for bound in cause.conditions} for cause in causes] == [
         {"class", "range_m", "bearing_deg"},
         {"class", "range_m", "height_m"},
     ]
@@ -120,11 +120,9 @@ def test_many_frames_of_few_objects_are_no_cause() -> None:
 
 def test_examples_come_from_different_drives() -> None:
     causes = find_causes(findings(batch(far_persons)))
-    examples = causes.examples(causes.causes[0])
-    assert len({example["recording"] for example in examples}) == len(examples) == 3
-    assert all(
-        e["command"].startswith(f"bevviz open runs/{e['recording']}.rrd --at 2025-06-15T") for e in examples
-    )
+    examples = causes.causes[0].examples
+    assert len({example.recording for example in examples}) == len(examples) == 3
+    assert all(e.command.startswith(f"bevviz open runs/{e.recording}.rrd --at 2025-06-15T") for e in examples)
 
 
 def test_words_say_each_side_of_an_interval() -> None:
@@ -154,7 +152,7 @@ def test_an_unknown_number_meets_no_condition() -> None:
 
 def test_a_new_cause_and_a_gone_one() -> None:
     new, old = find_causes(findings(batch(far_persons))), find_causes(findings(batch(dark, seed=1)))
-    states = {c.state: c.cause.reason for c in compare_causes(new, old)}
+    states = {c.state: c.reason for c in compare_causes(new, old)}
     assert states == {"new": "ground", "gone": "not detected"}
     again = compare_causes(new, find_causes(findings(batch(far_persons, seed=2))))
     assert [c.state for c in again] == ["as before"]

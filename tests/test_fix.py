@@ -49,8 +49,8 @@ def test_two_wrong_parameters_are_repaired(samples: tuple[Sample, Sample]) -> No
     fix = find_fix(config, keys, choosing, confirming, trials=24)
     assert set(fix.settings) == set(keys)
     default = f1(confirming.counts(confirming.scores([load()])[0]))
-    assert fix.after >= default - 0.01 and fix.before < default - 0.1
-    assert fix.confirmed and fix.interval[0] > 0
+    assert fix.f1_after >= default - 0.01 and fix.f1_before < default - 0.1
+    assert fix.confirmed and fix.f1_change[0] > 0
     assert 0 < fix.fixed <= fix.missed and fix.cause_fixed == fix.fixed
     assert f"fixes {fix.fixed} of {fix.missed} missed objects" in "\n".join(fix.lines())
 
@@ -62,7 +62,7 @@ def test_the_file_repeats_what_was_measured(samples: tuple[Sample, Sample], tmp_
     file = tmp_path / "fix.yaml"
     file.write_text(fix.yaml())
     repeated = f1(confirming.counts(confirming.scores([load(file)])[0]))
-    assert repeated == pytest.approx(fix.after)
+    assert repeated == pytest.approx(fix.f1_after)
 
 
 def test_good_parameters_stay(samples: tuple[Sample, Sample]) -> None:
@@ -74,12 +74,13 @@ def test_good_parameters_stay(samples: tuple[Sample, Sample]) -> None:
 
 
 def test_a_gain_that_may_be_chance_is_not_confirmed() -> None:
-    def fix(low: float) -> Fix:
-        return Fix({"a.b": 1}, ["a.b"], 9, 0.5, 0.6, (low, 0.2), 1, 2, 0, 9, 0, 0, (1, 1), 6, 3, True)
+    def text(confirmed: bool) -> str:
+        change = (0.01 if confirmed else -0.01, 0.2)
+        counts = (1, 2, 0, 9, 0, 0, 1, 1, 6, 3)
+        return "\n".join(Fix({"a.b": 1}, confirmed, ["a.b"], 9, 0.5, 0.6, change, *counts, True).lines())
 
-    assert fix(0.01).confirmed and not fix(-0.01).confirmed
-    assert "not confirmed: it may as well be chance" in "\n".join(fix(-0.01).lines())
-    assert "parts of drives" in "\n".join(fix(0.01).lines())
+    assert "not confirmed: it may as well be chance" in text(confirmed=False)
+    assert "parts of drives" in text(confirmed=True) and "not confirmed" not in text(confirmed=True)
 
 
 def test_the_search_finds_values_that_only_help_together() -> None:

@@ -46,7 +46,7 @@ def test_a_whole_bag_is_described(tmp_path: Path, form: str, name: str) -> None:
     assert info.lidars == ("velodyne",)
     (camera,) = info.cameras
     assert camera.name == "camera"
-    assert info.tree == {"base_link": "odom", "velodyne": "base_link", "camera_optical": "velodyne"}
+    assert info.transforms == {"base_link": "odom", "velodyne": "base_link", "camera_optical": "velodyne"}
     assert info.world_frame == "odom"
     assert info.missing == info.warnings == ()
     text = render_bag_info(info)

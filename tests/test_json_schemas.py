@@ -8,7 +8,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from bevviz.cli import make_parser
-from bevviz.model.json_forms import FORMS, schema
+from bevviz.cli.json_forms import FORMS, schema
 from tests.support import documented_json
 from tools.make_schemas import FOLDER, text_of
 

@@ -123,7 +123,7 @@ def test_info_shows_the_graph(robot: str) -> None:
     assert made.seconds >= 1.0 and cloud.rate == pytest.approx(cloud.count / made.seconds)
     assert topics["/rosout"].count is None and topics["/rosout"].role == ""
     assert topics["/tf_static"].role == "static transforms; from /player (reliable, latched)"
-    assert made.tree["rslidar"] == "base_link" and made.world_frame == "map"
+    assert made.transforms["rslidar"] == "base_link" and made.world_frame == "map"
     assert made.missing == ("no detector: --model FILE.onnx",)
     text = info.render(made)
     assert text.startswith(f"graph   ROS_DOMAIN_ID {robot}, rmw_fastrtps_cpp\n")

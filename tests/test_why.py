@@ -23,6 +23,7 @@ from bevviz.model.reasons import Limit, ReasonKind
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection, why
+from bevviz.why.answer_results import AnswerResult
 from bevviz.why.answer_text import summary_line
 from bevviz.why.confidence import Outcome, features_of
 from bevviz.why.confidence_table import COEFFICIENTS, FEATURES
@@ -377,7 +378,7 @@ def test_without_a_model_no_detector_is_said_to_have_looked() -> None:
         answers = why(result, Selection(label="person"), CLASSES, hints=1)
         never = [a for a in answers if a.verdict.kind is ReasonKind.NOT_RUN]
         assert len(never) >= 2 and all(a.verdict.reason["problems"] == (what,) for a in never)
-        assert not any(a.verdict.reported or "no candidate" in str(a.as_dict()) for a in answers)
+        assert not any(a.verdict.reported or "no candidate" in str(AnswerResult.of(a)) for a in answers)
         assert "the detector never ran" in summary_line(answers)
         box = never[0].subject.box
         assert box is not None

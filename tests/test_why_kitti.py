@@ -18,7 +18,9 @@ from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.stages.clustering import dbscan
+from bevviz.support.json_form import json_tree
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.answer_results import AnswerResult
 from bevviz.why.frame_index import Fate
 
 NAMES = {"Car": "car", "Van": "car", "Truck": "truck", "Tram": "train"}  # any other label is a person
@@ -247,9 +249,8 @@ def test_a_change_with_the_objects_own_detection_is_a_hint(asked: dict[str, Aske
             helped += len(after.hints)
             if not after.hints and after.tried:
                 assert all(change.text in after.verdict.text for change in after.tried)
-                assert [change["text"] for change in after.as_dict()["tried"]] == [
-                    change.text for change in after.tried
-                ]
+                tried = json_tree(AnswerResult.of(after))["tried"]
+                assert [change["text"] for change in tried] == [change.text for change in after.tried]
     assert helped >= 2
 
 

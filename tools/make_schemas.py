@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from bevviz.model.json_forms import FORMS, schema
+from bevviz.cli.json_forms import FORMS, schema
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "schemas"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.frame import F64
-from bevviz.model.json_forms import CalibCameraForm
+from bevviz.support.json_form import json_form
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +129,12 @@ class AxisResult:
     score: F64  # (S,) mean score at each of these offsets
 
     @property
+    def error(self) -> AxisError:
+        """The result in plain values."""
+        axis = self.axis
+        return AxisError(axis.what, axis.unit, self.offset, self.interval, self.finding.value, self.reason)
+
+    @property
     def measured(self) -> str:
         """Offset, interval and unit in words."""
         if self.interval >= 2 * self.axis.prior:
@@ -145,6 +151,67 @@ class AxisResult:
             most = abs(self.offset) + self.interval
             return f"fine: off by no more than {most:.{self.axis.decimals}f} {self.axis.unit}"
         return f"{self.finding}: {self.reason}" if self.reason else str(self.finding)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisError:
+    """Error along one axis."""
+
+    what: str
+    unit: str
+    """of offset and interval"""
+    offset: float | None
+    """the error"""
+    interval: float | None
+    """two standard deviations to either side of the offset"""
+    finding: str
+    """one of the findings in docs/calib.md"""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationScores:
+    """Agreement of the edges of clouds and images."""
+
+    stated: float | None
+    corrected: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Extrinsics:
+    """4 x 4 pose of the child in the parent."""
+
+    stated: Sequence[Sequence[float]]
+    corrected: Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """Calibration of one camera."""
+
+    camera: str
+    answer: str
+    frames: int
+    """frames that were used"""
+    edges: int
+    """edges that were used"""
+    score: CalibrationScores
+    axes: Mapping[str, AxisError]
+    """by name: rx, ry, rz, tx, ty, tz, dt"""
+    parent: str
+    """frame"""
+    child: str
+    """frame"""
+    extrinsics: Extrinsics
+    notes: Sequence[str]
+
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class CalibrationResults:
+    """Errors of the mounting and the stamps of each camera."""
+
+    cameras: Sequence[CameraCalibration]
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,30 +286,20 @@ class Calibration:
             for name, offset, finding_text in rows
         )
 
-    def to_dict(self) -> CalibCameraForm:
-        """Return the result for JSON."""
-        return {
-            "camera": self.camera,
-            "answer": self.answer,
-            "frames": self.frames,
-            "edges": self.edges,
-            "score": {"stated": self.score_stated, "corrected": self.score_corrected},
-            "axes": {
-                axis.axis.name: {
-                    "what": axis.axis.what,
-                    "unit": axis.axis.unit,
-                    "offset": axis.offset,
-                    "interval": axis.interval,
-                    "finding": str(axis.finding),
-                    "reason": axis.reason,
-                }
-                for axis in self.axes
-            },
-            "parent": self.parent,
-            "child": self.child,
-            "extrinsics": {"stated": self.stated.tolist(), "corrected": self.corrected.tolist()},
-            "notes": list(self.notes),
-        }
+    def result(self) -> CameraCalibration:
+        """Return the result in plain values."""
+        return CameraCalibration(
+            camera=self.camera,
+            answer=self.answer,
+            frames=self.frames,
+            edges=self.edges,
+            score=CalibrationScores(self.score_stated, self.score_corrected),
+            axes={r.axis.name: r.error for r in self.axes},
+            parent=self.parent,
+            child=self.child,
+            extrinsics=Extrinsics(self.stated.tolist(), self.corrected.tolist()),
+            notes=self.notes,
+        )
 
 
 def frames_text(count: int) -> str:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from bevviz.calib import Calibration, Shots
     from bevviz.config import Config
     from bevviz.model.frame import Scene
-    from bevviz.model.json_forms import CalibForm
 
 FRAMES = 30  # Number of frames to use without --every.
 
@@ -54,6 +53,7 @@ class CalibOptions:
 )
 def _calib(options: CalibOptions) -> int:
     from bevviz.calib import calibrate, gather
+    from bevviz.calib.result import CalibrationResults
     from bevviz.errors import UserError
 
     config = load_config(options)
@@ -80,7 +80,7 @@ def _calib(options: CalibOptions) -> int:
                 steps.update(round(100 * share) - steps.n)
 
             results.append(calibrate(shots[name], show, config.sync.offsets))
-    tree: CalibForm = {"cameras": [result.to_dict() for result in results]}
+    tree = CalibrationResults([result.result() for result in results])
     print_result(output.json, "calib", tree, lambda: "\n".join(map(_text, results)))
     if output.write is not None:
         _write(results, output.write)

@@ -29,23 +29,12 @@ def _causes(options: CausesOptions) -> int:
     from bevviz.fleet.causes import Findings, compare_causes, comparison_lines, find_causes
 
     new = find_causes(Findings.load(options.folder))
-    tree = new.as_tree(options.top)
     if options.against is None:
-        print_result(options.json, "causes", tree, lambda: "\n".join(new.lines(options.top)))
+        print_result(
+            options.json, "causes", new.result(options.top), lambda: "\n".join(new.lines(options.top))
+        )
         return 0
     compared = compare_causes(new, find_causes(Findings.load(options.against)))
-    tree["compared"] = [
-        {
-            "state": c.state,
-            "kind": c.cause.kind,
-            "reason": c.cause.reason,
-            "text": c.cause.text,
-            "count": c.cause.count,
-            "among": c.cause.among,
-            "other": c.other,
-            "other_among": c.other_among,
-        }
-        for c in compared
-    ]
-    print_result(options.json, "causes", tree, lambda: "\n".join(comparison_lines(compared)))
+    result = new.result(options.top, compared)
+    print_result(options.json, "causes", result, lambda: "\n".join(comparison_lines(compared)))
     return 0

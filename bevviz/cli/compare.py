@@ -127,7 +127,7 @@ def _run(
         warn(failures.warnings)
         if summary.without:
             say(f"{summary.without} frames for which the robot published nothing are left out")
-        print_result(output.json, "compare", summary.as_tree(), summary.table)
+        print_result(output.json, "compare", summary.result(), summary.table)
         if output.csv is not None:
             summary.write_csv(output.csv)
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.metrics import Limit
-    from bevviz.model.json_forms import EvaluateForm, LimitForm
     from bevviz.model.protocols import Observer
     from bevviz.model.results import FrameResult
 
@@ -145,11 +144,7 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: EvaluateOption
     if not options.output and options.output.json != STDOUT:
         print(evaluation.table())
     results = check(limits, evaluation.metrics)
-    gate: list[LimitForm] = [
-        {"limit": str(result.limit), "kept": not result.reason, "reason": result.reason} for result in results
-    ]
-    tree: EvaluateForm = {**evaluation.as_tree(), "limits": gate}
-    write_json(options.output.json, "evaluate", tree)
+    write_json(options.output.json, "evaluate", evaluation.result(results))
     if options.limits.junit is not None:
         write_junit(options.limits.junit, {beside(options.drive.paths[0]).stem: results})
     for result in results:

@@ -74,7 +74,7 @@ def _fix(options: FixOptions) -> int:
         return 1
     with progress.bar(total=search.trials, desc="try", unit="setting", leave=False) as bar:
         fix = find_fix(config, keys, choosing, confirming, search.trials, bar.update, parts=parts)
-    print_result(search.json, "fix", fix.as_tree(), lambda: "\n".join(fix.lines()))
+    print_result(search.json, "fix", fix, lambda: "\n".join(fix.lines()))
     if search.output is not None and fix.settings:
         save_text(search.output, fix.yaml(), "-o")
         say(f"{search.output}: written", always=search.json != STDOUT)

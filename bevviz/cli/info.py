@@ -49,13 +49,7 @@ class InfoOptions:
     "faults of the sensors in the first seconds.",
 )
 def _info(options: InfoOptions) -> int:
-    from bevviz.pipeline.bag_info import (
-        BagInfo,
-        contents_tree,
-        describe_bag,
-        render_bag_contents,
-        render_missing,
-    )
+    from bevviz.pipeline.bag_info import BagInfo, describe_bag, render_bag_contents, render_missing
 
     if options.live and options.sensors:
         raise UserError("bevviz info: --sensors is for a drive; a running robot's are watched by bevviz live")
@@ -64,7 +58,7 @@ def _info(options: InfoOptions) -> int:
 
         seconds = options.seconds or info.LISTEN
         live = info.describe(load_config(options), options.ros_args, seconds)
-        print_result(options.json, "info", contents_tree(live), lambda: info.render(live))
+        print_result(options.json, "info", live, lambda: info.render(live))
         return 0
     if options.seconds is not None:
         raise UserError("bevviz info: --for is for --live; a bag is read as a whole")
@@ -77,5 +71,5 @@ def _info(options: InfoOptions) -> int:
 
     config = load_config(options)
     bag_info = describe_bag(options.paths, config, all_frames=options.sensors, on_contents=show)
-    print_result(options.json, "info", contents_tree(bag_info), lambda: render_missing(bag_info))
+    print_result(options.json, "info", bag_info, lambda: render_missing(bag_info))
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import html
-import math
 import os
 import re
 import shlex
@@ -13,7 +12,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -287,13 +286,13 @@ def join_json_option(arguments: Iterable[str]) -> list[str]:
     return joined
 
 
-def write_json(target: Path | None, form: str, tree: Mapping[str, Any]) -> None:
+def write_json(target: Path | None, form: str, result: object) -> None:
     """Print or write the result if ``--json`` is given.
 
     Args:
         target: value of ``--json``.
-        form: name of the format, see ``bevviz.model.json_forms``.
-        tree: the result: values that JSON can represent, NaN, and tuples.
+        form: name of the format, see ``bevviz.cli.json_forms``.
+        result: a dataclass of that format.
 
     Raises:
         UserError: the file cannot be written.
@@ -302,30 +301,22 @@ def write_json(target: Path | None, form: str, tree: Mapping[str, Any]) -> None:
         return
     import json
 
-    from bevviz.model.json_forms import form_name
+    from bevviz.cli.json_forms import form_name
     from bevviz.support.files import save_text
+    from bevviz.support.json_form import json_tree
 
-    text = json.dumps({"form": form_name(form), **_plain(tree)}, indent=1, allow_nan=False)
+    text = json.dumps({"form": form_name(form), **json_tree(result)}, indent=1, allow_nan=False)
     if target == STDOUT:
         print(text, flush=True)
     else:
         save_text(target, f"{text}\n", OPTION)
 
 
-def print_result(target: Path | None, form: str, tree: Mapping[str, Any], text: Callable[[], str]) -> None:
+def print_result(target: Path | None, form: str, result: object, text: Callable[[], str]) -> None:
     """Print the result as text or as JSON, and write it as ``--json FILE`` says; see ``write_json``."""
     if target != STDOUT:
         print(text(), flush=True)
-    write_json(target, form, tree)
-
-
-def _plain(value: Any) -> Any:
-    """Replace NaN and infinity by None, and tuples by lists."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    write_json(target, form, result)
 
 
 # --- the check that no output overwrites an input or another output ----------------------------

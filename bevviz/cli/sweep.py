@@ -58,7 +58,7 @@ def _sweep(options: SweepOptions) -> int:
             print_hints(source.scene, config)
             end = run_with_progress(source, sweep, [])
             warn(source.warnings)
-            print_result(outputs.json, "sweep", sweep.as_tree(), sweep.table)
+            print_result(outputs.json, "sweep", sweep.result(), sweep.table)
             if outputs.csv is not None:
                 sweep.write_csv(outputs.csv)
             if sinks is not None:

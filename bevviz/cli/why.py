@@ -18,9 +18,9 @@ from bevviz.support.contexts import garbage_collection_off
 
 if TYPE_CHECKING:
     from bevviz.model.frame import Scene
-    from bevviz.model.json_forms import WhyForm
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, FrameExplainer, Selection
+    from bevviz.why.answer_results import FrameAnswers
 
 EXAMPLES = """examples:
   bevviz why drive.mcap --at 12.5 --model yolo11n.onnx                  whatever went wrong in that frame
@@ -92,8 +92,8 @@ def _why(options: WhyOptions) -> int:
             for question, asked in extensions(options)
         )
         if (further := next(filter(None, answered), None)) is not None:
-            tree, lines = further
-            print_result(options.json, "why", tree, lambda: "\n".join(map(printable, lines)))
+            frame_answers, lines = further
+            print_result(options.json, "why", frame_answers, lambda: "\n".join(map(printable, lines)))
             return 0
         outputs = options.output
         result = session.run(frame) if outputs else session.run_explained(frame)
@@ -106,7 +106,7 @@ def _why(options: WhyOptions) -> int:
         text = printable(f"frame {frame.index}, preset {config.preset}: {headline}")
         if answers:
             text = f"{text}\n\n{plain_text(answers, subject.limit, neighbours, unseen)}"
-        print_result(options.json, "why", _tree(result, answers, neighbours, headline), lambda: text)
+        print_result(options.json, "why", _frame_answers(result, answers, neighbours, headline), lambda: text)
         if outputs:
             _show(result, answers, source.scene, outputs, subject.limit)
     return 0
@@ -161,17 +161,19 @@ def _headline(questioner: FrameExplainer, selection: Selection) -> str:
     return f"{problem}: there is no detection, however weak"
 
 
-def _tree(
+def _frame_answers(
     result: FrameResult, answers: Sequence[Answer], neighbours: Sequence[Answer], headline: str
-) -> WhyForm:
-    return {
-        "frame": result.frame.index,
-        "stamp": result.frame.stamp,
-        "preset": result.config.preset,
-        "summary": headline,
-        "answers": [a.as_dict() for a in answers],
-        "beside": [{"name": a.subject.name, "verdict": a.verdict.text} for a in neighbours],
-    }
+) -> FrameAnswers:
+    from bevviz.why.answer_results import AnswerResult, FrameAnswers, OtherAnswer
+
+    return FrameAnswers(
+        frame=result.frame.index,
+        stamp=result.frame.stamp,
+        preset=result.config.preset,
+        summary=headline,
+        answers=[*map(AnswerResult.of, answers)],
+        beside=[OtherAnswer(a.subject.name, a.verdict.text) for a in neighbours],
+    )
 
 
 def _show(result: FrameResult, answers: Sequence[Answer], scene: Scene, outputs: Outputs, limit: int) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from io import StringIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Protocol
 
@@ -20,15 +22,101 @@ from bevviz.compare.differences import (
     TruthComparison,
 )
 from bevviz.config import ParameterChange
-from bevviz.model.json_forms import ComparedFrameForm, CompareForm, JudgedForm, ObjectDifferenceForm
 from bevviz.model.protocols import Observer
 from bevviz.support import table
 from bevviz.support.files import save_text
+from bevviz.support.json_form import json_form
 from bevviz.support.text import fenced, printable
 
 WORST = 10  # number of frames in the table
 EXAMPLES = 2  # number of objects shown for each frame
 COLUMNS = ("objects A", "objects B", *(change.value for change in (Change.SAME, *DIFFERENT)))
+
+
+@dataclass(frozen=True, slots=True)
+class ImageDifference:
+    """A detection that differs."""
+
+    change: str
+    class_a: str
+    class_b: str
+    camera: str
+    text: str
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectDifference:
+    """An object that differs."""
+
+    change: str
+    class_a: str
+    class_b: str
+    x: float | None
+    """metres in the frame of the points"""
+    y: float | None
+    z: float | None
+    distance: float | None
+    """metres between both sides"""
+    iou: float | None
+    text: str
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
+class DifferingFrame:
+    """Differences of one frame."""
+
+    frame: int
+    """number of the scan"""
+    stamp: int
+    """nanoseconds since 1970"""
+    number: int
+    """differences"""
+    fixed: Sequence[str]
+    """labelled objects that only B finds"""
+    broke: Sequence[str]
+    """labelled objects that only A finds"""
+    objects: Sequence[ObjectDifference]
+    detections: Sequence[ImageDifference]
+
+
+@dataclass(frozen=True, slots=True)
+class SideCounts:
+    """A number for each side."""
+
+    A: int
+    B: int
+
+
+@dataclass(frozen=True, slots=True)
+class TruthCounts:
+    """Both sides against the ground truth."""
+
+    classes: Mapping[str, Mapping[str, int]]
+    """labelled objects: there, found by A and B, fixed and broken by B"""
+    wrong: SideCounts
+    """objects that are none"""
+
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class ComparisonResult:
+    """Differences of two runs."""
+
+    a: str
+    b: str
+    config: Mapping[str, str]
+    """parameters that differ: before -> after"""
+    objects: Mapping[str, Mapping[str, int]]
+    """counts by class and change"""
+    detections: Mapping[str, Mapping[str, int]]
+    """counts by class and change"""
+    clusters: SideCounts
+    """number in all frames"""
+    truth: TruthCounts | None
+    """null: no ground truth"""
+    frames: Sequence[DifferingFrame]
 
 
 class FrameComparison(Protocol):
@@ -50,7 +138,7 @@ class ComparisonSummary(Observer[FrameComparison]):
     def __init__(self, names: tuple[str, str], config: Mapping[str, ParameterChange]) -> None:
         self.names, self.config = names, {key: str(change) for key, change in config.items()}
         self.without = 0  # frames for which a side has no result
-        self.frames: list[ComparedFrameForm] = []
+        self.frames: list[DifferingFrame] = []
         self._classes: dict[str, Counter[str]] = defaultdict(Counter)
         self._detections: dict[str, Counter[str]] = defaultdict(Counter)
         self._clusters: Counter[str] = Counter()
@@ -92,27 +180,20 @@ class ComparisonSummary(Observer[FrameComparison]):
             self._judge(judged)
         differing = [d for d in differences.objects if d.change is not Change.SAME]
         self.frames.append(
-            {
-                "frame": differences.index,
-                "stamp": differences.stamp,
-                "number": differences.number,
-                "fixed": [] if judged is None else [*map(judged.text, judged.fixed)],
-                "broke": [] if judged is None else [*map(judged.text, judged.broken)],
-                "objects": [_row(d, differences) for d in differing],
-                "detections": [
-                    {
-                        "change": d.change.value,
-                        "class_a": d.name_a,
-                        "class_b": d.name_b,
-                        "camera": camera,
-                        "text": d.text,
-                        "place": f"in {camera}",
-                    }
+            DifferingFrame(
+                frame=differences.index,
+                stamp=differences.stamp,
+                number=differences.number,
+                fixed=[] if judged is None else [*map(judged.text, judged.fixed)],
+                broke=[] if judged is None else [*map(judged.text, judged.broken)],
+                objects=[_row(d, differences) for d in differing],
+                detections=[
+                    ImageDifference(d.change.value, d.name_a, d.name_b, camera, d.text, f"in {camera}")
                     for camera, pairs in differences.images.items()
                     for d in pairs
                     if d.change is not Change.SAME
                 ],
-            }
+            )
         )
 
     def _judge(self, judged: TruthComparison) -> None:
@@ -129,21 +210,21 @@ class ComparisonSummary(Observer[FrameComparison]):
                 self._judged[judged.labels[row].lower()][outcome] += 1
 
     @property
-    def truth(self) -> JudgedForm | None:
+    def truth(self) -> TruthCounts | None:
         """Labelled objects that each side finds, by class, and the number of false ones. None: no truth."""
         if not self._judged:
             return None
         wrong = {
             side: sum(n for name, n in w.items() if name in self._names) for side, w in self._wrong.items()
         }
-        return {"classes": self._judged, "wrong": {"A": wrong["A"], "B": wrong["B"]}}
+        return TruthCounts(self._judged, SideCounts(**wrong))
 
     @property
-    def worst(self) -> Sequence[ComparedFrameForm]:
+    def worst(self) -> Sequence[DifferingFrame]:
         """Frames that differ. Frames in which B loses an object come first, then those with most changes."""
         return sorted(
-            (f for f in self.frames if f["number"]),
-            key=lambda f: (-len(f["broke"]), -f["number"], f["frame"]),
+            (f for f in self.frames if f.number),
+            key=lambda f: (-len(f.broke), -f.number, f.frame),
         )
 
     def table(self) -> str:
@@ -173,16 +254,19 @@ class ComparisonSummary(Observer[FrameComparison]):
             return
         yield f"{len(worst)} of {len(self.frames)} frames differ; the worst:"
         for frame in worst[:WORST]:
-            differences = [*frame["objects"], *frame["detections"]]
-            counts = Counter(d["change"] for d in differences)
+            differences: list[ObjectDifference | ImageDifference] = [*frame.objects, *frame.detections]
+            counts = Counter(d.change for d in differences)
             change_counts = ", ".join(
                 f"{counts[change]} {change}" for change in WORST_FIRST if counts[change]
             )
-            differences.sort(key=lambda d: WORST_FIRST.index(d["change"]))
-            examples = [f"{outcome} {text}" for outcome in ("broke", "fixed") for text in frame[outcome]]
-            examples = examples or [f"{d['text']} {d['place']}" for d in differences]
+            differences.sort(key=lambda d: WORST_FIRST.index(d.change))
+            examples = [
+                *(f"broke {text}" for text in frame.broke),
+                *(f"fixed {text}" for text in frame.fixed),
+            ]
+            examples = examples or [f"{d.text} {d.place}" for d in differences]
             more = "; ..." if examples[EXAMPLES:] else ""
-            yield f"  frame {frame['frame']}: {change_counts} ({'; '.join(examples[:EXAMPLES])}{more})"
+            yield f"  frame {frame.frame}: {change_counts} ({'; '.join(examples[:EXAMPLES])}{more})"
 
     def _truth_lines(self) -> Iterator[str]:
         truth = self.truth
@@ -199,10 +283,9 @@ class ComparisonSummary(Observer[FrameComparison]):
                 ("all", *(str(total[column]) for column in columns)),
             ]
         )
-        wrong = truth["wrong"]
         yield (
             f"B fixed {total['fixed']}, broke {total['broke']}; objects that are none: "
-            f"{wrong['A']} in A, {wrong['B']} in B"
+            f"{truth.wrong.A} in A, {truth.wrong.B} in B"
         )
 
     def _no_difference(self) -> str:
@@ -212,18 +295,17 @@ class ComparisonSummary(Observer[FrameComparison]):
         objects = "no object differs" if self._detected else "no detector (--model FILE.onnx), so no objects"
         return f"{objects}; the number of clusters differs in {self._other_clusters} of {frames}"
 
-    def as_tree(self) -> CompareForm:
-        """Return the counts and every difference for JSON."""
-        return {
-            "a": self.names[0],
-            "b": self.names[1],
-            "config": self.config,
-            "objects": self._classes,
-            "detections": self._detections,
-            "clusters": {"A": self._clusters["objects A"], "B": self._clusters["objects B"]},
-            "truth": self.truth,
-            "frames": self.frames,
-        }
+    def result(self) -> ComparisonResult:
+        """Return the counts and every difference."""
+        return ComparisonResult(
+            *self.names,
+            config=self.config,
+            objects=self._classes,
+            detections=self._detections,
+            clusters=SideCounts(self._clusters["objects A"], self._clusters["objects B"]),
+            truth=self.truth,
+            frames=self.frames,
+        )
 
     def write_csv(self, path: Path) -> None:
         """Write a row for each object that differs.
@@ -233,10 +315,11 @@ class ComparisonSummary(Observer[FrameComparison]):
         """
         header = ("frame", "stamp", "change", "class_a", "class_b", "x", "y", "z", "distance", "iou")
         file = StringIO()
-        writer = csv.DictWriter(file, header, extrasaction="ignore")
-        writer.writeheader()
+        writer = csv.writer(file)
+        writer.writerow(header)
         for frame in self.frames:
-            writer.writerows({**frame, **row} for row in frame["objects"])
+            of_object = attrgetter(*header[2:])
+            writer.writerows((frame.frame, frame.stamp, *of_object(row)) for row in frame.objects)
         save_text(path, file.getvalue(), "--csv")
 
 
@@ -265,19 +348,19 @@ def _rows(counts: Mapping[str, Counter[str]], which: Sequence[str] = COLUMNS) ->
     yield ("all", *(str(total[column]) for column in which))
 
 
-def _row(difference: Difference, differences: FrameDifferences) -> ObjectDifferenceForm:
+def _row(difference: Difference, differences: FrameDifferences) -> ObjectDifference:
     side, row = differences.side_with(difference)
     x, y, z = (round(v, 3) for v in side.boxes.center[row].tolist())
     pair = difference.row_a >= 0 and difference.row_b >= 0
-    return {
-        "change": difference.change.value,
-        "class_a": difference.name_a,
-        "class_b": difference.name_b,
-        "x": x,
-        "y": y,
-        "z": z,
-        "distance": round(difference.distance, 3) if pair else None,
-        "iou": round(difference.iou, 3) if pair else None,
-        "text": difference.text,
-        "place": differences.position_of(difference),
-    }
+    return ObjectDifference(
+        change=difference.change.value,
+        class_a=difference.name_a,
+        class_b=difference.name_b,
+        x=x,
+        y=y,
+        z=z,
+        distance=round(difference.distance, 3) if pair else None,
+        iou=round(difference.iou, 3) if pair else None,
+        text=difference.text,
+        place=differences.position_of(difference),
+    )

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, AveragePrecision, scored_objects
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
-from bevviz.evaluate.metrics import base_of, ranges
+from bevviz.evaluate.metrics import LimitResult, base_of, ranges
 from bevviz.evaluate.tracking_score import HINT, TrackScore
 from bevviz.model.frame import Boxes3D, Frame
-from bevviz.model.json_forms import EvaluationForm, WrongFrameForm
 from bevviz.model.protocols import Observer
 from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult, Objects
 from bevviz.model.tables import Columns, Tabular
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support import table
+from bevviz.support.json_form import json_form
 from bevviz.support.text import printable
 
 UNUSABLE = 10  # number of unusable labels in the JSON
@@ -46,6 +46,40 @@ class JudgedFrame:
     true: tuple[str, ...]  # text as ``person at 12.3 m, 4° left``
     missed: tuple[str, ...]
     false: tuple[tuple[str, str, str], ...]  # name, text, cause; a name that no label accepts is not judged
+
+
+@dataclass(frozen=True, slots=True)
+class FrameOutcome:
+    """Objects of a frame in words."""
+
+    frame: int
+    """number of the scan"""
+    stamp: int
+    """nanoseconds since 1970"""
+    true: Sequence[str]
+    missed: Sequence[str]
+    false: Sequence[str]
+
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class EvaluationResult:
+    """Metrics against ground truth, and the gate."""
+
+    frames: int
+    """judged frames"""
+    frames_without_truth: int
+    unusable_labels: int
+    """labels that are left out"""
+    unusable_examples: Sequence[str]
+    """the first ten, with the reason"""
+    metrics: Mapping[str, float | None]
+    """metrics of docs/evaluate.md by name; null: not measured"""
+    false_causes: Mapping[str, int]
+    """false objects by cause"""
+    worst: Sequence[FrameOutcome]
+    """frames with missed or false objects, the worst first"""
+    limits: Sequence[LimitResult]
 
 
 class Evaluation(Observer[FrameResult], Tabular):
@@ -197,29 +231,22 @@ class Evaluation(Observer[FrameResult], Tabular):
         return {f"{c}.{d}" if d else c: number for (c, d), number in labels.items()}
 
     @property
-    def now(self) -> Mapping[str, Any]:
-        """Objects ``true``, ``missed`` and ``false`` of the last frame, as text."""
+    def now(self) -> FrameOutcome:
+        """Objects of the last frame, as text."""
         return self._frame(self.judged[-1])
 
     @property
-    def worst(self) -> list[WrongFrameForm]:
+    def worst(self) -> list[FrameOutcome]:
         """Frames with missed or false objects, those with most of them first."""
         frames = [self._frame(frame) for frame in self.judged]
-        wrong = [frame for frame in frames if frame["missed"] or frame["false"]]
-        return sorted(wrong, key=lambda f: (-len(f["missed"]) - len(f["false"]), f["frame"]))
+        wrong = [frame for frame in frames if frame.missed or frame.false]
+        return sorted(wrong, key=lambda f: (-len(f.missed) - len(f.false), f.frame))
 
-    def _frame(self, frame: JudgedFrame) -> WrongFrameForm:
-        return {
-            "frame": frame.index,
-            "stamp": frame.stamp,
-            "true": list(frame.true),
-            "missed": list(frame.missed),
-            "false": [
-                f"{text}: {cause}" if cause else text
-                for name, text, cause in frame.false
-                if self.judges(name)
-            ],
-        }
+    def _frame(self, frame: JudgedFrame) -> FrameOutcome:
+        false = [
+            f"{text}: {cause}" if cause else text for name, text, cause in frame.false if self.judges(name)
+        ]
+        return FrameOutcome(frame.index, frame.stamp, frame.true, frame.missed, false)
 
     @property
     def last_causes(self) -> list[str]:
@@ -240,17 +267,20 @@ class Evaluation(Observer[FrameResult], Tabular):
         """Return the evaluation for the terminal."""
         return "\n".join(map(printable, _lines(self, table.lines)))
 
-    def as_tree(self) -> EvaluationForm:
-        """Return every metric, and the frames with errors, worst first, for JSON."""
-        return {
-            "frames": len(self.judged),
-            "frames_without_truth": self.without,
-            "unusable_labels": len(self.unusable),
-            "unusable_examples": self.unusable[:UNUSABLE],
-            "metrics": {name: _plain(value) for name, value in self.metrics.items()},
-            "false_causes": dict(self.false_causes),
-            "worst": self.worst,
-        }
+    def result(self, limits: Sequence[LimitResult] = ()) -> EvaluationResult:
+        """Return every metric, the frames with errors and the outcome of the limits."""
+        return EvaluationResult(
+            frames=len(self.judged),
+            frames_without_truth=self.without,
+            unusable_labels=len(self.unusable),
+            unusable_examples=self.unusable[:UNUSABLE],
+            metrics={
+                name: None if math.isnan(value) else round(value, 6) for name, value in self.metrics.items()
+            },
+            false_causes=self.false_causes,
+            worst=self.worst,
+            limits=limits,
+        )
 
     def _columns(self) -> Columns:
         """Return a row for each metric: name, class, range and value."""
@@ -268,11 +298,6 @@ def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:
     yield f"f1{tail}", share(2 * counts["true"], counts["missed"] + counts["false"])
     yield f"missed{tail}", float(counts["missed"])
     yield f"false{tail}", float(counts["false"])
-
-
-def _plain(value: float) -> float | None:
-    """Return None for NaN, which JSON does not have, else the rounded number."""
-    return None if math.isnan(value) else round(value, 6)
 
 
 def count_ground(counts: Counter[str], result: FrameResult) -> None:
@@ -354,10 +379,11 @@ def _lines(
         return
     yield f"{len(worst)} of {len(evaluation.judged)} frames have something missed or false; the worst:"
     for frame in worst[:WORST]:
-        wrong = [f"{kind} {what}" for kind in ("missed", "false") for what in frame[kind]]
+        outcomes = {"missed": frame.missed, "false": frame.false}
+        wrong = [f"{kind} {text}" for kind, texts in outcomes.items() for text in texts]
         more = "; ..." if wrong[EXAMPLES:] else ""
-        counts = ", ".join(f"{len(frame[k])} {k}" for k in ("missed", "false") if frame[k])
-        yield f"{bullet}frame {frame['frame']}: {counts} ({'; '.join(wrong[:EXAMPLES])}{more})"
+        counts = ", ".join(f"{len(texts)} {kind}" for kind, texts in outcomes.items() if texts)
+        yield f"{bullet}frame {frame.frame}: {counts} ({'; '.join(wrong[:EXAMPLES])}{more})"
 
 
 def tables(evaluation: Evaluation) -> Iterator[list[Row]]:

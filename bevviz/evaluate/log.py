@@ -63,7 +63,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         groups = [group for group in groups if group[2]]
         self._boxes(result, groups)
         judged = self._evaluation.now
-        texts_by_outcome = {outcome: judged[outcome] for outcome in (*_WRONG, "true")}
+        texts_by_outcome = {"missed": judged.missed, "false": judged.false, "true": judged.true}
         for outcome, texts in texts_by_outcome.items():
             writer.scalar(entities.JUDGED_COUNT.path(outcome), float(len(texts)))
         writer.put(entities.EVALUATE, document(_page(frame.index, truth, texts_by_outcome)))

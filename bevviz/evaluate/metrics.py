@@ -7,8 +7,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 from xml.etree import ElementTree
+
+from pydantic import PlainSerializer
 
 from bevviz.errors import UserError
 from bevviz.evaluate.average_precision import OVERLAPS, VIEWS
@@ -70,11 +72,12 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class LimitResult:
-    """Outcome of a limit. ``reason`` says why it is not kept and is empty if it is."""
+    """A limit of the gate."""
 
-    limit: Limit
-    measured: float  # NaN: not measured
+    limit: Annotated[Limit, PlainSerializer(str, return_type=str)]
+    kept: bool
     reason: str
+    """empty: it is kept"""
 
 
 def parse_limits(least: Sequence[str], most: Sequence[str]) -> list[Limit]:
@@ -118,9 +121,9 @@ def _check_limit(limit: Limit, metrics: Mapping[str, float]) -> LimitResult:
         base, ranged = base_of(limit.metric), "@" in limit.metric
         measured = [name for name in metrics if base_of(name) == base and (ranged or "@" not in name)]
         reason = f"measured were {', '.join(measured)}" if measured else f"nothing there has a {base}"
-        return LimitResult(limit, value, f"{limit.metric} could not be measured: {reason}")
+        return LimitResult(limit, False, f"{limit.metric} could not be measured: {reason}")
     kept = value >= limit.value if limit.side == "min" else value <= limit.value
-    return LimitResult(limit, value, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
+    return LimitResult(limit, kept, "" if kept else f"{limit.metric} is {value:.4g}, asked for {limit}")
 
 
 def write_junit(path: Path, suites: Mapping[str, list[LimitResult] | str]) -> None:

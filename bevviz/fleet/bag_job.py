@@ -129,7 +129,7 @@ def _fill(
             time.perf_counter() - start,
             replace(source.scene, bag=(), topics=()),
             warnings,
-            None if evaluation is None else dict(evaluation.as_tree()["metrics"]),
+            None if evaluation is None else dict(evaluation.result().metrics),
             recording.stat().st_size,
             file_hash(recording),
         )
@@ -165,9 +165,8 @@ class _RowCollector(Observer[FrameResult]):
         values = row(result, result.config)
         if self._evaluation is not None and self._evaluation.last is not None:
             judgement = self._evaluation.now
-            values = add_judgement(
-                values, judgement["missed"], judgement["false"], self._evaluation.last_causes
-            )
+            causes = self._evaluation.last_causes
+            values = add_judgement(values, judgement.missed, judgement.false, causes)
         rank = values["badness"], -len(self._rows)
         if len(self._worst) < PICTURED or rank > self._worst[0][:2]:
             heapq.heappush(self._worst, (*rank, _pictures(result)))

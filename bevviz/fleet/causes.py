@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +22,7 @@ from bevviz.fleet.condition_search import LEAST_UNITS, Attribute, Condition, Sli
 from bevviz.fleet.findings import FINDINGS
 from bevviz.model.frame import F32, I64, Bool
 from bevviz.support import table as text_table
+from bevviz.support.json_form import LEFT_OUT, WhereKnown, json_form, rounded
 
 MOST = 30  # causes of one kind
 LEAST_LIFT = 1.2  # of a cause; less is as usual
@@ -177,12 +178,14 @@ ORDER = ("class", *SCALES, *NAMES)  # of the words in a sentence
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Condition on one attribute: a value, or an interval from ``low`` to below ``high``; None: open."""
+    """Condition on one attribute: a value, or an interval."""
 
     attribute: str
     value: str | None = None
     low: float | None = None
+    """null: open"""
     high: float | None = None
+    """null: open"""
 
     @property
     def text(self) -> str:
@@ -291,51 +294,42 @@ class Findings:
         return np.asarray(units.ravel(), np.int64)
 
 
-@dataclass(frozen=True)
-class Cause:
-    """Group of findings with a common condition.
-
-    Attributes:
-        kind: kind of the findings: missed, false, unexplained or anomaly.
-        reason: reason that they share; empty: several reasons.
-        bounds: conditions.
-        rows: rows of the findings.
-        among: number of rows, findings or not, under these conditions.
-        rate: rate of all such findings in the batch.
-        reasons: number of the findings by reason.
-        drives: number of their drives.
-        score: logarithm of the likelihood ratio, less the cost of the search.
-    """
+@dataclass(frozen=True, slots=True)
+class ListedFinding:
+    """One missed or false object, unexplained detection or anomaly."""
 
     kind: str
+    recording: str
+    frame: int
     reason: str
-    bounds: tuple[Bound, ...]
-    rows: I64
-    among: int
-    rate: float
-    reasons: Counter[str]
+    label: str
+    """class"""
+    range_m: float | None
+    text: str
+    command: str
+    """opens the frame in the workbench"""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Findings with a condition in common."""
+
+    kind: str
+    """missed, false, unexplained or anomaly"""
+    reason: str
+    """empty: several reasons"""
+    text: str
+    """conditions in words"""
+    conditions: Sequence[Bound]
+    count: int
     drives: int
-    score: float
-
-    @property
-    def count(self) -> int:
-        """Number of findings."""
-        return len(self.rows)
-
-    @property
-    def lift(self) -> float:
-        """Factor by which these findings are more frequent under the conditions."""
-        return self.count / self.among / self.rate
-
-    @property
-    def text(self) -> str:
-        """The conditions in words."""
-        bounds = {bound.attribute: bound.text for bound in self.bounds}
-        name = bounds.pop("class", "")
-        noun = f"{name}{'es' if name.endswith(('s', 'x', 'ch', 'sh')) else 's'}" if name else "all objects"
-        if self.kind == "anomaly":
-            noun = "all frames"
-        return ", ".join([noun, *(bounds[name] for name in ORDER if name in bounds)])
+    among: int
+    """findings and what they are compared with, under the conditions"""
+    lift: Annotated[float, rounded(3)]
+    """ratio to the usual rate"""
+    reasons: Mapping[str, int]
+    examples: Sequence[ListedFinding]
+    rows: Annotated[I64, LEFT_OUT]  # of the findings
 
     @property
     def title(self) -> str:
@@ -343,6 +337,38 @@ class Cause:
         why = f" ({self.reason})" if self.reason else ""
         outcome = f"{self.count} {self.kind if self.count == 1 or self.kind != 'anomaly' else 'anomalies'}"
         return f"{outcome}{why} in {self.drives} drive{'s' * (self.drives != 1)}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedCause:
+    """Cause of one batch, and its counts in the other."""
+
+    state: str
+    """new, gone or as before"""
+    kind: str
+    reason: str
+    text: str
+    count: int
+    among: int
+    other: int
+    other_among: int
+    title: Annotated[str, LEFT_OUT]
+
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class CausesResult:
+    """Causes of a batch."""
+
+    batch: str
+    findings: Mapping[str, int]
+    """number by kind"""
+    causes: Sequence[Cause]
+    """largest first"""
+    rest: Mapping[str, Mapping[str, int]]
+    """number of the other findings by kind and reason"""
+    compared: WhereKnown[Sequence[ComparedCause]] = None
+    """with --against"""
 
 
 @dataclass(frozen=True)
@@ -359,10 +385,15 @@ class Causes:
     causes: tuple[Cause, ...]
     rest: Mapping[str, Counter[str]]
 
+    @property
+    def totals(self) -> Mapping[str, int]:
+        """Number of all findings by kind."""
+        return {kind: int(self.findings.is_word("outcome", kind).sum()) for kind in BASES}
+
     def lines(self, top: int) -> Iterator[str]:
         """Yield the causes for the terminal."""
         drives = len(set(self.findings.words("recording")[1].tolist()))
-        totals = {kind: int(self.findings.is_word("outcome", kind).sum()) for kind in BASES}
+        totals = self.totals
         counts = [f"{n} {kind}" for kind, n in totals.items() if n]
         yield f"{drives} drives; {', '.join(counts) or 'nothing missed, nothing false, no anomaly'}"
         for number, cause in enumerate(self.causes[:top], 1):
@@ -375,10 +406,10 @@ class Causes:
             )
             if len(cause.reasons) > 1:
                 yield "   " + ", ".join(
-                    f"{n} {reason or 'other'}" for reason, n in cause.reasons.most_common(4)
+                    f"{n} {reason or 'other'}" for reason, n in list(cause.reasons.items())[:4]
                 )
-            for row in self.examples(cause):
-                yield f"   {row['command']}"
+            for example in cause.examples:
+                yield f"   {example.command}"
         if self.causes[top:]:
             yield f"\n{len(self.causes) - top} more causes: --top {len(self.causes)}"
         rest = [
@@ -390,70 +421,52 @@ class Causes:
             yield "\nwithout a condition in common:"
             yield from text_table.lines([("kind", "reason", "number"), *rest])
 
-    def examples(self, cause: Cause, most: int = EXAMPLES) -> list[dict[str, Any]]:
-        """Return findings of a cause, of as many drives as possible, with the command that opens each."""
-        return rows_of(self.findings, self._spread(cause.rows, most))
-
-    def _spread(self, rows: I64, most: int) -> I64:
-        """Return some of the rows, of as many drives as possible."""
-        drives = self.findings.words("recording")[1][rows]
-        # The n-th finding of each drive comes before the (n + 1)-th of any.
-        order = np.argsort(drives, kind="stable")
-        first = np.flatnonzero(np.r_[True, np.diff(drives[order]) != 0]) if len(rows) else order
-        turn = np.arange(len(order)) - np.repeat(first, np.diff(np.r_[first, len(order)]))
-        return np.asarray(rows[order[np.argsort(turn, kind="stable")[:most]]], np.int64)
-
-    def listed(self, most: int) -> list[dict[str, Any]]:
+    def listed(self, most: int) -> list[ListedFinding]:
         """Return findings for a page: as many of each cause, then others."""
         kinds = [self.findings.is_word("outcome", kind) for kind in BASES]
         caused = np.concatenate([*(cause.rows for cause in self.causes), np.zeros(0, np.int64)])
         others = np.setdiff1d(np.flatnonzero(np.logical_or.reduce(kinds)), caused)
-        turns = [self._spread(cause.rows, most).tolist() for cause in self.causes]
+        turns = [_spread(self.findings, cause.rows, most).tolist() for cause in self.causes]
         in_turn = [row for turn in zip_longest(*turns) for row in turn if row is not None]
-        rows = [*in_turn[:most], *self._spread(others, max(0, most - len(in_turn))).tolist()]
-        return rows_of(self.findings, np.array(rows, np.int64))
+        rows = [*in_turn[:most], *_spread(self.findings, others, max(0, most - len(in_turn))).tolist()]
+        return _findings_at(self.findings, np.array(rows, np.int64))
 
-    def as_tree(self, top: int) -> dict[str, Any]:
-        """Return the causes for JSON."""
-        return {
-            "batch": str(self.findings.folder),
-            "findings": {kind: int(self.findings.is_word("outcome", kind).sum()) for kind in BASES},
-            "causes": [
-                {
-                    "kind": cause.kind,
-                    "reason": cause.reason,
-                    "text": cause.text,
-                    "conditions": [
-                        {"attribute": b.attribute, "value": b.value, "low": b.low, "high": b.high}
-                        for b in cause.bounds
-                    ],
-                    "count": cause.count,
-                    "drives": cause.drives,
-                    "among": cause.among,
-                    "lift": round(cause.lift, 3),
-                    "reasons": dict(cause.reasons.most_common()),
-                    "examples": self.examples(cause),
-                }
-                for cause in self.causes[:top]
-            ],
-            "rest": {kind: dict(reasons.most_common()) for kind, reasons in self.rest.items()},
-        }
+    def result(self, top: int, compared: Sequence[ComparedCause] | None = None) -> CausesResult:
+        """Return the first causes, and the comparison with another batch."""
+        rest = {kind: dict(reasons.most_common()) for kind, reasons in self.rest.items()}
+        return CausesResult(str(self.findings.folder), self.totals, self.causes[:top], rest, compared)
 
 
-def rows_of(findings: Findings, rows: I64) -> list[dict[str, Any]]:
+def _spread(findings: Findings, rows: I64, most: int) -> I64:
+    """Return some of the rows, of as many drives as possible."""
+    drives = findings.words("recording")[1][rows]
+    # The n-th finding of each drive comes before the (n + 1)-th of any.
+    order = np.argsort(drives, kind="stable")
+    first = np.flatnonzero(np.r_[True, np.diff(drives[order]) != 0]) if len(rows) else order
+    turn = np.arange(len(order)) - np.repeat(first, np.diff(np.r_[first, len(order)]))
+    return np.asarray(rows[order[np.argsort(turn, kind="stable")[:most]]], np.int64)
+
+
+def _findings_at(findings: Findings, rows: I64) -> list[ListedFinding]:
     """Return findings with the command that opens each."""
     columns = ["recording", "frame", "stamp", "outcome", "reason", "class", "range_m", "text"]
     chosen = findings.table.select(columns).take(pa.array(rows))
     chosen = chosen.set_column(2, "stamp", chosen["stamp"].cast(pa.int64()))
     opened = []
     for row in chosen.to_pylist():
-        stamp = iso(row.pop("stamp"))
-        path = findings.folder / f"{row['recording']}.rrd"
-        row["label"] = row.pop("class")
-        row |= {name: row[name] or "" for name in ("reason", "label", "text")}
-        distance = row["range_m"]
-        row["range_m"] = None if distance is None or math.isnan(distance) else round(distance, 1)
-        opened.append({"kind": row.pop("outcome"), **row, "command": f"bevviz open {path} --at {stamp}"})
+        recording, distance = row["recording"], row["range_m"]
+        opened.append(
+            ListedFinding(
+                kind=row["outcome"],
+                recording=recording,
+                frame=row["frame"],
+                reason=row["reason"] or "",
+                label=row["class"] or "",
+                range_m=None if distance is None or math.isnan(distance) else round(distance, 1),
+                text=row["text"] or "",
+                command=f"bevviz open {findings.folder / f'{recording}.rrd'} --at {iso(row['stamp'])}",
+            )
+        )
     return opened
 
 
@@ -507,17 +520,30 @@ def _cause(
 ) -> Cause:
     """Return a slice as a cause."""
     positives = rows[found.positives]
+    conditions = [resolve[condition.attribute](condition) for condition in found.conditions]
     return Cause(
-        kind,
-        found.target,
-        tuple(resolve[condition.attribute](condition) for condition in found.conditions),
-        positives,
-        len(found.rows),
-        float(targets[found.target].mean()),
-        _reasons(findings, positives),
-        len(np.unique(findings.words("recording")[1][positives])),
-        found.score,
+        kind=kind,
+        reason=found.target,
+        text=_text(kind, conditions),
+        conditions=conditions,
+        count=len(positives),
+        drives=len(np.unique(findings.words("recording")[1][positives])),
+        among=len(found.rows),
+        lift=len(positives) / len(found.rows) / float(targets[found.target].mean()),
+        reasons=dict(_reasons(findings, positives).most_common()),
+        examples=_findings_at(findings, _spread(findings, positives, EXAMPLES)),
+        rows=positives,
     )
+
+
+def _text(kind: str, conditions: Sequence[Bound]) -> str:
+    """Return conditions in words."""
+    texts = {bound.attribute: bound.text for bound in conditions}
+    name = texts.pop("class", "")
+    noun = f"{name}{'es' if name.endswith(('s', 'x', 'ch', 'sh')) else 's'}" if name else "all objects"
+    if kind == "anomaly":
+        noun = "all frames"
+    return ", ".join([noun, *(texts[name] for name in ORDER if name in texts)])
 
 
 def _reasons(findings: Findings, rows: I64) -> Counter[str]:
@@ -578,37 +604,20 @@ def _named(name: str, words: Sequence[str]) -> Callable[[Condition], Bound]:
 # --- two batches -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ComparedCause:
-    """Cause of one batch, and what became of it in the other.
-
-    Attributes:
-        cause: the cause.
-        state: new, gone or as before.
-        other: findings of the other batch under the same conditions.
-        other_among: rows of the other batch under the same conditions.
-    """
-
-    cause: Cause
-    state: str
-    other: int
-    other_among: int
-
-
 def compare_causes(new: Causes, old: Causes) -> list[ComparedCause]:
     """Return the new causes, those that are gone, and the others."""
     compared = [_compared(cause, old.findings, "new") for cause in new.causes]
     gone = [_compared(cause, new.findings, "gone") for cause in old.causes]
     return sorted(
         [*compared, *(c for c in gone if c.state == "gone")],
-        key=lambda c: (["new", "gone", "as before"].index(c.state), -c.cause.count),
+        key=lambda c: (["new", "gone", "as before"].index(c.state), -c.count),
     )
 
 
 def _compared(cause: Cause, other: Findings, changed: str) -> ComparedCause:
     """Look for a cause in another batch. It has changed if its rate there is plainly lower."""
     inside = other.is_word("outcome", cause.kind) | other.is_word("outcome", BASES[cause.kind])
-    for bound in cause.bounds:
+    for bound in cause.conditions:
         # Drives of another batch have other names.
         inside &= bound.holds(other) if bound.attribute != "recording" else True
     hits = inside & other.is_word("outcome", cause.kind)
@@ -618,7 +627,17 @@ def _compared(cause: Cause, other: Findings, changed: str) -> ComparedCause:
     rate, other_rate = cause.count / cause.among, p / max(n, 1)
     sure = _rates_differ(cause.count, cause.among, p, n)
     is_changed = rate > CHANGED * other_rate and (sure or not n)
-    return ComparedCause(cause, changed if is_changed else "as before", p, n)
+    return ComparedCause(
+        state=changed if is_changed else "as before",
+        kind=cause.kind,
+        reason=cause.reason,
+        text=cause.text,
+        count=cause.count,
+        among=cause.among,
+        other=p,
+        other_among=n,
+        title=cause.title,
+    )
 
 
 def _rates_differ(p: int, n: int, q: int, m: int) -> bool:
@@ -637,7 +656,7 @@ def comparison_lines(compared: Sequence[ComparedCause]) -> Iterator[str]:
     counts = Counter(c.state for c in compared)
     yield ", ".join(f"{counts[state]} causes {state}" for state in ("new", "gone", "as before"))
     for c in compared:
-        here = f"{c.cause.count} of {c.cause.among}"
+        here = f"{c.count} of {c.among}"
         there = f"{c.other} of {c.other_among}" if c.other_among else "nothing to compare with"
         pair = f"{here} -> {there}" if c.state == "gone" else f"{there} -> {here}"
-        yield f"{c.state}: {c.cause.title} ({pair})"
+        yield f"{c.state}: {c.title} ({pair})"

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from bevviz.fleet.parameter_search import Settings, search
 from bevviz.model.frame import F64, Bool, Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants
+from bevviz.support.json_form import json_form, rounded
 from bevviz.why import FrameExplainer
 from bevviz.why.false_objects import false_reasons
 
@@ -160,54 +161,48 @@ def f1(counts: F64) -> float:
     return float(2 * true / max(2 * true + missed + false, 1e-9))
 
 
-@dataclass(frozen=True)
-class Fix:
-    """Changed parameters with what they do on frames that were not used to choose them.
+F1 = Annotated[float, rounded(6)]
 
-    Attributes:
-        settings: changed parameters; empty: none is better than the present ones.
-        keys: parameters that were searched.
-        trials: number of settings that were tried.
-        before: F1 of the present configuration.
-        after: F1 of the changed one.
-        interval: 95 % interval of the difference in F1, by drawing whole drives or parts.
-        fixed: objects that were missed before and are found.
-        missed: objects that were missed before.
-        broken: objects that were found before and are missed.
-        found: objects that were found before.
-        cause_fixed: fixed objects in frames of the cause.
-        cause_missed: missed objects in frames of the cause.
-        false: false objects before and after.
-        frames: number of frames to confirm on.
-        units: number of drives or parts that these frames come from.
-        parts: whether they are parts of drives.
-    """
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """Changed parameters, and their effect on frames that were not used to choose them."""
 
     settings: Settings
-    keys: Sequence[str]
+    """changed parameters; empty: none is better"""
+    confirmed: bool
+    """the whole interval is an improvement"""
+    searched: Sequence[str]
+    """parameters"""
     trials: int
-    before: float
-    after: float
-    interval: tuple[float, float]
+    f1_before: F1
+    f1_after: F1
+    f1_change: Sequence[F1]
+    """95 % interval"""
     fixed: int
+    """objects that were missed and are found"""
     missed: int
+    """before"""
     broken: int
+    """objects that were found and are missed"""
     found: int
+    """before"""
     cause_fixed: int
+    """in frames of the cause"""
     cause_missed: int
-    false: tuple[int, int]
+    false_before: int
+    false_after: int
     frames: int
+    """that confirm"""
     units: int
+    """drives, or parts of drives, that the interval draws"""
     parts: bool
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether the whole interval is an improvement."""
-        return bool(self.settings) and self.interval[0] > 0
+    """whether the units are parts of drives"""
 
     def lines(self) -> Iterator[str]:
         """Yield the result for the terminal."""
-        yield f"{self.trials} settings of {', '.join(self.keys)} tried"
+        yield f"{self.trials} settings of {', '.join(self.searched)} tried"
         if not self.settings:
             yield "none is better than the present ones"
             return
@@ -218,35 +213,13 @@ class Fix:
         yield f"  fixes {self.fixed} of {self.missed} missed objects" + (
             f", {self.cause_fixed} of {self.cause_missed} in frames of the cause" if self.cause_missed else ""
         )
-        false = f"false objects {self.false[0]} -> {self.false[1]}"
+        false = f"false objects {self.false_before} -> {self.false_after}"
         yield f"  breaks {self.broken} of {self.found} found ones; {false}"
-        low, high = self.interval
-        yield f"  F1 {self.before:.3f} -> {self.after:.3f}; the change is {low:+.3f} to {high:+.3f} (95 %)"
+        low, high = self.f1_change
+        change = f"the change is {low:+.3f} to {high:+.3f} (95 %)"
+        yield f"  F1 {self.f1_before:.3f} -> {self.f1_after:.3f}; {change}"
         if not self.confirmed:
             yield "not confirmed: it may as well be chance"
-
-    def as_tree(self) -> dict[str, Any]:
-        """Return the result for JSON."""
-        return {
-            "settings": dict(self.settings),
-            "confirmed": self.confirmed,
-            "searched": list(self.keys),
-            "trials": self.trials,
-            "f1_before": round(self.before, 6),
-            "f1_after": round(self.after, 6),
-            "f1_change": [round(value, 6) for value in self.interval],
-            "fixed": self.fixed,
-            "missed": self.missed,
-            "broken": self.broken,
-            "found": self.found,
-            "cause_fixed": self.cause_fixed,
-            "cause_missed": self.cause_missed,
-            "false_before": self.false[0],
-            "false_after": self.false[1],
-            "frames": self.frames,
-            "units": self.units,
-            "parts": self.parts,
-        }
 
     def yaml(self) -> str:
         """Return the changed parameters as a configuration file."""
@@ -346,7 +319,7 @@ def _confirmed(
     draws = rng.integers(len(units), size=(DRAWS, len(units)))
     differences = [f1(sums[1][draw]) - f1(sums[0][draw]) for draw in draws]
     low, high = np.quantile(differences, [0.025, 0.975]).tolist()
-    totals: Counter[str] = Counter()
+    totals: Counter[str] = Counter(cause_fixed=0, cause_missed=0)
     for s, a, b in zip(sample.frames, old, new, strict=True):
         fixed, missed = int((b.found & ~a.found).sum()), int((s.truth.must & ~a.found).sum())
         totals.update(fixed=fixed, missed=missed, broken=int((a.found & ~b.found).sum()))
@@ -354,11 +327,18 @@ def _confirmed(
         if s.of_cause:
             totals.update(cause_fixed=fixed, cause_missed=missed)
     return Fix(
-        settings, keys, trials, f1(counts[0]), f1(counts[1]), (low, high),
-        totals["fixed"], totals["missed"], totals["broken"], totals["found"],
-        totals["cause_fixed"], totals["cause_missed"], (totals["false_before"], totals["false_after"]),
-        len(sample.frames), len(units), parts,
-    )  # fmt: skip
+        settings=settings,
+        confirmed=bool(settings) and low > 0,
+        searched=keys,
+        trials=trials,
+        f1_before=f1(counts[0]),
+        f1_after=f1(counts[1]),
+        f1_change=(low, high),
+        frames=len(sample.frames),
+        units=len(units),
+        parts=parts,
+        **totals,
+    )
 
 
 def keys_for(reasons: Mapping[str, int], config: Config | None = None) -> list[str]:

@@ -14,6 +14,7 @@ from bevviz.live.graph import PublishedTopic, describe_qos
 from bevviz.live.source import LiveSource
 from bevviz.model.frame import Frame
 from bevviz.pipeline.bag_info import (
+    CameraInfo,
     TopicContents,
     TopicInfo,
     find_missing,
@@ -22,18 +23,23 @@ from bevviz.pipeline.bag_info import (
     render_missing,
 )
 from bevviz.support import progress
+from bevviz.support.json_form import json_form
 
 LISTEN = 3.0  # seconds
 PATIENCE = 10.0  # seconds until the topics found so far are shown
 
 
+@json_form
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveInfo(TopicContents):
     """Content of ``bevviz info --live``."""
 
     domain: int
+    """ROS domain; --live"""
     middleware: str
-    seconds: float  # listening time
+    """RMW; --live"""
+    seconds: float
+    """time of listening; --live"""
 
 
 def describe(
@@ -68,8 +74,8 @@ def describe(
                 for topic in sorted(source.topics.values(), key=lambda t: t.name)
             ),
             lidars=source.roles.lidar_names,
-            cameras=frame.cameras if frame else (),
-            tree=source.tree,
+            cameras=[*map(CameraInfo.of, frame.cameras)] if frame else (),
+            transforms=source.tree,
             points_frame=frame.points_frame if frame else "",
             world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
             network=networks["detector"],

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from bevviz.errors import UserError
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
-from bevviz.model.json_forms import CameraForm, InfoForm
 from bevviz.pipeline.sensor_check import SensorCheck, first_frames
 from bevviz.recording.provenance import model_path
 from bevviz.support import table
+from bevviz.support.json_form import LEFT_OUT, json_form
 from bevviz.support.text import printable
 
 if TYPE_CHECKING:
@@ -45,46 +45,108 @@ MAX_TIMED_MESSAGES = (
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """Summary of one topic."""
+    """A topic of the bag or of the graph."""
 
     name: str
     type: str
-    count: int | None  # None: nothing subscribes to the topic
+    """package/msg/Name"""
+    count: int | None
+    """messages; null: nothing subscribes to it"""
     frame_id: str
-    rate: float | None  # Hz, between the first and the last message
+    rate: float | None
+    """Hz, between the first and the last message"""
     role: str
-    pause: float | None = None  # longest time between two messages, seconds of log time
-    pause_at: float | None = None  # start of the longest pause, in seconds from the start
-    size: float | None = None  # average bytes of a message
-    delay: float | None = None  # seconds from the stamp to the time of receipt
+    """use of the topic; empty: none"""
+    pause: float | None = None
+    """longest time between two messages, seconds"""
+    pause_at: float | None = None
+    """start of the longest pause, seconds from the start of the bag"""
+    size: float | None = None
+    """mean bytes of a message; --live"""
+    delay: float | None = None
+    """seconds from the stamp to the receipt; --live"""
 
 
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """A camera of one scan."""
+
+    name: str
+    """as options name it"""
+    width: int | None
+    """pixels"""
+    height: int | None
+    """pixels"""
+    K: Sequence[Sequence[float]] | None
+    """3 x 3 intrinsics"""
+    distortion_model: str | None
+    """empty: none"""
+    D: Sequence[float] | None
+    """distortion in the order of ROS"""
+    camera_from_points: Sequence[Sequence[float]] | None
+    """4 x 4 transform"""
+    problems: Sequence[str]
+    text: Annotated[str, LEFT_OUT]
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraInfo:
+        """Return the summary of a camera."""
+        image, model, transform = camera.image, camera.intrinsics, camera.camera_from_points
+        return cls(
+            name=camera.name,
+            width=None if image is None else image.bgr.shape[1],
+            height=None if image is None else image.bgr.shape[0],
+            K=None if model is None else model.K.tolist(),
+            distortion_model=None if model is None else model.distortion_model,
+            D=None if model is None else model.D.tolist(),
+            camera_from_points=None if transform is None else transform.tolist(),
+            problems=camera.problems,
+            text=_camera(camera),
+        )
+
+
+@json_form
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicContents:
-    """Topics, sensors and transforms of a bag or of a ROS graph."""
+    """Topics, sensors and transforms, and what a full run lacks."""
 
-    topics: tuple[TopicInfo, ...]
-    lidars: tuple[str, ...] = ()
-    cameras: tuple[Camera, ...] = ()  # as in one scan
-    tree: Mapping[str, str] = field(default_factory=dict)  # child frame -> parent frame
+    topics: Sequence[TopicInfo]
+    lidars: Sequence[str] = ()
+    """names of the LiDARs"""
+    cameras: Sequence[CameraInfo] = ()
+    transforms: Mapping[str, str] = field(default_factory=dict)
+    """parent of each frame"""
     points_frame: str = ""
-    world_frame: str = ""  # "": the fixed frame is not connected by TF
-    network: str = ""  # provider of the detector's network; "": there is none
-    object_network: str = ""  # provider of the 3D detector's network; "": there is none
-    configured: tuple[str, ...] = ()  # sources of parameters, with the keys they state
-    missing: tuple[str, ...] = ()  # missing requirements of a full run, with the option that meets each
-    warnings: tuple[str, ...] = ()
+    """frame of the points"""
+    world_frame: str = ""
+    """fixed frame; empty: none"""
+    network: str = ""
+    """what the detector runs on, or why it does not; empty: no detector"""
+    object_network: str = ""
+    """the same of a 3D detector"""
+    configured: Sequence[str] = ()
+    """place: keys where parameters are stated"""
+    missing: Sequence[str] = ()
+    """what a full run lacks, with the option that gives it"""
+    warnings: Sequence[str] = ()
+    """faults of the bag"""
 
 
+@json_form
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagInfo(TopicContents):
-    """Output of ``bevviz info``. Times are log times in nanoseconds."""
+    """Contents of a bag."""
 
-    paths: tuple[str, ...]
-    formats: tuple[str, ...]  # format of each file
-    size: int  # bytes on disk
+    paths: Sequence[str]
+    """files of the bag"""
+    formats: Sequence[str]
+    """format of each file"""
+    size: int
+    """bytes on disk"""
     start: int
+    """first log time, nanoseconds since 1970"""
     end: int
+    """last log time, nanoseconds since 1970"""
     messages: int
 
     @property
@@ -160,8 +222,8 @@ def _describe(
         messages=recording.message_count,
         topics=tuple(_topic(recording, topic, roles) for topic in recording.topics),
         lidars=roles.lidar_names,
-        cameras=frame.cameras if frame else (),
-        tree=dict(source.tree) if source else {},
+        cameras=[*map(CameraInfo.of, frame.cameras)] if frame else (),
+        transforms=dict(source.tree) if source else {},
         points_frame=frame.points_frame if frame else "",
         world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
         network=networks["detector"],
@@ -293,35 +355,6 @@ def _without_motion(config: Config) -> str:
     return "runs over the drive estimate the motion from the scans (odometry.method)"
 
 
-def contents_tree(info: TopicContents) -> InfoForm:
-    """Return the contents as a tree for JSON, without images and clouds."""
-    values = {
-        f.name: getattr(info, f.name) for f in fields(info) if f.name not in ("topics", "cameras", "tree")
-    }
-    tree = {
-        **values,
-        "topics": [asdict(topic) for topic in info.topics],
-        "cameras": [_camera_tree(camera) for camera in info.cameras],
-        "transforms": dict(info.tree),
-    }
-    return cast("InfoForm", tree)
-
-
-def _camera_tree(camera: Camera) -> CameraForm:
-    """Return a camera as a tree for JSON."""
-    image, model, transform = camera.image, camera.intrinsics, camera.camera_from_points
-    return {
-        "name": camera.name,
-        "width": None if image is None else image.bgr.shape[1],
-        "height": None if image is None else image.bgr.shape[0],
-        "K": None if model is None else model.K.tolist(),
-        "distortion_model": None if model is None else model.distortion_model,
-        "D": None if model is None else model.D.tolist(),
-        "camera_from_points": None if transform is None else transform.tolist(),
-        "problems": list(camera.problems),
-    }
-
-
 def render_bag_info(info: BagInfo) -> str:
     """Return the summary of a bag as text for a terminal of 100 columns."""
     return f"{render_bag_contents(info)}\n{render_missing(info)}"
@@ -352,7 +385,7 @@ def render_contents(header: Mapping[str, str], info: TopicContents) -> str:
         *_topic_table(info.topics),
         "",
         *_section("roles", [f"{t.name}: {t.role}" for t in info.topics if t.role]),
-        *_section("cameras", [_camera(camera) for camera in info.cameras]),
+        *_section("cameras", [camera.text for camera in info.cameras]),
         *_section("transforms", list(_tree(info))),
         *_section("network runs on", [info.network] if info.network else []),
         *_section("3D detector runs on", [info.object_network] if info.object_network else []),
@@ -433,7 +466,7 @@ def _camera(camera: Camera) -> str:
 def _tree(info: TopicContents) -> Iterator[str]:
     """Yield the transforms as an indented tree."""
     children: dict[str, list[str]] = {}
-    for child, parent in sorted(info.tree.items()):
+    for child, parent in sorted(info.transforms.items()):
         children.setdefault(parent, []).append(child)
 
     def subtree(frame: str, depth: int) -> Iterator[str]:
@@ -441,7 +474,7 @@ def _tree(info: TopicContents) -> Iterator[str]:
         for child in children.get(frame, ()):
             yield from subtree(child, depth + 1)
 
-    for root in sorted(children.keys() - info.tree.keys()):
+    for root in sorted(children.keys() - info.transforms.keys()):
         yield from subtree(root, 0)
     if info.points_frame:
         yield f"fixed frame of '{info.points_frame}': {info.world_frame or 'none'}"

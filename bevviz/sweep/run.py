@@ -21,11 +21,11 @@ from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
-from bevviz.model.json_forms import SweepForm
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
+from bevviz.support.json_form import json_form
 from bevviz.support.text import printable
 
 MOST = 500  # combinations of values, at most
@@ -202,6 +202,45 @@ class SweepOutcome:
         return metrics
 
 
+@dataclass(frozen=True, slots=True)
+class ClassCounts:
+    """Counts of one class, over all frames."""
+
+    tp: int
+    """true objects"""
+    fp: int
+    """false objects"""
+    fn: int
+    """missed objects"""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRun:
+    """One combination of values."""
+
+    values: Values
+    """in the order of the parameters"""
+    frames: int
+    metrics: Mapping[str, float | None]
+    """mean of a frame; times: median in milliseconds; precision, recall and F1: of all frames"""
+    classes: Mapping[str, ClassCounts]
+    """with ground truth"""
+    failures: int
+    """failed stages"""
+
+
+@json_form
+@dataclass(frozen=True, slots=True)
+class SweepResult:
+    """Metrics of each combination of values."""
+
+    parameters: Sequence[str]
+    """their keys"""
+    runs: Sequence[SweepRun]
+    best: Values | None
+    """values with the greatest F1; null: none within the noise"""
+
+
 class Sweep:
     """A run of every combination of values on each frame.
 
@@ -325,25 +364,16 @@ class Sweep:
         """Return the names of all metrics."""
         return max((list(outcome.metrics) for outcome in self.outcomes.values()), key=len)
 
-    def as_tree(self) -> SweepForm:
-        """Return the sweep for JSON: every metric of the table, the time of each stage, counts by class."""
-        return {
-            "parameters": [parameter.key for parameter in self.parameters],
-            "runs": [
-                {
-                    "values": list(values),
-                    "frames": outcome.frames,
-                    "metrics": outcome.metrics,
-                    "classes": {
-                        name: {"tp": class_counts["tp"], "fp": class_counts["fp"], "fn": class_counts["fn"]}
-                        for name, class_counts in sorted(outcome.score.classes.items())
-                    },
-                    "failures": outcome.failures,
-                }
-                for values, outcome in self.outcomes.items()
-            ],
-            "best": None if self.best is None else list(self.best),
-        }
+    def result(self) -> SweepResult:
+        """Return every metric of the table, the time of each stage, and the counts by class."""
+        runs = []
+        for values, outcome in self.outcomes.items():
+            classes = {
+                name: ClassCounts(counts["tp"], counts["fp"], counts["fn"])
+                for name, counts in sorted(outcome.score.classes.items())
+            }
+            runs.append(SweepRun(values, outcome.frames, outcome.metrics, classes, outcome.failures))
+        return SweepResult([parameter.key for parameter in self.parameters], runs, self.best)
 
     def write_csv(self, path: Path) -> None:
         """Write a row for each combination: all metrics of the table, stage times, counts by class.

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 
 from bevviz.evaluate import MIN_HITS, RANGE, Truth
 from bevviz.model.frame import U8
-from bevviz.model.json_forms import AnswerForm, HintForm, StepForm
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
@@ -154,53 +152,6 @@ class Answer:
             x, y, z = (float(v) for v in subject.box.center[0])
             return Selection(point=(x, y, z), radius=max(0.5, float(subject.box.size[0].min()) / 2))
         return None
-
-    def as_dict(self) -> AnswerForm:
-        """Return the answer for JSON, without the points."""
-        subject, verdict = self.subject, self.verdict
-        return {
-            "kind": subject.kind,
-            "name": subject.name,
-            "label": subject.label,
-            "row": subject.row,
-            "camera": subject.camera,
-            "image_box": None if subject.xyxy is None else [round(float(value), 2) for value in subject.xyxy],
-            "position": None
-            if subject.box is None
-            else [round(float(value), 3) for value in subject.box.center[0]],
-            "distance": None if np.isnan(self.distance) else round(self.distance, 2),
-            "points": self.points,
-            "reported": verdict.reported,
-            "reason": verdict.kind.value,
-            "verdict": self.text,
-            "confidence": None if self.confidence is None else round(self.confidence, 3),
-            "likely": [kind.value for kind in self.likely],
-            "folded": self.folded,
-            "false": self.false,
-            "empty": self.empty,
-            "chain": [
-                cast("StepForm", {"stage": step.stage, "text": step.text, **step.numbers})
-                for step in self.steps
-            ],
-            "hints": [_hint_dict(hint) for hint in self.hints],
-            "remark": self.remark,
-            "tried": [{"settings": list(change.settings), "text": change.text} for change in self.tried],
-        }
-
-
-def _hint_dict(hint: Hint) -> HintForm:
-    """Return a hint for JSON."""
-    effects = hint.effects
-    return {
-        "settings": list(hint.settings),
-        "text": hint.text,
-        "fixed": list(effects.fixed),
-        "added": list(effects.added),
-        "false": list(effects.false),
-        "lost": list(effects.lost),
-        "right": list(effects.right),
-        "changed": effects.changed,
-    }
 
 
 class FrameExplainer:

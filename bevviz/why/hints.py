@@ -81,10 +81,12 @@ class Hint:
 
 @dataclass(frozen=True, slots=True)
 class TriedChange:
-    """A change that was run and did not help: its settings, and the result for the subject."""
+    """Change of parameters that was run and does not help."""
 
     settings: tuple[str, ...]
+    """key=value each"""
     text: str
+    """its result"""
 
 
 @dataclass(frozen=True, slots=True)

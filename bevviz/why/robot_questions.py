@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from bevviz.bags.source import BagSource
 from bevviz.model.frame import F64, Frame
-from bevviz.model.json_forms import WhyForm
 from bevviz.support.extensions import find
 
 if TYPE_CHECKING:
+    from bevviz.why.answer_results import FrameAnswers
     from bevviz.why.selection import Selection
 
 
@@ -48,7 +48,7 @@ class Question(Protocol):
         selection: Selection,
         limit: int,
         everything: bool,
-    ) -> tuple[WhyForm, Sequence[str]] | None:
+    ) -> tuple[FrameAnswers, Sequence[str]] | None:
         """Return the answer as JSON and as lines. None: the options do not ask it.
 
         Args:

@@ -215,7 +215,7 @@ class PageConnection:
 
     async def _ask(self, number: int, message: Message) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer question came."""
-        from bevviz.workbench.page_messages import hints_dict, other_answers
+        from bevviz.workbench.page_messages import answer_tree, hints_dict, other_answers
 
         self._asked = number
         workbench, frame = self._workbench, await self._frame(message)
@@ -244,7 +244,8 @@ class PageConnection:
                 return {"type": "absent", "text": text, "pick": str(identity)}
             answer, *others = workbench.ask(frame, settings, selection)
             pick = str(workbench.identity(frame, settings, selection, answer, identity))
-            tree = {"pick": pick, "found": found, **answer.as_dict(), "beside": list(other_answers(others))}
+            followed = {"pick": pick, "found": found}
+            tree = {**followed, **answer_tree(answer), "beside": list(other_answers(others))}
             return selection, self._source.look(frame, settings), answer, tree
 
         answered = await self._in_turn(number, work, settings)

@@ -11,7 +11,9 @@ from typing import Any
 
 from bevviz.config import Config, Parameter, parameters, values
 from bevviz.pipeline.notes import HandledFinding, Note
+from bevviz.support.json_form import json_tree
 from bevviz.why import Answer
+from bevviz.why.answer_results import AnswerResult
 from bevviz.workbench.source import Message
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
@@ -32,9 +34,14 @@ def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
             }
 
 
+def answer_tree(answer: Answer) -> dict[str, Any]:
+    """Return an answer as ``bevviz why --json`` writes it."""
+    return json_tree(AnswerResult.of(answer))
+
+
 def hints_dict(answer: Answer) -> dict[str, Any]:
     """Return the hints of an answer with hints, and the sentence about them."""
-    return {"hints": answer.as_dict()["hints"], "remark": answer.remark}
+    return {"hints": answer_tree(answer)["hints"], "remark": answer.remark}
 
 
 def note_dict(note: Note) -> dict[str, Any]:

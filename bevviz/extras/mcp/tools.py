@@ -21,7 +21,9 @@ from bevviz.extras.mcp.drives import AskedDrive, agent_config
 from bevviz.fleet.summary import collect
 from bevviz.fleet.table import RunInfo
 from bevviz.pipeline.run import run
+from bevviz.support.json_form import json_tree
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.answer_results import AnswerResult
 
 LIMIT = 12_000  # bytes of an answer
 WORST = 30  # frames of a batch
@@ -78,10 +80,10 @@ class AgentTools:
 
     def overview(self, drive: str = "") -> str:
         """State sensors, topics and transforms of a drive, its faults, and what a full run lacks."""
-        from bevviz.pipeline.bag_info import contents_tree, describe_bag
+        from bevviz.pipeline.bag_info import describe_bag
 
         asked = self._drive(drive)
-        info = contents_tree(describe_bag(asked.paths, asked.drive.config, all_frames=True))
+        info = json_tree(describe_bag(asked.paths, asked.drive.config, all_frames=True))
         kept = ("name", "role", "count", "rate", "pause", "pause_at")  # Hz and seconds
         topics = [{key: value for key, value in topic.items() if key in kept} for topic in info["topics"]]
         head = {key: info.get(key) for key in ("missing", "warnings", "configured", "network", "transforms")}
@@ -203,17 +205,17 @@ class AgentTools:
         summary = ComparisonSummary((" ".join(a) or "as opened", " ".join(b)), changes(*configs))
         truth_of = truth_source(asked.source.roles, *asked.truth, len(asked.drive))
         run(asked.source, ComparedSessions(configs[0], configs[1], truth_of), [summary])
-        tree = summary.as_tree()
+        tree = summary.result()
         sides = [
             word for side, settings in (("a", a), ("b", b)) for s in settings for word in (f"--set-{side}", s)
         ]
         worst = [
-            {"frame": frame["frame"], "fixed": frame["fixed"], "broken": frame["broke"]}
-            | {"objects": [f"{row['text']} {row['place']}" for row in frame["objects"]]}
+            {"frame": frame.frame, "fixed": frame.fixed, "broken": frame.broke}
+            | {"objects": [f"{row.text} {row.place}" for row in frame.objects]}
             for frame in summary.worst
         ]
-        head = {"command": asked.command("compare", *sides), "frames": len(tree["frames"])}
-        return {**head, **{key: tree[key] for key in ("config", "truth", "objects")}, "worst": worst}
+        head = {"command": asked.command("compare", *sides), "frames": len(tree.frames)}
+        return {**head, "config": tree.config, "truth": tree.truth, "objects": tree.objects, "worst": worst}
 
     def evaluate(self, drive: str = "", settings: Sequence[str] = ()) -> str:
         """Compare all frames with the ground truth: recall, precision, tracks, causes of false objects."""
@@ -224,7 +226,8 @@ class AgentTools:
         asked = self._drive(drive)
         evaluation = Evaluation(truth_in(asked.source, *asked.truth), false_causes)
         asked.run(settings, [evaluation])
-        tree = evaluation.as_tree()
+        tree = json_tree(evaluation.result())
+        tree.pop("limits")
         metrics = {name: value for name, value in tree["metrics"].items() if value is not None}
         command = asked.command("evaluate", *_set(settings))
         return fitted({"command": command, **tree, "metrics": metrics})
@@ -243,9 +246,9 @@ class AgentTools:
         chosen = (frame for number, frame in enumerate(asked.source) if number % step == 0)
         shots = gather(chosen, names, asked.source.pose)
         offsets = asked.drive.config.sync.offsets
-        results = [calibrate(shots[name], stamps=offsets).to_dict() for name in names]
+        results = [calibrate(shots[name], stamps=offsets).result() for name in names]
         keep = ("camera", "answer", "frames", "axes", "notes")
-        cameras = [{key: value for key, value in result.items() if key in keep} for result in results]
+        cameras = [{key: getattr(result, key) for key in keep} for result in results]
         return fitted({"command": asked.command("calib"), "cameras": cameras})
 
     def parameters(self, words: str, drive: str = "") -> str:
@@ -355,10 +358,10 @@ def _set(settings: Sequence[str]) -> list[str]:
 
 def _brief(answer: Answer, *, chain: bool = True) -> dict[str, Any]:
     """Return an answer with its stages in words. The numbers with their units are in these words."""
-    tree = answer.as_dict()
+    tree = json_tree(AnswerResult.of(answer))
     kept = ("name", "reported", "reason", "verdict", "confidence", "likely", "distance", "points", "remark")
     selection = answer.selection
-    brief = {"about": "" if selection is None else str(selection), **{key: tree[key] for key in kept}}  # type: ignore[literal-required]
+    brief = {"about": "" if selection is None else str(selection), **{key: tree[key] for key in kept}}
     if not chain:
         return brief
     return brief | {

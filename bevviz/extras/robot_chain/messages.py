@@ -19,8 +19,8 @@ from bevviz.messages.guard import guard
 from bevviz.messages.transforms import decode_transforms
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame, LabelledBoxes3D
-from bevviz.model.json_forms import RobotObjectForm
 from bevviz.sync.transform_tree import TransformBuffer, TransformError
+from bevviz.why.answer_results import RobotObjectResult, RobotStepResult
 from bevviz.why.robot_questions import object_topics
 
 AROUND = 10 * SECOND  # nanoseconds before and after the frame that the chain is inferred from
@@ -69,19 +69,17 @@ class FollowedObject:
         )
         return f"{name}: {verb} by the step that makes {change.topic}"
 
-    def as_form(self) -> RobotObjectForm:
-        """Return the object as JSON."""
-        return {
-            "text": self.text,
-            "label": self.label,
-            "center": [round(value, 2) for value in self.center.tolist()],
-            "step": None if self.change is None else self.change.topic,
-            "state": "kept" if self.change is None else self.change.state,
-            "steps": [
-                {"topic": one.topic, "parent": one.parent, "state": one.state, "text": one.text}
-                for one in self.outcomes
-            ],
-        }
+    def result(self) -> RobotObjectResult:
+        """Return the object in plain values."""
+        change = self.change
+        return RobotObjectResult(
+            text=self.text,
+            label=self.label,
+            center=[round(value, 2) for value in self.center.tolist()],
+            step=None if change is None else change.topic,
+            state="kept" if change is None else change.state,
+            steps=[RobotStepResult(one.topic, one.parent, one.state, one.text) for one in self.outcomes],
+        )
 
     def page_form(self) -> dict[str, Any]:
         """Return each step of the chain, with what it did with the object."""

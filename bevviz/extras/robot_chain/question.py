@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from bevviz.bags.source import BagSource
     from bevviz.extras.robot_chain.messages import RobotQuestions
     from bevviz.model.frame import Frame
-    from bevviz.model.json_forms import WhyForm
     from bevviz.why import Selection
+    from bevviz.why.answer_results import FrameAnswers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def answer(
     selection: Selection,
     limit: int,
     everything: bool,
-) -> tuple[WhyForm, Sequence[str]] | None:
+) -> tuple[FrameAnswers, Sequence[str]] | None:
     """Say which steps of the robot's own chain lost or changed objects.
 
     Raises:
@@ -57,6 +57,8 @@ def answer(
     """
     if not options.robot:
         return None
+    from bevviz.why.answer_results import FrameAnswers, RobotResult
+
     if selection.one and not selection.point:
         raise UserError("--robot: give the object with --point, or all of a class with --class")
     questions = around(source, frame)
@@ -70,13 +72,5 @@ def answer(
     for number, one in enumerate(shown):
         steps = [f"  {outcome.text}" for outcome in one.outcomes] if number < limit else []
         lines += ["", one.text, *steps] if steps else [one.text]
-    tree: WhyForm = {
-        "frame": frame.index,
-        "stamp": frame.stamp,
-        "preset": source.config.preset,
-        "summary": head,
-        "answers": [],
-        "beside": [],
-        "robot": {"chain": list(questions.lines()), "objects": [one.as_form() for one in shown]},
-    }
-    return tree, lines
+    robot = RobotResult([*questions.lines()], [one.result() for one in shown])
+    return FrameAnswers(frame.index, frame.stamp, source.config.preset, head, [], [], robot), lines
