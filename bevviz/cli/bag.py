@@ -22,7 +22,7 @@ from bevviz.support.contexts import garbage_collection_off
 
 @dataclass(frozen=True, kw_only=True)
 class BagOutputs(Outputs):
-    """Outputs of ``bag``."""
+    """Outputs of a run of all stages."""
 
     blueprint: str = layout_option("debug")
     keep: Keep = keep_option()

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bevviz
+from bevviz.cli.bag import BagOutputs
 from bevviz.cli.command import command, flag, option
-from bevviz.cli.options import ConfigOptions, DriveOptions, Keep, TruthOptions, keep_option
-from bevviz.cli.outputs import Outputs, layout_option, say
+from bevviz.cli.options import ConfigOptions, DriveOptions, TruthOptions
+from bevviz.cli.outputs import say
 from bevviz.cli.run import process
 from bevviz.cli.values import positive
 from bevviz.errors import UserError
@@ -69,14 +70,6 @@ class SimulatorOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOutputs(Outputs):
-    """Outputs of ``demo``."""
-
-    blueprint: str = layout_option("debug")
-    keep: Keep = keep_option()
-
-
-@dataclass(frozen=True, kw_only=True)
 class DemoOptions:
     """Options of ``demo``."""
 
@@ -88,7 +81,7 @@ class DemoOptions:
         file="written",
     )
     config: ConfigOptions
-    output: DemoOutputs
+    output: BagOutputs
 
 
 @command(
