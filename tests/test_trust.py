@@ -704,11 +704,11 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         and (len(call.args) > 1 or any(keyword.arg == "settings" for keyword in call.keywords))
     }
     assert giving == {
-        "cli/demo.py",
         "cli/options.py",
         "config/loading.py",
         "config/reloading.py",
         "drive.py",
+        "extras/demo/command.py",
         "fleet/fix.py",  # its own values of numbers and methods, over a configuration that is loaded
         "recording/source_lookup.py",
         "report/check.py",

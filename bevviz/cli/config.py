@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bevviz.cli.command import command, option
-from bevviz.cli.options import ConfigOptions
+from bevviz.cli.options import ConfigOptions, load_stated
 
 EXAMPLES = """examples:
   bevviz config > my.yaml                 all, to be changed and given to --config
@@ -30,11 +30,11 @@ class ConfigCommandOptions:
     epilog=EXAMPLES,
 )
 def _config(options: ConfigCommandOptions) -> int:
-    from bevviz.config import config_yaml, load, stated_lines
+    from bevviz.config import config_yaml, stated_lines
     from bevviz.config.descriptions import describe_parameters
 
     chosen = options.config
-    config = load(chosen.file, chosen.set, chosen.preset, layers=chosen.project_layers)
+    config = load_stated(chosen, chosen.file, chosen.set, chosen.preset)
     if options.key is not None:
         print(describe_parameters(options.key, config))
         return 0

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
 
-from bevviz.cli.command import Group, option, option_values, options_of
+from bevviz.cli.command import Group, option, option_values
 from bevviz.cli.values import frame_range, metres, number, numbers, positive
 from bevviz.errors import UserError
 
@@ -305,21 +305,32 @@ def result_settings(
 
 
 def load_config_from(
-    options: Configured, file: Path | Sequence[Path] | None, settings: Sequence[str], preset: Preset | None
+    options: Configured,
+    file: Path | Sequence[Path] | None,
+    settings: Sequence[str],
+    preset: Preset | None,
+) -> Config:
+    """Load a configuration. Without ``--keep`` a command logs everything, even if a recording keeps less."""
+    config = load_stated(options.config, file, settings, preset)
+    if any(bound.option.key == "logging.keep" for bound, _ in option_values(options)):
+        return config
+    logging = config.logging.model_copy(update={"keep": "everything"})
+    return config.model_copy(update={"logging": logging})
+
+
+def load_stated(
+    options: ConfigOptions,
+    file: Path | Sequence[Path] | None,
+    settings: Sequence[str],
+    preset: Preset | None,
 ) -> Config:
     """Load a configuration on top of the recording's, if the input is one, else of the project's."""
     from bevviz.config import load
 
-    recorded: RecordingSource | None = options.config.recorded
+    recorded: RecordingSource | None = options.recorded
     if recorded is not None:
-        config = recorded.load(file, settings, preset)
-    else:
-        config = load(file, settings, preset, layers=options.config.project_layers)
-    if any(bound.option.key == "logging.keep" for bound in options_of(type(options))):
-        return config
-    # A single frame is read from the bag and logged whole, even if the recording or the project keeps less.
-    logging = config.logging.model_copy(update={"keep": "everything"})
-    return config.model_copy(update={"logging": logging})
+        return recorded.load(file, settings, preset)
+    return load(file, settings, preset, layers=options.project_layers)
 
 
 def follow_recording(options: Any) -> Any:
