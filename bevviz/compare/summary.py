@@ -317,8 +317,8 @@ class ComparisonSummary(Observer[FrameComparison]):
         file = StringIO()
         writer = csv.writer(file)
         writer.writerow(header)
+        of_object = attrgetter(*header[2:])
         for frame in self.frames:
-            of_object = attrgetter(*header[2:])
             writer.writerows((frame.frame, frame.stamp, *of_object(row)) for row in frame.objects)
         save_text(path, file.getvalue(), "--csv")
 
