@@ -6,7 +6,7 @@ The conventions are those of `bevviz.model.frame`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal
@@ -138,6 +138,11 @@ class Detections(Tabular):
     def kept(self) -> Bool:
         """(D,) mask of the detections that go on to the fusion."""
         return np.equal(self.state, DetectionState.KEPT)
+
+    def labels(self) -> Iterator[tuple[F32, str]]:
+        """Yield the box of each kept detection, and its name and score as text."""
+        for row in np.flatnonzero(self.kept):
+            yield self.xyxy[row], f"{self.names[row]} {self.score[row]:.2f}"
 
     def _columns(self) -> Columns:
         """Return a row for each detection, including weak ones."""
@@ -299,6 +304,14 @@ class Objects(Tabular):
         f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
         return Objects(Boxes3D.empty(), (), f, i, (), i)
 
+    def labels(self) -> list[tuple[str, str, str, str]]:
+        """Return name, score, distance and camera of each object as text, the nearest first."""
+        distance = self.boxes.distance
+        return [
+            (self.names[row], f"{self.score[row]:.2f}", f"{distance[row]:.1f} m", self.camera[row])
+            for row in np.argsort(distance).tolist()
+        ]
+
     def _columns(self) -> Columns:
         """Return a row for each object."""
         origin = {"camera": self.camera, "detection": self.detection, "cluster": self.cluster}
@@ -455,9 +468,18 @@ class FrameResult:
 
     def _repr_html_(self) -> str:
         """Return the images, the view from above and the objects, for a notebook."""
-        from bevviz.model.preview import preview
+        from bevviz.model.preview import MAX_CAMERAS, draw_boxes, preview
 
-        return preview(self)
+        pictures = [
+            draw_boxes(camera.camera.image.bgr, camera.detections.labels() if camera.detections else ())
+            for camera in self.cameras
+            if camera.camera.image is not None
+        ][:MAX_CAMERAS]
+        if self.bev is not None:
+            pictures.append(self.bev.image)
+        objects = [] if self.objects is None else self.objects.labels()
+        failures = [f"{failure.stage} failed: {failure.reason}" for failure in self.failures]
+        return preview(repr(self)[1:-1], pictures, objects, failures)
 
     @staticmethod
     def unprocessed(
