@@ -174,7 +174,7 @@ def _open(bag: Path, model: str) -> None:
     from bevviz.bags.source import BagSource
     from bevviz.config import load
     from bevviz.evaluate import truth_source
-    from bevviz.workbench.recorded_drive import recorded_session
+    from bevviz.workbench.session import recorded_session
 
     config = load(None, [f"detector.model={model}"])
     source, again = BagSource([bag], config), BagSource([bag], config)

@@ -12,7 +12,7 @@ from starlette.websockets import WebSocket
 import bevviz
 from bevviz.bags.source import BagSource
 from bevviz.workbench.page_connection import PageConnection
-from bevviz.workbench.recorded_drive import recorded_session
+from bevviz.workbench.session import recorded_session
 from tests.support import bags
 from tests.support.waiting import until
 

@@ -13,8 +13,7 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
-from bevviz.workbench.recorded_drive import recorded_session
-from bevviz.workbench.session import WorkbenchSession
+from bevviz.workbench.session import WorkbenchSession, recorded_session
 from tests.support.waiting import PATIENCE
 
 FRAMES = 10

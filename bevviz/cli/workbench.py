@@ -103,7 +103,7 @@ def open_page(options: OpenOptions, config: Config, shown: Mapping[str, str] = E
             second_source = stack.enter_context(LabelledSource(paths, config))
             print_hints(source.scene, config)
             from bevviz.drive import Drive
-            from bevviz.workbench.recorded_drive import recorded_session
+            from bevviz.workbench.session import recorded_session
 
             truth_of, labels = truth.find(source), (truth.truth, truth.kitti_labels)
             if labels != (None, None):

@@ -11,8 +11,7 @@ from bevviz.errors import UserError, first_line
 
 if TYPE_CHECKING:
     from bevviz.fleet.fix import Fix
-    from bevviz.workbench.recorded_drive import RecordedDrive
-    from bevviz.workbench.source import Settings
+    from bevviz.workbench.source import Settings, Source
 
 
 class FixSearch:
@@ -28,9 +27,7 @@ class FixSearch:
         state: empty before the first search; running, over, cancelled or failed.
     """
 
-    def __init__(
-        self, source: RecordedDrive, paths: Sequence[Path], truth: str | None, labels: Path | None
-    ) -> None:
+    def __init__(self, source: Source, paths: Sequence[Path], truth: str | None, labels: Path | None) -> None:
         self._source, self._paths, self._truth, self._labels = source, tuple(paths), truth, labels
         self._stop = threading.Event()
         self.state = ""

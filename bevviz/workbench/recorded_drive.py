@@ -8,7 +8,6 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +19,10 @@ from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.frame_findings import Finding, find_findings
-from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
+from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
-from bevviz.pipeline.notes import Notes
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Variants, check_same_frames
@@ -35,52 +33,15 @@ from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
-from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
-from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
-from bevviz.workbench.session import DriveTools, WorkbenchSession
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.thumbnails import Thumbnails
-from bevviz.workbench.trials import TrialRunner
 
 KEPT = 6  # results of recently viewed frames that are kept
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
 RAW = 4  # frames that are kept as they were read
-
-
-def recorded_session(
-    drive: Drive,
-    again: FrameSource,
-    paths: Sequence[Path],
-    truth_of: TruthLookup | None = None,
-    first: int = 0,
-    labels: tuple[str | None, Path | None] = (None, None),
-) -> WorkbenchSession:
-    """Return the workbench session of a recorded drive.
-
-    Args:
-        drive: the drive that questions are about.
-        again: the same frames a second time. The run reads them while questions read those of ``drive``.
-        paths: paths of the bag.
-        truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
-        first: number of the scan that is shown first.
-        labels: stated topic and files of the ground truth.
-    """
-    recording = getattr(drive.frames, "recording", None)
-    files = [] if recording is None else [file.path for file in recording.files]
-    table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
-    source = RecordedDrive(drive, again, truth_of, first, table)
-    session = WorkbenchSession(source)
-
-    def bag_of(number: int) -> ReportedBag:
-        return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
-
-    reports = ReportMaker(session, bag_of, folder_beside(paths))
-    fix = FixSearch(source, paths, *labels)
-    session.equip(reports, DriveTools(TrialRunner(source), fix, Notes(paths)))
-    return session
 
 
 class RecordedDrive(Source, Observer[FrameResult]):

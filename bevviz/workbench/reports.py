@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from bevviz.bags.remote import beside
 from bevviz.bags.source import iso
@@ -17,9 +17,11 @@ from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 
 if TYPE_CHECKING:
+    from bevviz.pipeline.notes import Note
     from bevviz.report.make import ReportRequest
-    from bevviz.workbench.session import WorkbenchSession
-    from bevviz.workbench.source import Settings
+    from bevviz.report.report_subject import TriedValues
+    from bevviz.why import Answer
+    from bevviz.workbench.source import Settings, Source
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
@@ -90,6 +92,21 @@ class ReportedBag:
     start: int
 
 
+class QuestionLog(Protocol):
+    """Answers and notes of a workbench session, which a report quotes."""
+
+    source: Source
+
+    def notes(self) -> list[Note]:
+        """Return the notes."""
+
+    def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
+        """Return number of the frame and answer of each question in a range of log times, newest first."""
+
+    def tried_on(self, number: int, settings: Settings, answer: Answer | None) -> TriedValues:
+        """Return what other values do to the object of an answer, to its frame, and to the drive."""
+
+
 def folder_beside(paths: Sequence[Path]) -> Path:
     """Return the folder of a bag, or the working directory if that is read-only."""
     folder = beside(paths[0]).parent
@@ -108,7 +125,7 @@ class ReportMaker:
         made: the reports, the newest last.
     """
 
-    def __init__(self, session: WorkbenchSession, bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
+    def __init__(self, session: QuestionLog, bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
         self._session, self._bag_of, self._folder = session, bag_of, folder
         self._tell = session.source.news.tell
         self._thread: threading.Thread | None = None

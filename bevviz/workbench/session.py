@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from bevviz.drive import Drive
 from bevviz.errors import UserError
+from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.findings.run_table import run_table
+from bevviz.model.protocols import FrameSource
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.report.report_subject import TriedValues
 from bevviz.support.contexts import Closable
@@ -18,7 +24,8 @@ from bevviz.why.resolve import select_subjects
 from bevviz.why.side_effects import effects
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
-from bevviz.workbench.reports import ReportMaker
+from bevviz.workbench.recorded_drive import RecordedDrive
+from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
 from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
 
@@ -300,3 +307,36 @@ class WorkbenchSession(Closable):
     def _tell_notes(self) -> None:
         self.notes_version += 1
         self.source.news.tell()
+
+
+def recorded_session(
+    drive: Drive,
+    again: FrameSource,
+    paths: Sequence[Path],
+    truth_of: TruthLookup | None = None,
+    first: int = 0,
+    labels: tuple[str | None, Path | None] = (None, None),
+) -> WorkbenchSession:
+    """Return the workbench session of a recorded drive.
+
+    Args:
+        drive: the drive that questions are about.
+        again: the same frames a second time. The run reads them while questions read those of ``drive``.
+        paths: paths of the bag.
+        truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
+        first: number of the scan that is shown first.
+        labels: stated topic and files of the ground truth.
+    """
+    recording = getattr(drive.frames, "recording", None)
+    files = [] if recording is None else [file.path for file in recording.files]
+    table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
+    source = RecordedDrive(drive, again, truth_of, first, table)
+    session = WorkbenchSession(source)
+
+    def bag_of(number: int) -> ReportedBag:
+        return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
+
+    reports = ReportMaker(session, bag_of, folder_beside(paths))
+    fix = FixSearch(source, paths, *labels)
+    session.equip(reports, DriveTools(TrialRunner(source), fix, Notes(paths)))
+    return session

@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +26,8 @@ from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
-
-if TYPE_CHECKING:
-    from bevviz.workbench.recorded_drive import RecordedDrive
-    from bevviz.workbench.source import Settings
+from bevviz.workbench.recorded_drive import RecordedDrive
+from bevviz.workbench.source import Settings
 
 RUNS = 6  # trials that are kept
 

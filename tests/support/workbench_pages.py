@@ -79,9 +79,9 @@ def served(bag: Path, *settings: str) -> Iterator[str]:
     """Serve the workbench of a bag from a thread of this process. Yield its address."""
     pytest.importorskip("starlette", reason="needs pip install 'bevviz[workbench]'")
     from bevviz.workbench.access import persistent_token
-    from bevviz.workbench.recorded_drive import recorded_session
     from bevviz.workbench.routes import Site
     from bevviz.workbench.server import Server, bound_socket, viewer_folder
+    from bevviz.workbench.session import recorded_session
     from bevviz.workbench.startup import LabelledSource, SessionStartup
 
     config = load(None, ["detector.model=demo", *settings])

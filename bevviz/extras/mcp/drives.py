@@ -30,8 +30,7 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import find_source
-from bevviz.workbench.recorded_drive import recorded_session
-from bevviz.workbench.session import WorkbenchSession
+from bevviz.workbench.session import WorkbenchSession, recorded_session
 from bevviz.workbench.startup import LabelledSource
 
 
