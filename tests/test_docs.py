@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from bevviz.cli import main, make_parser
-from bevviz.recording import entities
 from tests.support.recordings import Recording
 from tools import make_reference
 
@@ -142,12 +141,6 @@ def test_links_of_the_pages_that_are_no_part_of_the_site() -> None:
             assert "://" in target or (path.parent / target).exists(), f"{page}: {target}"
 
 
-def test_the_page_of_recordings_has_the_entities_of_the_code() -> None:
-    text = (ROOT / "docs/recordings.md").read_text()
-    rows = [line for line in text.splitlines() if re.match(r"\| `[/<].*\|.*\|.*\|$", line)]
-    assert rows == [entity.row for entity in entities.table().values()]
-
-
 def test_every_command_is_on_a_page() -> None:
     text = "\n".join(
         path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -175,6 +168,6 @@ def test_every_command_and_option_on_a_page_exists() -> None:
     assert not wrong
 
 
-def test_the_page_of_reasons_and_parameters_is_that_of_the_code() -> None:
+def test_the_page_of_the_reference_is_that_of_the_code() -> None:
     kept = make_reference.PAGE.read_text(encoding="utf-8")
     assert kept == make_reference.text(), "run: python -m tools.make_reference"

@@ -17,7 +17,7 @@ CLOUDS = ("PointCloud2", "LaserScan")  # what may be a LiDAR's; scans of one pla
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 
-# Entities of recordings beside those of the sensors (docs/recordings.md). No sensor may have these names.
+# Entities of recordings beside those of the sensors (docs/reference.md). No sensor may have these names.
 RESERVED = frozenset(
     {"fused", "fusion", "frustums", "bev", "ground_truth", "tracks"}  # in /world
     | {"missed", "false", "unnamed"}  # in /world, too

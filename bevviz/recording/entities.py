@@ -1,4 +1,4 @@
-"""Entity paths, timelines and class ids of a recording (see docs/recordings.md)."""
+"""Entity paths, timelines and class ids of a recording (listed in docs/reference.md)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TIME_TOLERANCE = 1000  # nanoseconds of tolerance for times from a viewer, which
 
 
 class Entity(str):
-    """Entity of a recording: its path, and what docs/recordings.md says of it.
+    """Entity of a recording: its path, and what docs/reference.md says of it.
 
     A path with braces is the template of many entities; ``path`` fills it in.
 
@@ -58,7 +58,7 @@ class Entity(str):
 
     @property
     def row(self) -> str:
-        """Row of docs/recordings.md, in Markdown."""
+        """Row of docs/reference.md, in Markdown."""
         return f"| `{self.translate({123: '<', 125: '>'})}` | {self.types} | {self.content} |"
 
 
@@ -97,7 +97,7 @@ POINTS = Entity(
     "/world/{lidar}/points",
     "Points3D, ColorBy",
     "raw points; class id 0 unclassified, 1 ground, 2 obstacle; "
-    "[further colours](#colours-of-the-raw-points)",
+    "[further colours](recordings.md#colours-of-the-raw-points)",
 )
 GROUND = Entity(
     "/world/{lidar}/points/ground",
@@ -291,6 +291,14 @@ CALIB_CORRECTED = Entity("/calib/{camera}/corrected", "EncodedImage, Points2D", 
 CONFIG = Entity("/config", "TextDocument", "configuration and versions")
 REPORT = Entity("/report", "TextDocument", "note, files and commands of a report")
 DIGEST = Entity("/report/digest", "AnyValues", "fingerprints of each frame's results")
+
+SECTIONS: Mapping[Entity, str] = {  # first entity of each section of the docs, and its title
+    WORLD: "The scene",
+    EXPLAIN: "Decisions",
+    STAGE_TIME: "Health",
+    EVALUATE: "Evaluate, compare, sweep, calib",
+    CONFIG: "Provenance",
+}
 PROPERTY = "bevviz"  # property of a recording that says how it was made
 BAG = "bag"  # property of a recording that says what it was made from
 
