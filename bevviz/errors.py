@@ -1,8 +1,6 @@
-"""Errors that a user sees: one clear line each, never a traceback."""
+"""Errors that a user sees: one clear line each, never a traceback. And text made safe for a terminal."""
 
 from __future__ import annotations
-
-from bevviz.support.text import printable
 
 LONGEST = 4000  # most characters of a line
 
@@ -43,3 +41,14 @@ def interrupt_in(error: BaseException) -> bool:
         seen.add(id(current))
         current = current.__cause__ or current.__context__
     return False
+
+
+def printable(text: str) -> str:
+    r"""Return text for a terminal. Invisible characters are escaped as in Python, and so have no effect.
+
+    >>> printable("/points\x1b[2J\n")
+    '/points\\x1b[2J\\n'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

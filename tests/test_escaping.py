@@ -12,9 +12,9 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 from bevviz.cli import main
-from bevviz.errors import UserError
+from bevviz.errors import UserError, printable
 from bevviz.support import table
-from bevviz.support.text import fenced, markdown, printable
+from bevviz.support.text import fenced, markdown
 from tests.support import bags
 from tests.support.recordings import Recording
 

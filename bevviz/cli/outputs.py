@@ -24,9 +24,8 @@ from urllib.parse import unquote
 from bevviz.cli.command import Group, flag, option, option_values
 from bevviz.cli.interrupts import wait_for_interrupt
 from bevviz.cli.values import port
-from bevviz.errors import UserError
+from bevviz.errors import UserError, printable
 from bevviz.support import progress
-from bevviz.support.text import printable
 
 if TYPE_CHECKING:
     from rerun.blueprint import Blueprint

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from bevviz.cli.outputs import print_error
-from bevviz.support.text import did_you_mean, printable
+from bevviz.errors import printable
+from bevviz.support.text import did_you_mean
 
 COMMAND = "COMMAND"
 CUTOFF = 0.66  # least similarity of a name to suggest

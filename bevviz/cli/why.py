@@ -70,9 +70,9 @@ class WhyOptions:
 @garbage_collection_off()
 def _why(options: WhyOptions) -> int:
     from bevviz.bags.source import BagSource
+    from bevviz.errors import printable
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
-    from bevviz.support.text import printable
     from bevviz.why import FrameExplainer
     from bevviz.why.answer_text import plain_text
 

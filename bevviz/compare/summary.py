@@ -22,11 +22,12 @@ from bevviz.compare.differences import (
     TruthComparison,
 )
 from bevviz.config import ParameterChange
+from bevviz.errors import printable
 from bevviz.model.protocols import Observer
 from bevviz.support import table
 from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
-from bevviz.support.text import fenced, printable
+from bevviz.support.text import fenced
 
 WORST = 10  # number of frames in the table
 EXAMPLES = 2  # number of objects shown for each frame

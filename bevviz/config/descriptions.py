@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from bevviz.config import TUTORIAL_NAMES, Config, Parameter, load, parameters, unknown_key, values
-from bevviz.errors import UserError
-from bevviz.support.text import printable
+from bevviz.errors import UserError, printable
 
 WIDTH = 100
 

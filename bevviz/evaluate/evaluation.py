@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from bevviz.errors import printable
 from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, AveragePrecision, scored_objects
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
@@ -23,7 +24,6 @@ from bevviz.model.tables import Columns, Tabular
 from bevviz.stages.voxel import spread_to_points
 from bevviz.support import table
 from bevviz.support.json_form import json_form
-from bevviz.support.text import printable
 
 UNUSABLE = 10  # number of unusable labels in the JSON
 WORST = 10  # number of frames in the table

@@ -23,7 +23,7 @@ from bevviz.config import (
     stage_topics,
     stated_lines,
 )
-from bevviz.errors import UserError
+from bevviz.errors import UserError, printable
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
@@ -31,7 +31,6 @@ from bevviz.pipeline.sensor_check import SensorCheck, first_frames
 from bevviz.recording.provenance import model_path
 from bevviz.support import table
 from bevviz.support.json_form import LEFT_OUT, json_form
-from bevviz.support.text import printable
 
 if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import Stages

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from bevviz.errors import interrupt_in
+from bevviz.errors import interrupt_in, printable
 from bevviz.model.protocols import Items, Observer, Processor
 from bevviz.support import progress
 from bevviz.support.queues import NewestQueue
-from bevviz.support.text import printable
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)

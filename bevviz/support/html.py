@@ -10,8 +10,8 @@ from functools import lru_cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from bevviz.errors import printable
 from bevviz.support.colors import css_properties
-from bevviz.support.text import printable
 
 
 def render(template: str, **values: object) -> str:

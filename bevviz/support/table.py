@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from bevviz.errors import printable
 from bevviz.support import text
 
 Rows = Sequence[Sequence[str]]
@@ -16,7 +17,7 @@ def lines(rows: Rows, align: str = "") -> Iterator[str]:
         rows: rows of the same length.
         align: ``l`` or ``r`` for each column. Default: the first to the left, the others to the right.
     """
-    cells = [[text.printable(cell) for cell in row] for row in rows]
+    cells = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     sides = align or _default(rows)
     for row in cells:

@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from reprlib import Repr
 
+from bevviz.errors import printable
+
 # Characters with a meaning in Markdown anywhere, and those with a meaning only at the beginning of a line.
 _MARKS = re.compile(r"[\\`*\[\]<~|&$]|_(?:(?<![^\W_]_)|(?![^\W_]))")
 _START = re.compile(r"[#>+=:-]|\d+(?=[.)])")
@@ -16,17 +18,6 @@ _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 20
 _PLAIN = re.compile(r"[A-Za-z][\w .,:;()'%/>=+-]*", re.ASCII)  # most sentences: only _ may need work
-
-
-def printable(text: str) -> str:
-    r"""Return text for a terminal. Invisible characters are escaped as in Python, and so have no effect.
-
-    >>> printable("/points\x1b[2J\n")
-    '/points\\x1b[2J\\n'
-    """
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def short_repr(value: object) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.errors import UserError
+from bevviz.errors import UserError, printable
 from bevviz.evaluate import ObjectScore, Truth
 from bevviz.model import counts
 from bevviz.model.counts import count_results
@@ -26,7 +26,6 @@ from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
-from bevviz.support.text import printable
 
 MOST = 500  # combinations of values, at most
 PARTS = 20  # parts of a drive that are left out in turn to estimate the noise of F1

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from bevviz.errors import printable
 from bevviz.evaluate import MIN_HITS, RANGE
 from bevviz.model.reasons import ReasonKind
-from bevviz.support.text import markdown, printable
+from bevviz.support.text import markdown
 from bevviz.why.answer import Answer
 from bevviz.why.subject import count
 from bevviz.why.verdict import HOPELESS
