@@ -28,7 +28,7 @@ MAX_REDIRECTS = 5  # redirects of one request for a remote bag
 # --- bytes of a message or a part of a bag -----------------------------------------------------
 
 MAX_MESSAGE = 1 << 28  # a message or cloud after unpacking: 8 million points of 32 bytes
-MAX_OBJECTS = 1 << 25  # a message without points or pixels: Python objects, which take 2 s
+MAX_OBJECTS = 1 << 24  # a message without points or pixels: up to 200 MB of Python objects, which take 1 s
 MAX_DEFINITION = 1 << 20  # the text that defines a message type; usual are some kilobytes
 MIN_CHUNK = 1 << 26  # a chunk may unpack to so much, even if it states less: the number may be damaged
 MAX_CHUNK = 1 << 29  # a chunk after unpacking; recorders close one at 1 to 4 MB
