@@ -12,7 +12,7 @@ from bevviz.cli.command import Group, command, extensions, flag, option
 from bevviz.cli.options import ConfigOptions, DriveOptions, FrameOptions, SubjectOptions, load_config
 from bevviz.cli.outputs import Outputs, json_option, layout_option, print_result, say, warn
 from bevviz.cli.values import positive
-from bevviz.errors import UserError
+from bevviz.errors import UserError, printable
 from bevviz.support import progress
 from bevviz.support.contexts import garbage_collection_off
 
@@ -70,7 +70,6 @@ class WhyOptions:
 @garbage_collection_off()
 def _why(options: WhyOptions) -> int:
     from bevviz.bags.source import BagSource
-    from bevviz.errors import printable
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
     from bevviz.why import FrameExplainer
