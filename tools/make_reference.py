@@ -1,4 +1,4 @@
-"""Write docs/reference.md: all reasons, parameters and entities, from the tables of the code."""
+"""Write docs/reference.md: all reasons, parameters, metrics and entities, from the tables of the code."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import json
 from pathlib import Path
 
 from bevviz.config import Config, load, parameters, values
+from bevviz.evaluate.metrics import METRICS
 from bevviz.model.reasons import MEANINGS, PARAMETERS
 from bevviz.recording import entities
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
-HEAD = """# Reasons, parameters and entities
+HEAD = """# Reasons, parameters, metrics and entities
 
 `python -m tools.make_reference` writes this page. `bevviz config KEY` explains one parameter and says where
 its value is stated; [the project file](project.md#which-value-wins) states values.
@@ -42,7 +43,10 @@ def text() -> str:
             lines.append(f"| `{one.key}` | {value} | {_cell(limits)} | {_cell(one.text)} |")
         if inside:
             lines.append("")
-    lines += ["## Entities", "", "What [a recording](recordings.md) holds, by path."]
+    lines += ["## Metrics", "", "[Evaluate](evaluate.md#metrics) says what each needs.", ""]
+    lines += ["| metric | meaning |", "| --- | --- |"]
+    lines += [f"| `{name}` | {_cell(meaning)} |" for name, meaning in METRICS.items()]
+    lines += ["", "## Entities", "", "What [a recording](recordings.md) holds, by path."]
     for entity in entities.table().values():
         if entity in entities.SECTIONS:
             title = entities.SECTIONS[entity]
