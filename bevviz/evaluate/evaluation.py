@@ -74,7 +74,7 @@ class EvaluationResult:
     unusable_examples: Sequence[str]
     """the first ten, with the reason"""
     metrics: Mapping[str, float | None]
-    """metrics of docs/evaluate.md by name; null: not measured"""
+    """metrics of docs/reference.md by name; null: not measured"""
     false_causes: Mapping[str, int]
     """false objects by cause"""
     worst: Sequence[FrameOutcome]

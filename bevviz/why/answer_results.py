@@ -83,7 +83,7 @@ class AnswerResult:
     """points in its box"""
     reported: bool
     reason: str
-    """one of the reasons in docs/why.md"""
+    """one of the reasons in docs/reference.md"""
     verdict: str
     confidence: float | None
     """0 to 1, that the reason is right; null: ground truth tells it, or it is unknown"""
