@@ -27,9 +27,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # The longest files first, so that no worker is left alone with one at the end.
 FIRST = (
-    *("test_workbench_journeys", "test_calib", "test_workbench", "test_example_notebooks"),
-    *("test_torture_benchmark", "test_damaged_bags", "test_benchmarks", "test_batch", "test_why"),
-    *("test_live_ros", "test_live", "test_workbench_live"),
+    *("test_workbench_journeys", "test_live_ros", "test_workbench", "test_torture_benchmark", "test_calib"),
+    *("test_example_notebooks", "test_live", "test_batch", "test_workbench_live", "test_benchmarks"),
+    *("test_commands", "test_docs", "test_damaged_bags", "test_why", "test_bag"),
 )
 
 
