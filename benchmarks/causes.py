@@ -272,7 +272,7 @@ def judge(
     rows: list[Row],
 ) -> tuple[int, int, int]:
     """Print what became of each fault. Return how many were found, found in part, and the false slices."""
-    state = {id(c.cause): c.state for c in compare_causes(causes, natural)}
+    state = {(c.kind, c.reason, c.text): c.state for c in compare_causes(causes, natural)}
     numbers = np.array([victims.get((r["recording"], r["frame"], _victim(r)), -1) for r in rows])
     best: dict[int, tuple[float, float, bool, str]] = {}
     false = []
@@ -283,12 +283,12 @@ def judge(
         if not len(faults) or counts.max() < 0.5 * cause.count:
             # An object that is reported by a wrong name is missed, and false by that name.
             is_effect = cause.kind == "false" and cause.text.startswith("benches")
-            if state.get(id(cause)) == "new" and not is_effect:
+            if state.get((cause.kind, cause.reason, cause.text)) == "new" and not is_effect:
                 false.append(cause.title)
             continue
         inside = np.logical_and.reduce([bound.holds(causes.findings) for bound in plants[fault].bounds])
         purity = float(inside[cause.rows].mean())
-        names = {b.attribute for b in cause.bounds}
+        names = {b.attribute for b in cause.conditions}
         right = _directions(names) == _directions({b.attribute for b in plants[fault].bounds})
         whole = counts.max() / max(int((numbers == fault).sum()), 1)
         if (right, purity) > (best[fault][2], best[fault][0]) if fault in best else True:

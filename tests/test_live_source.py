@@ -6,7 +6,7 @@ The messages are handed over inside this process. tests/test_live_ros.py has the
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -108,7 +108,7 @@ def test_info_says_what_is_missing(graph: FedGraph, monkeypatch: pytest.MonkeyPa
     said: list[str] = []
     monkeypatch.setattr("bevviz.support.progress._say", said.append)
 
-    def missing(*settings: str) -> tuple[str, ...]:
+    def missing(*settings: str) -> Sequence[str]:
         return info.describe(load(settings=settings), seconds=0.01, patience=2.0).missing
 
     assert missing()[0].startswith("nothing is published on ROS domain 0: is the robot running")
