@@ -412,9 +412,13 @@ def test_a_run_is_killed_started_again_and_ordered(robot: str, tmp_path: Path, c
             assert capsys.readouterr().out.split() == paths
             assert "mine.rrd: is already there" in error_of(capsys, "snap", "mine.rrd", "--pid", str(run.pid))
             assert "no 'bevviz live' of yours with process id 1" in error_of(capsys, "snap", "--pid", "1")
-            saved = set(tmp_path.glob("flight_*.rrd"))
+
+            def complete() -> set[Path]:
+                return {path for path in tmp_path.glob("flight_*.rrd") if ".partial-" not in path.name}
+
+            saved = complete()
             run.send_signal(signal.SIGUSR1)
-            (signalled,) = until(lambda: set(tmp_path.glob("flight_*.rrd")) - saved, "a recording")
+            (signalled,) = until(lambda: complete() - saved, "a recording")
             until(lambda: signalled.with_suffix(".mcap").exists(), "its bag")
             run.send_signal(signal.SIGTERM)
             run.send_signal(signal.SIGTERM)  # somebody has no patience

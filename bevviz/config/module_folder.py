@@ -166,8 +166,12 @@ class _FolderHook:
         return inside and not any(place.is_relative_to(installed) for installed in self._installed)
 
     def __call__(self, path: str) -> machinery.FileFinder:
-        """Return the finder of a path of the folder."""
-        if not self.covers(path):
+        """Return the finder of a path of the folder. An archive in it has no modules.
+
+        Raises:
+            ImportError: the path is of another folder, or a script, which ``runpy`` runs as a file.
+        """
+        if not self.covers(path) or (path.endswith(".py") and Path(path).is_file()):
             raise ImportError
         loaders: list[tuple[Any, list[str]]] = [
             (partial(SourceLoader, folder=self.folder), machinery.SOURCE_SUFFIXES)
