@@ -86,6 +86,7 @@ def test_a_right_calibration_is_left_alone(faultless: Calibration) -> None:
     assert faultless.answer == "Camera 'zed': calibration and clock are fine."
 
 
+@pytest.mark.long
 def test_a_turn_and_a_late_clock_are_found(late_and_rolled: Calibration) -> None:
     assert_found(late_and_rolled, {"rx": 1.0, "dt": 40.0})
 
@@ -96,6 +97,7 @@ def test_turns_and_shifts_are_found_together(drive: Drive) -> None:
     assert_found(drive.calibrate(offsets(**planted)), planted)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn", [2.0, -2.0])
 def test_a_fence_is_not_taken_for_its_neighbour(turn: float) -> None:
     """Posts every 2 degrees: between what is stated and the truth lies a place that fits nearly as well."""
@@ -135,6 +137,7 @@ def fence(seed: int) -> Frame:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_correction_undoes_the_error(drive: Drive, late_and_rolled: Calibration) -> None:
     result = late_and_rolled
     true = geometry.inverse(drive.source.base_from_lidar) @ drive.source.base_from_camera
@@ -171,6 +174,7 @@ def test_the_gradient_equals_differences_of_the_score(drive: Drive) -> None:
 # --- the drive carries what is planted ---------------------------------------------------------
 
 
+@pytest.mark.long
 def test_stated_mounting_and_stamps_are_wrong_in_frames_and_bag(tmp_path: Path) -> None:
     error = error_pose(offsets(ry=1.0))
     right = SyntheticSource(2, 3, weave=True)
@@ -191,6 +195,7 @@ def test_stated_mounting_and_stamps_are_wrong_in_frames_and_bag(tmp_path: Path) 
         assert np.allclose(true, error @ stated, atol=1e-3)
 
 
+@pytest.mark.long
 def test_the_default_drive_does_not_weave(drive: Drive) -> None:
     plain, weaving = SyntheticSource(80, 0), drive.source
     assert not np.allclose(plain.map_from_base(START + PERIOD), weaving.map_from_base(START + PERIOD))
@@ -230,6 +235,7 @@ def of_six(kitti: list[Frame]) -> Calibration:
     return of_kitti(kitti)
 
 
+@pytest.mark.long
 def test_errors_of_kittis_calibration_are_near_zero(of_six: Calibration) -> None:
     """Six frames, no motion: the turns are sure, and what is not sure is said to be so."""
     result = of_six
@@ -259,6 +265,7 @@ def test_planted_errors_are_found_in_kitti(kitti: list[Frame], planted: dict[str
         assert abs(found(result)["tz"] - planted["tz"]) < result.axes[5].interval
 
 
+@pytest.mark.long
 def test_repeated_views_count_as_three(kitti: list[Frame]) -> None:
     once, often = (calibrate(shots_of(kitti[:3] * times)) for times in (1, 4))
     assert once.by(AxisFinding.FINE)
@@ -267,6 +274,7 @@ def test_repeated_views_count_as_three(kitti: list[Frame]) -> None:
         assert again.interval > 0.6 * axis.interval
 
 
+@pytest.mark.long
 def test_one_real_view_gives_no_confident_answer(ten: list[Frame]) -> None:
     for times, frames in ((1, "1 frame"), (12, "12 frames, which show as much as 1 different one,")):
         result = calibrate(shots_of(ten[2:3] * times))
@@ -274,6 +282,7 @@ def test_one_real_view_gives_no_confident_answer(ten: list[Frame]) -> None:
         assert f"too little data: in {frames} several alignments fit about as well" in result.answer
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("planted", [{"ry": 1.0}, {"ty": 20.0}], ids=str)
 def test_a_camera_that_moves_during_the_drive_is_reported(
     ten: list[Frame], planted: dict[str, float]
@@ -286,6 +295,7 @@ def test_a_camera_that_moves_during_the_drive_is_reported(
     assert not result.correction.any()
 
 
+@pytest.mark.long
 def test_images_of_other_frames_give_no_answer(kitti: list[Frame], of_six: Calibration) -> None:
     others = [frame.cameras[0] for frame in (*kitti[1:], kitti[0])]
     swapped = [
@@ -300,6 +310,7 @@ def test_images_of_other_frames_give_no_answer(kitti: list[Frame], of_six: Calib
     assert of_six.score_stated > 1.2 * FIT
 
 
+@pytest.mark.long
 def test_the_worst_agreement_of_a_right_calibration(shared: Path) -> None:
     """These four frames are among the real ones that score least."""
     assert best_score(Kitti(shared / "kitti_more", range(12, 16)).frames) > 1.2 * FIT
@@ -331,6 +342,7 @@ def test_one_view_repeated_twelve_times_counts_once(drive: Drive) -> None:
     assert ratio.min() > 0.4 and np.exp(np.log(ratio[:5]).mean()) > 0.7
 
 
+@pytest.mark.long
 def test_two_frames_do_not_confirm_shift_along_z_and_time(drive: Drive) -> None:
     """These two have different speeds, so their intervals are small."""
     once = calibrate(gather(drive.frames[::5], ["zed"], drive.pose)["zed"])

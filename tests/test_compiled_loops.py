@@ -37,6 +37,7 @@ print("scipy.linalg" in sys.modules)
 """
 
 
+@pytest.mark.long
 def test_loaded_loops_import_no_scipy() -> None:
     """The import would take half a second before the first frame of the workbench."""
     runs = [  # The first one may compile.

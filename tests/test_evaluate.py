@@ -396,6 +396,7 @@ def test_false_boxes_in_any_frame_lower_the_precision() -> None:
 # --- many bags ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_batch_is_evaluated_against_the_truth(
     drive: Path, evaluated: Evaluation, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -55,6 +55,7 @@ def test_two_wrong_parameters_are_repaired(samples: tuple[Sample, Sample]) -> No
     assert f"fixes {fix.fixed} of {fix.missed} missed objects" in "\n".join(fix.lines())
 
 
+@pytest.mark.long
 def test_the_file_repeats_what_was_measured(samples: tuple[Sample, Sample], tmp_path: Path) -> None:
     choosing, confirming = samples
     config = load(settings=["fusion.min_rating=0.6"])
@@ -65,6 +66,7 @@ def test_the_file_repeats_what_was_measured(samples: tuple[Sample, Sample], tmp_
     assert repeated == pytest.approx(fix.f1_after)
 
 
+@pytest.mark.long
 def test_good_parameters_stay(samples: tuple[Sample, Sample]) -> None:
     """A change that helps fewer than one object is left out."""
     choosing, confirming = samples

@@ -44,6 +44,7 @@ def ended(session: WorkbenchSession) -> str:
     return session.tools.fix.state
 
 
+@pytest.mark.long
 def test_the_wrong_parameter_is_found(session: WorkbenchSession, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bevviz.fleet.fix.TRIALS", 6)
     fix = session.tools.fix

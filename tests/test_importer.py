@@ -26,6 +26,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bags.write(folder, bags.small_items(scans=3), form="sqlite3")
 
 
+@pytest.mark.long
 def test_a_bag_is_a_recording_on_standard_output(drive: Path, tmp_path: Path) -> None:
     (bag,) = drive.glob("*.db3")
     about = [

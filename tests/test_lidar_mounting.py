@@ -248,6 +248,7 @@ def test_a_nearly_inverted_lidar_still_faces_ahead(tilt: float) -> None:
         assert _least_turn(LIDAR, np.array(up)) == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-6)
 
 
+@pytest.mark.long
 @given(hnp.arrays(np.float64, 3, elements=st.floats(-np.pi, np.pi)))
 def test_the_ground_is_found_whatever_way_the_lidar_is_turned(turn: F64) -> None:
     scan = SCAN

@@ -119,6 +119,7 @@ def test_an_overview_lists_images_that_show_nothing() -> None:
     assert not listed.content()
 
 
+@pytest.mark.long
 def test_the_run_replaces_the_overview(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> None:
     """The list is that of a run without an overview."""
     monkeypatch.setattr(recorded_drive, "FIRST", 0.0)

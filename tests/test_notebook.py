@@ -21,6 +21,8 @@ from bevviz.why import Selection
 
 pytest.importorskip("rerun_notebook")
 
+pytestmark = pytest.mark.long
+
 ORIGIN = {"application_id": "bevviz", "recording_id": "74f3feed65624874a4fb98b371e8523b", "segment_id": None}
 FRAMES = 3
 

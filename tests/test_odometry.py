@@ -155,6 +155,7 @@ def test_a_missing_package_is_one_line(street: list[Frame], monkeypatch: pytest.
 # --- real drives -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_real_drive_repeats_and_single_frames_agree(shared: Path, tmp_path: Path) -> None:
     with bevviz.open(shared / "kitti_drive") as drive:
         assert drive.at(frame=20).frame.world_from_points is None, "no run has placed it"

@@ -261,6 +261,7 @@ def functions(path: Path, depth: int) -> str:
     return str(path)
 
 
+@pytest.mark.long
 def test_a_command_ends_well_while_a_network_still_loads(tmp_path: Path) -> None:
     """A thread of onnxruntime cannot be ended, and must not crash the process that leaves."""
     model = functions(tmp_path / "m.onnx", 28)

@@ -139,6 +139,7 @@ def points_at(recording: Recording, paths: list[str], frame: int) -> F32:
     return np.array(found, np.float32)
 
 
+@pytest.mark.long
 def test_every_decision_box_track_and_explanation_is_kept(read: dict[str, Recording]) -> None:
     whole = read["everything"]
     thinned = (entities.WORLD, entities.BEV, entities.HEALTH)
@@ -160,6 +161,7 @@ def test_every_decision_box_track_and_explanation_is_kept(read: dict[str, Record
                     )
 
 
+@pytest.mark.long
 def test_inspect_keeps_voxels_and_raw_clouds_at_findings(
     saved: dict[str, Path], read: dict[str, Recording]
 ) -> None:
@@ -192,6 +194,7 @@ def test_inspect_keeps_voxels_and_raw_clouds_at_findings(
     assert entities.CLUSTERS.path(lidar) in report.at
 
 
+@pytest.mark.long
 def test_the_recording_says_what_it_lacks(saved: dict[str, Path], read: dict[str, Recording]) -> None:
     for keep, path in saved.items():
         recording = read[keep]

@@ -55,6 +55,7 @@ def test_the_action_holds_bags_to_limits(tmp_path: Path) -> None:
     assert (tmp_path / named["page"]).read_text().startswith("<!")
 
 
+@pytest.mark.long
 def test_the_action_says_why_a_bag_failed(tmp_path: Path) -> None:
     (tmp_path / "broken.mcap").write_bytes(b"no bag")
     status, summary, _ = run_action(tmp_path, BAGS="broken.mcap", TRUTH="")

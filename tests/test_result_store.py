@@ -319,6 +319,7 @@ with ResultStore(Path(sys.argv[1]), 10**9) as store:
 """
 
 
+@pytest.mark.long
 def test_several_processes_share_the_file(tmp_path: Path) -> None:
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)]) for _ in range(3)]
     assert [writer.wait(120) for writer in writers] == [0, 0, 0]

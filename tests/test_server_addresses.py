@@ -96,7 +96,9 @@ def is_let_in(port: int, origin: str) -> bool:
     return bool(answer.value.headers.get("access-control-allow-origin") == origin)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [name if name == "sweep" else pytest.param(name, marks=pytest.mark.long) for name in COMMANDS]
+)
 def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
     bags.write(Path("drive"), bags.small_items(scans=2))
     port = a_port()
@@ -117,6 +119,7 @@ def test_a_command_that_serves_is_for_this_machine(name: str) -> None:
     until(lambda: not any(is_listening("127.0.0.1", p) for p in found))  # nothing outlives a kill
 
 
+@pytest.mark.long
 def test_a_catalog_is_for_this_machine() -> None:
     pytest.importorskip("datafusion", reason="needs 'bevviz[catalog]'")
     from bevviz.cli import main
@@ -131,6 +134,7 @@ def test_a_catalog_is_for_this_machine() -> None:
         assert not any(is_listening(OTHER, p) for p in found)
 
 
+@pytest.mark.long
 def test_bind_opens_it_at_one_address() -> None:
     port = a_port()
     with running("demo", "--frames", "2", "--serve", str(port), "--bind", OTHER) as process:

@@ -544,6 +544,7 @@ def test_a_scan_without_robot_results_is_a_reason(frame: Frame) -> None:
 # --- as a user runs it -------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_whole_run_uses_user_stages(here: Path, robot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive, own = str(robot), ["--set", "clustering.method=mine.stages:cells"]
     assert main(["bag", drive, *own, "--save", "x.rrd"]) == 0

@@ -107,6 +107,7 @@ def new_verdict(page: Page, before: str) -> str:
 # --- with Rerun's viewer ------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_viewer_is_clicked_and_shows_the_frame_of_the_panel(
     browser: Browser, address: str, bag: Path
 ) -> None:
@@ -499,6 +500,7 @@ def test_an_address_and_a_shared_link_open_the_same(
     stranger.context.close()
 
 
+@pytest.mark.long
 def test_two_pages_find_a_server_again_that_was_killed(bag: Path, browser: Browser) -> None:
     """Each page has its own question. The next server of the same drive shows the same."""
     with (

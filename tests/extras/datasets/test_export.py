@@ -43,6 +43,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bevviz.Dri
     return folder, drive
 
 
+@pytest.mark.long
 def test_our_own_reader_and_pykitti_have_the_same_frames(exported: tuple[Path, bevviz.Drive]) -> None:
     from pykitti.utils import load_velo_scan, read_calib_file  # type: ignore[import-untyped]
 

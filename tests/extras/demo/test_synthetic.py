@@ -25,6 +25,8 @@ from bevviz.model.results import DetectionState
 from bevviz.pipeline.session import Session
 from bevviz.stages.detector import Detector
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def source() -> SyntheticSource:

@@ -27,7 +27,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("preset", ["default", "reference"])
+@pytest.mark.parametrize("preset", ["default", pytest.param("reference", marks=pytest.mark.long)])
 def test_a_bag_runs(tmp_path: Path, preset: str) -> None:
     command = ["bag", str(BAG), "--model", "demo", "--frames", ":2", "--preset", preset]
     done = run(tmp_path, *command, "--save", f"{preset}.rrd", "--quiet")
@@ -35,6 +35,7 @@ def test_a_bag_runs(tmp_path: Path, preset: str) -> None:
     assert (tmp_path / f"{preset}.rrd").stat().st_size > 100_000
 
 
+@pytest.mark.long
 def test_a_bag_is_described_and_explained(tmp_path: Path) -> None:
     described = run(tmp_path, "info", str(BAG))
     assert described.returncode == 0 and "/rslidar_points: LiDAR" in " ".join(described.stdout.split())
@@ -42,6 +43,7 @@ def test_a_bag_is_described_and_explained(tmp_path: Path) -> None:
     assert explained.returncode == 0 and "frame 1" in explained.stdout
 
 
+@pytest.mark.long
 def test_the_workbench_opens(tmp_path: Path) -> None:
     command = [*COMMAND, "open", str(BAG), "--model", "demo", "--no-browser"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as server:
