@@ -28,7 +28,7 @@ class ClosedSocket:
 
 
 def test_closed_pages_leave_no_threads(tmp_path: Path) -> None:
-    """Those of Rerun's streams are no threads of Python, so the system counts."""
+    """Count by the system: threads of Rerun's streams are no threads of Python."""
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=3))
     with (
         bevviz.open(bag) as drive,

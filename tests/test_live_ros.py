@@ -368,7 +368,7 @@ def live(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_run_is_killed_started_again_and_ordered(
     robot: str, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a user, systemd and the robot's operator do to ``bevviz live`` in one day."""
+    """A user, systemd and the robot's operator act on ``bevviz live`` in one day."""
     # A process that is killed amid a message may leave Fast DDS's shared memory locked for those after it.
     monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
     from rcl_interfaces.srv import SetParameters

@@ -1,4 +1,4 @@
-"""What users do on the workbench's page, in a real browser.
+"""Journeys of users over the workbench's page, in a real browser.
 
 One journey has Rerun's viewer, which draws slowly without a graphics card. The others have a stand-in for it.
 """

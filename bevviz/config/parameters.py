@@ -125,13 +125,9 @@ def parameters(config: Config | None = None) -> Mapping[str, Parameter]:
     if not added:
         return _built_in()
     own = {key: _parameter(key, field) for key, field in added.items()}
-    table: dict[str, Parameter] = {}
-    for key, parameter in _built_in().items():
-        table[key] = parameter
-        section = key.partition(".")[0]
-        if key == _last_key(section):
-            table |= {name: param for name, param in own.items() if name.startswith(f"{section}.params.")}
-    return table
+    order = [*Config.model_fields]
+    both = {**_built_in(), **own}
+    return dict(sorted(both.items(), key=lambda item: order.index(item[0].partition(".")[0])))
 
 
 def parameter(key: str, config: Config | None = None) -> Parameter | None:
@@ -161,12 +157,6 @@ def _built_in() -> Mapping[str, Parameter]:
             fields = {section: field}
         table |= {key: _parameter(key, inner) for key, inner in fields.items()}
     return table
-
-
-@cache
-def _last_key(section: str) -> str:
-    """Return the last built-in key of a section."""
-    return [key for key in _built_in() if key.partition(".")[0] == section][-1]
 
 
 def _parameter(key: str, field: FieldInfo) -> Parameter:

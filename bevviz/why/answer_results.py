@@ -145,7 +145,7 @@ class OtherAnswer:
 
 @dataclass(frozen=True, slots=True)
 class RobotStepResult:
-    """What one of the robot's steps did with an object."""
+    """Outcome of one of the robot's steps for an object."""
 
     topic: str
     """topic that the step makes"""

@@ -76,7 +76,7 @@ def test_tables_of_nuscenes_with_other_scans(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["3a2e1b9f8c7d4e5f9a0b1c2d3e4f5a6b", "00544", "0000001"])
 def test_kitti_with_other_names_of_frames(name: str, tmp_path: Path) -> None:
-    """As nuScenes' devkit converts its scenes, and View of Delft: they were plain folders, not calibrated."""
+    """Folders of nuScenes' devkit and of View of Delft were plain folders, without a calibration."""
     for folder in ("velodyne", "calib"):
         (tmp_path / folder).mkdir()
     np.ones((2000, 4), "<f4").tofile(tmp_path / f"velodyne/{name}.bin")
@@ -90,7 +90,7 @@ def test_kitti_with_other_names_of_frames(name: str, tmp_path: Path) -> None:
 
 
 def test_kitti_that_was_copied_by_a_mac(tmp_path: Path) -> None:
-    """What it lays beside each file was a scan without a number, and the drive was refused."""
+    """A hidden file beside each scan was a scan without a number, and the drive was refused."""
     for folder in (kitti_odometry(tmp_path), kitti_raw(tmp_path)):
         for file in [f for f in folder.rglob("*") if f.suffix in (".bin", ".png", ".label", ".txt")]:
             file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7")
