@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from tests.support.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.live.publish import FUSED, OBSTACLES, TOPICS, TRANSFORMS, RosTopics
+from bevviz.live.publish import BEV, FUSED, OBSTACLES, TOPICS, TRANSFORMS, RosTopics
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.source import LiveSource
 
@@ -105,4 +106,26 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
         session.until_told("/a has two types")
         until(lambda: OBSTACLES in session.source.topics, "a topic of another type than ours")
         session.until_frames()
-        assert TOPICS.keys() - publisher.topics == {FUSED, TRANSFORMS}
+        until(lambda: OBSTACLES not in publisher.topics, "the end of our topic")
+        assert TOPICS.keys() - publisher.topics == {FUSED, OBSTACLES, TRANSFORMS}
+
+
+def test_no_result_goes_to_a_topic_of_the_robot(robot: FaultyRobot) -> None:
+    robot.set(OBSTACLES, kind="PointCloud2", node="detector")
+    with running() as session:
+        until(lambda: OBSTACLES in session.source.topics, "the robot's topic")
+        told: list[str] = []
+        publisher = RosTopics(session.source.node, told.append)
+        assert told == [
+            f"{OBSTACLES} is not published: /detector publishes {OBSTACLES}, and messages of two sources "
+            f"would mix; --ros-args -r {OBSTACLES}:=/bevviz{OBSTACLES} gives ours another name"
+        ]
+        assert OBSTACLES not in publisher.topics and BEV in publisher.topics
+        told.clear()
+        robot.set(BEV, kind="Image", node="viewer")
+        began = time.monotonic()
+        until(lambda: told, "the robot's second publisher is named")
+        assert time.monotonic() - began < 2
+        assert told[0].startswith(f"{BEV} is not published any more: /viewer publishes {BEV} now; --ros-args")
+        assert BEV not in publisher.topics and not publisher.wants(BEV)
+        publisher.send(BEV, b"", 0)  # a result that was on its way goes nowhere

@@ -82,47 +82,53 @@ def test_the_command_of_the_unit_runs_and_ends(tmp_path: Path) -> None:
 
 def test_the_launch_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BEVVIZ_PROGRAM", "/robot/bevviz")
-    made = described(monkeypatch)
-    (process,) = [args for kind, args in made if kind == "ExecuteProcess"]
-    defaults = {args["name"]: args["default_value"] for kind, args in made if kind == "DeclareLaunchArgument"}
-
-    def text(part: Any) -> str:
-        if isinstance(part, list):
-            return "".join(map(text, part))
-        return defaults[part[1]["name"]] if isinstance(part, tuple) else str(part)
-
-    program, *arguments = map(text, process["cmd"])
+    process = launched(monkeypatch)
+    program, *arguments = process["cmd"]
     assert program == "/robot/bevviz" and process["respawn"] is True
     assert arguments[-3:] == ["--ros-args", "-r", "__ns:=/"]
+    assert "--diagnostics" in arguments and "--publish" not in arguments
     settings = settings_of(arguments)
     assert settings.config.detector.model == "" and settings.config.live.flight_folder == "."
 
 
-def described(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
-    """Return the kind and the arguments of each action in the launch file, without an installed ROS."""
+def test_the_launch_file_passes_options_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = launched(monkeypatch, options="--publish --save 'my drive.mcap'")["cmd"]
+    rest = command.index("--ros-args")
+    assert command[rest - 3 : rest] == ["--publish", "--save", "my drive.mcap"]
+
+
+def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> dict[str, Any]:
+    """Return the arguments of the process that the launch file starts, without an installed ROS."""
+    made: list[tuple[str, dict[str, Any]]] = []
 
     def noted(kind: str) -> Any:
-        def make(name: Any = None, value: Any = None, **more: Any) -> tuple[str, dict[str, Any]]:
-            return kind, {"name": name, "value": value, **more} if name is not None else more
+        def make(name: str = "", value: str = "", **more: Any) -> None:
+            made.append((kind, {"name": name, "value": value, **more}))
 
         return make
 
-    kinds = {
-        "launch.actions": ("DeclareLaunchArgument", "ExecuteProcess", "SetEnvironmentVariable"),
-        "launch.substitutions": ("LaunchConfiguration",),
-    }
+    class Value:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def perform(self, context: dict[str, str]) -> str:
+            return context[self.name]
+
     launch = ModuleType("launch")
     launch.LaunchDescription = list  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "launch", launch)
-    for name, inside in kinds.items():
-        module = ModuleType(name)
-        for kind in inside:
-            setattr(module, kind, noted(kind))
-        monkeypatch.setitem(sys.modules, name, module)
-    said: list[tuple[str, dict[str, Any]]] = runpy.run_path(str(PACKAGE / "launch" / "live.launch.py"))[
-        "generate_launch_description"
-    ]()
-    return said
+    actions, substitutions = ModuleType("launch.actions"), ModuleType("launch.substitutions")
+    for kind in ("DeclareLaunchArgument", "ExecuteProcess", "OpaqueFunction", "SetEnvironmentVariable"):
+        setattr(actions, kind, noted(kind))
+    substitutions.LaunchConfiguration = Value  # type: ignore[attr-defined]
+    for module in (launch, actions, substitutions):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    runpy.run_path(str(PACKAGE / "launch" / "live.launch.py"))["generate_launch_description"]()
+    values = {one["name"]: one["default_value"] for kind, one in made if kind == "DeclareLaunchArgument"}
+    (start,) = [one["function"] for kind, one in made if kind == "OpaqueFunction"]
+    assert arguments.keys() <= values.keys()
+    start(values | arguments)
+    (process,) = [one for kind, one in made if kind == "ExecuteProcess"]
+    return process
 
 
 def test_the_workspace_installs_what_it_names(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence, Set
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
@@ -10,7 +11,8 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.live.graph import open_publisher
+from bevviz.live.graph import UNKNOWN, foreign_publishers, full_name, open_publisher, rename_advice
+from bevviz.live.node import add_timer
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
@@ -34,6 +36,7 @@ FUSED = "/detection/fused_3d"
 TRACKS = "/detection/tracks_3d"
 MARKERS = "/visualization/tracks"
 TRANSFORMS = "/tf"
+LOOK = 0.5  # seconds between two looks for other publishers of our topics
 SPEED = "speed_m_s"  # class of a track's second result; the score of that result is the speed
 TOPICS = {
     BEV: "sensor_msgs/msg/Image",
@@ -79,14 +82,19 @@ class Watch(Protocol):
 
 
 class RosTopics:
-    """Publishers of a ROS node.
+    """Publishers of a ROS node. A topic that another node publishes is left to that node.
+
+    If another node begins to publish a topic later, ours ends there, and does not begin again: a robot that
+    loses its detector must not be steered by ours.
 
     Args:
         node: an rclpy node, whose remaps apply.
-        tell: called with one sentence for each topic that cannot be published.
+        tell: called with one sentence for each topic that is not published.
     """
 
     def __init__(self, node: Any, tell: Callable[[str], None] = lambda text: None) -> None:
+        self._node, self._tell = node, tell
+        self._lock = threading.Lock()  # guards ``_publishers``, from which the timer removes
         self._publishers: dict[str, Any] = {}
         for topic, kind in TOPICS.items():
             if topic == TRANSFORMS:  # The robot publishes its own.
@@ -95,6 +103,7 @@ class RosTopics:
                 self._publishers[topic] = open_publisher(node, kind, topic)
             except UserError as error:
                 tell(f"{topic} is not published: {error}")
+        add_timer(node, LOOK, self._give_way)
 
     @property
     def topics(self) -> Set[str]:
@@ -103,12 +112,26 @@ class RosTopics:
 
     def wants(self, topic: str) -> bool:
         """Return whether anybody receives a topic."""
-        publisher = self._publishers.get(topic)
-        return publisher is not None and publisher.get_subscription_count() > 0
+        with self._lock:
+            publisher = self._publishers.get(topic)
+            return publisher is not None and publisher.get_subscription_count() > 0
 
     def send(self, topic: str, data: bytes, stamp: int) -> None:
-        """Publish a message."""
-        self._publishers[topic].publish(data)
+        """Publish a message, unless another node publishes the topic by now."""
+        with self._lock:
+            if (publisher := self._publishers.get(topic)) is not None:
+                publisher.publish(data)
+
+    def _give_way(self) -> None:
+        """End each topic that another node publishes by now."""
+        for topic in list(self._publishers):
+            name = self._node.resolve_topic_name(topic)
+            others = [p for p in foreign_publishers(self._node, name) if p.node_name != UNKNOWN]
+            if others:
+                with self._lock:
+                    self._node.destroy_publisher(self._publishers.pop(topic))
+                who = f"{full_name(others[0])} publishes {name} now"
+                self._tell(f"{topic} is not published any more: {who}; {rename_advice(topic)}")
 
 
 class Publisher:

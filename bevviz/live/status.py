@@ -155,7 +155,7 @@ class Diagnostics:
 
     def __init__(self, node: Any) -> None:
         self._node, self._name = node, node.get_name()
-        self._publisher = open_publisher(node, TYPE, DIAGNOSTICS)
+        self._publisher = open_publisher(node, TYPE, DIAGNOSTICS, shared=True)
         self._result: FrameResult | None = None
         self._at = 0.0
 
