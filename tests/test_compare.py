@@ -15,7 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.cli import main
-from bevviz.compare.differences import (
+from bevviz.compare.sides import published_result, robot_topic
+from bevviz.compare.views import side_space
+from bevviz.config import load
+from bevviz.errors import UserError
+from bevviz.evaluate.differences import (
     Change,
     ImageBoxes,
     SideResult,
@@ -24,10 +28,6 @@ from bevviz.compare.differences import (
     differences,
     seen,
 )
-from bevviz.compare.sides import published_result, robot_topic
-from bevviz.compare.views import side_space
-from bevviz.config import load
-from bevviz.errors import UserError
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D

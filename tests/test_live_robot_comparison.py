@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevviz.compare.differences import Change
 from bevviz.config import load
+from bevviz.evaluate.differences import Change
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.live.robot_comparison import WAITING, RobotComparison

@@ -1,1 +1,1 @@
-"""Comparison of two results of the same frames. Imports `evaluate` and below."""
+"""Comparison of two results of the same frames. Imports `why` and below."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 import numpy as np
 import rerun as rr
 
-from bevviz.compare.differences import (
+from bevviz.evaluate.differences import (
     DIFFERENT,
     WORST_FIRST,
     Change,

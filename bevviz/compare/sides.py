@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import FailureSummary
-from bevviz.compare.differences import FrameDifferences, compare_with_truth, differences, seen
 from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.evaluate.differences import FrameDifferences, compare_with_truth, differences, seen
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer

@@ -13,7 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
-from bevviz.compare.differences import (
+from bevviz.config import ParameterChange
+from bevviz.errors import printable
+from bevviz.evaluate.differences import (
     DIFFERENT,
     WORST_FIRST,
     Change,
@@ -21,8 +23,6 @@ from bevviz.compare.differences import (
     FrameDifferences,
     TruthComparison,
 )
-from bevviz.config import ParameterChange
-from bevviz.errors import printable
 from bevviz.model.protocols import Observer
 from bevviz.support import table
 from bevviz.support.files import save_text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from bevviz.compare.differences import DIFFERENT, Change
+from bevviz.evaluate.differences import DIFFERENT, Change
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
 from bevviz.recording.views import HIDDEN, LINKED, birds_eye, plot, space, text_log

@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.compare.differences import (
+from bevviz.compare.sides import published_result, robot_topic
+from bevviz.config import LiveConfig
+from bevviz.errors import UserError
+from bevviz.evaluate.differences import (
     Change,
     Difference,
     FrameDifferences,
@@ -18,9 +21,6 @@ from bevviz.compare.differences import (
     differences,
     seen,
 )
-from bevviz.compare.sides import published_result, robot_topic
-from bevviz.config import LiveConfig
-from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult

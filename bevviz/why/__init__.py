@@ -1,4 +1,4 @@
-"""Explanations of why an object was reported or missed. Imports `compare` and below."""
+"""Explanations of why an object was reported or missed. Imports `evaluate` and below."""
 
 from bevviz.why.answer import Answer, FrameExplainer, why
 from bevviz.why.hints import Hint

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bevviz.compare.differences import Change, SideResult, compare_objects
 from bevviz.evaluate import Truth, match
+from bevviz.evaluate.differences import Change, SideResult, compare_objects
 from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects

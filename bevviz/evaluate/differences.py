@@ -9,7 +9,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from bevviz.evaluate import Truth, judge, position_text
+from bevviz.evaluate.ground_truth import Truth
+from bevviz.evaluate.matching import judge, position_text
 from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, Bool, Boxes3D
 from bevviz.model.results import FrameResult, Objects
