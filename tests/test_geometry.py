@@ -13,12 +13,14 @@ from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D, Intrinsics
 
 K = np.array([[320.0, 0, 310], [0, 330, 170], [0, 0, 1]])
+OAK = (4.985, 1.378, -1.6e-5, 1.9e-4, 0.0126, 5.356, 2.905, 0.162, 0.01, -0.002, 0.03, 0.001, 0.02, -0.01)
 CAMERAS = {
     "pinhole": Intrinsics(640, 360, K),
     "plumb_bob": Intrinsics(640, 360, K, "plumb_bob", np.array([-0.28, 0.09, 0.001, -0.0005, -0.012])),
     "rational_polynomial": Intrinsics(
         640, 360, K, "rational_polynomial", np.array([3.2, 1.1, 2e-4, 1e-4, 0.04, 3.5, 2.0, 0.25])
     ),
+    "thin prism and tilt": Intrinsics(640, 360, K, "rational_polynomial", np.array(OAK)),
     "equidistant": Intrinsics(640, 360, K, "equidistant", np.array([0.03, -0.01, 0.006, -0.002])),
 }
 

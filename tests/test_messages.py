@@ -256,6 +256,36 @@ def test_data_cut_to_a_few_bytes_are_survived(size: int) -> None:
         assert len(cloud.xyz) + cloud.dropped == 100
 
 
+@pytest.mark.parametrize("padding", [0, 8])
+@pytest.mark.parametrize("row_step", [16, 24 * 16, 25 * 16 + 1, 62 * 16, 100 * 16, 1 << 31])
+def test_the_length_of_the_data_decides_over_a_wrong_row_step(row_step: int, padding: int) -> None:
+    points = random_points(100)
+    msg = cloud_message(points, height=4, row_padding=padding)
+    msg.row_step = row_step
+    cloud = clouds.decode_cloud(msg, "/p", 0)
+    if padding and row_step <= 25 * 16:  # nothing tells of the padding
+        assert "up to" in cloud.doubt
+        return
+    np.testing.assert_array_equal(cloud.xyz[:, 1], points["y"])
+    assert cloud.dropped == 0
+    assert bool(cloud.doubt) == bool(padding)
+
+
+def test_a_stale_height_or_width_is_said_with_the_lost_points() -> None:
+    points = random_points(100)
+    flat = cloud_message(points)
+    flat.height = 0
+    assert len(clouds.decode_cloud(flat, "/p", 0).xyz) == 100
+    wide = cloud_message(points, height=4)
+    wide.width = 30
+    cloud = clouds.decode_cloud(wide, "/p", 0)
+    assert len(cloud.xyz) == 100 and cloud.dropped == 20
+    assert cloud.doubt.endswith("does not fit its 1600 bytes of data: 20 of 120 points are missing")
+    narrow = cloud_message(points)
+    narrow.width = 60
+    assert clouds.decode_cloud(narrow, "/p", 0).doubt.endswith("up to 40 points are not read")
+
+
 def test_row_step_and_count_that_old_drivers_leave_at_zero() -> None:
     msg = cloud_message(random_points(100), height=4)
     msg.row_step = 0
@@ -404,6 +434,13 @@ def test_yuv420_images_are_decoded(encoding: str, u: int) -> None:
     assert bgr.shape == (6, 8, 3) and np.abs(bgr - expected).max() <= 2
 
 
+@pytest.mark.parametrize("step", [0, 8, 100, 1000])
+def test_rows_without_padding_are_read_whatever_their_step(step: int) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
+    image = images.decode_image(image_message(pixels, "bgr8", step=step), "/image", 0)
+    np.testing.assert_array_equal(image.bgr, pixels)
+
+
 def test_bad_images_are_named() -> None:
     pixels = random_pixels(6, 8, 3)
     with pytest.raises(
@@ -415,7 +452,7 @@ def test_bad_images_are_named() -> None:
     ):
         images.decode_image(image_message(pixels, "bgr8", height=7), "/image", 0)
     with pytest.raises(MessageError, match="but step is 8"):
-        images.decode_image(image_message(pixels, "bgr8", step=8), "/image", 0)
+        images.decode_image(image_message(pixels, "bgr8", step=8, height=5), "/image", 0)
     with pytest.raises(MessageError, match="/image: the image is 0 x 6 and has no pixels"):
         images.decode_image(image_message(pixels, "bgr8", width=0), "/image", 0)
     with pytest.raises(MessageError, match="/image: a 7 x 6 image cannot be yuv422"):
@@ -604,8 +641,8 @@ def test_bad_camera_infos_are_named() -> None:
         match="/info: distortion model 'mei' is not supported; supported are equidistant, plumb_bob",
     ):
         camera_info.decode_camera_info(info_message("mei"), False, "/info")
-    with pytest.raises(MessageError, match=r"/info: more than 8 coefficients .* \(OpenCV's thin prism"):
-        camera_info.decode_camera_info(info_message("rational_polynomial", np.full(14, 0.01)), False, "/info")
+    with pytest.raises(MessageError, match=r"/info: more than 14 coefficients .* OpenCV has 14"):
+        camera_info.decode_camera_info(info_message("rational_polynomial", np.full(15, 0.01)), False, "/info")
     with pytest.raises(MessageError, match=r"/info: .* are no coefficients"):
         camera_info.decode_camera_info(info_message(d=[math.nan]), False, "/info")
     for model, d in [("equidistant", np.full(5, 0.01)), ("plumb_bob", [1e9]), ("plumb_bob", [-math.inf])]:
@@ -628,8 +665,8 @@ def test_bad_camera_infos_are_named() -> None:
 def test_any_number_of_coefficients_is_the_lens_that_it_states(model: str, count: int) -> None:
     """OpenCV takes 4, 5, 8, 12 or 14. Each further coefficient is zero, which is the same lens."""
     stated = np.zeros(count)
-    limit = 4 if model == "equidistant" else 8
-    stated[:limit] = np.linspace(0.01, 0.02, 8)[: min(count, limit)]
+    limit = 4 if model == "equidistant" else 14
+    stated[:limit] = np.linspace(0.01, 0.02, 14)[: min(count, limit)]
     intrinsics = camera_info.decode_camera_info(info_message(model, stated), rectified=False)
     points = np.array([[0.3, 0.1, 2.0], [-1.0, 0.5, 4.0]])
     full = np.zeros(limit)

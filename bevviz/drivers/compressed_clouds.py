@@ -31,7 +31,8 @@ def decompress(msg: Any) -> Cloud:
         return cloud
     # Not bytes(msg...): if the field is a number, bytes() would allocate that many zeros.
     data = memoryview(msg.compressed_data).tobytes()
-    size = int(msg.height) * max(int(msg.row_step), int(msg.width) * int(msg.point_step))
+    points, rows = int(msg.height) * int(msg.width) * int(msg.point_step), int(msg.height) * int(msg.row_step)
+    size = rows if points < rows <= MAX_MESSAGE else points  # The row_step may be that of the whole cloud.
     if form == "zstd":
         return unpack_cloud(msg, _unpack(zstd.ZstdDecompressor(), data, size))
     if form == "zlib":

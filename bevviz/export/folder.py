@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from bevviz.errors import UserError
+from bevviz.model import geometry
 from bevviz.model.frame import U8, Intrinsics
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -134,5 +135,5 @@ def rectify(bgr: U8, intrinsics: Intrinsics) -> U8:
     if intrinsics.distortion_model == "equidistant":
         straight = cv2.fisheye.undistortImage(bgr, intrinsics.K, intrinsics.D[:4], Knew=intrinsics.K)
     else:
-        straight = cv2.undistort(bgr, intrinsics.K, intrinsics.D[:8])
+        straight = cv2.undistort(bgr, intrinsics.K, geometry.coefficients(intrinsics))
     return np.asarray(straight, np.uint8)

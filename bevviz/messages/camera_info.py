@@ -20,7 +20,13 @@ _DISTORTION = {
     "kannala_brandt4": "equidistant",  # name in librealsense
 }
 
-OPENCV_COUNTS = (4, 5, 8)  # numbers of coefficients that OpenCV takes; of an equidistant lens the first
+OPENCV_COUNTS = (
+    4,
+    5,
+    8,
+    12,
+    14,
+)  # numbers of coefficients that OpenCV takes; of an equidistant lens the first
 MAX_NUMBER = 1e6  # Largest coefficient, and largest focal length or centre in pixels, of any real camera.
 
 
@@ -70,8 +76,9 @@ def _distortion(name: str, D: F64, topic: str) -> tuple[str, F64]:
     """Return the model and as many coefficients as OpenCV takes.
 
     Coefficients that are not stated are zero. That is the same lens: each is the factor of one term of a sum
-    (k of a power of the radius or of the angle, p1 and p2 of the tangential terms), and all tools state them
-    in this order: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of an equidistant lens.
+    (k of a power of the radius or of the angle, p1 and p2 of the tangential terms, s of the thin prism) or
+    an angle of the tilted sensor, and all tools state them in this order: k1, k2, p1, p2, k3, k4, k5, k6,
+    s1 to s4, two angles, or k1 to k4 of an equidistant lens.
 
     Raises:
         MessageError: the model is not supported, or these are no coefficients of it.
@@ -89,8 +96,8 @@ def _distortion(name: str, D: F64, topic: str) -> tuple[str, F64]:
     counts = OPENCV_COUNTS[:1] if model == "equidistant" else OPENCV_COUNTS
     if np.any(D[counts[-1] :]):
         raise MessageError(
-            f"{topic}: more than {counts[-1]} coefficients of the distortion model '{model}' (OpenCV's thin "
-            "prism and tilt) are not supported; calibrate without them"
+            f"{topic}: more than {counts[-1]} coefficients of the distortion model '{model}' are stated, and "
+            f"OpenCV has {counts[-1]}"
         )
     coefficients = np.zeros(next((count for count in counts if len(D) <= count), counts[-1]))
     coefficients[: len(D)] = D[: len(coefficients)]

@@ -79,8 +79,9 @@ def unpack_cloud(msg: Any, data: Any, count: int | None = None) -> Cloud:
             f"{len(data)} bytes of data"
         )
     layout = point_layout(msg.fields, msg.point_step, ">" if msg.is_bigendian else "<")
-    grid = _point_grid(np.frombuffer(data, np.uint8), layout, rows, columns, int(msg.row_step))
-    return make_cloud(stamp_ns(msg.header.stamp), msg.header.frame_id, grid, rows * columns)
+    grid, doubt = _point_grid(np.frombuffer(data, np.uint8), layout, rows, columns, int(msg.row_step))
+    cloud = make_cloud(stamp_ns(msg.header.stamp), msg.header.frame_id, grid, rows * columns)
+    return replace(cloud, doubt=doubt)
 
 
 def make_cloud(stamp: int, frame_id: str, points: NDArray[np.void], announced: int = 0) -> Cloud:
@@ -225,13 +226,42 @@ def point_layout(fields: Iterable[Any], step: int, order: str = "<") -> np.dtype
 
 def _point_grid(
     data: U8, layout: np.dtype[np.void], rows: int, columns: int, row_step: int
-) -> NDArray[np.void]:
-    """Return a (rows, columns) view of the points that the data hold completely."""
-    step = layout.itemsize
-    row_bytes = columns * step
-    row_step = max(row_step, row_bytes)  # some drivers send 0
-    if row_step == row_bytes or rows == 1:
-        rows, columns = 1, min(rows * columns, data.size // step)
+) -> tuple[NDArray[np.void], str]:
+    """Return a view of the points that the data hold completely, and what does not fit the data's length.
+
+    Many drivers send a wrong ``row_step`` or ``height``: the data's length decides.
+    """
+    size, step = data.size, layout.itemsize
+    header = f"{columns} x {rows} points of {step} bytes and a row_step of {row_step}"
+    if not rows and size == columns * step:
+        rows = 1
+    stated, row_bytes = rows * columns, columns * step
+    pitch = _row_pitch(size, rows, row_bytes, row_step)
+    surplus = (size - rows * pitch) // step
+    guessed = pitch not in (row_bytes, row_step)
+    if pitch == row_bytes:
+        rows, columns = 1, min(stated, size // step)
     else:
-        rows = min(rows, max(data.size - row_bytes, -row_step) // row_step + 1)
-    return np.ndarray((rows, columns), layout, data, strides=(row_step, step))
+        rows = min(rows, max(size - row_bytes, -pitch) // pitch + 1)
+    if lost := stated - rows * columns:
+        outcome = f"{lost} of {stated} points are missing"
+    elif surplus > 0:
+        outcome = f"up to {surplus} points are not read"
+    elif guessed:
+        outcome = f"rows of {pitch} bytes are read"
+    else:
+        return np.ndarray((rows, columns), layout, data, strides=(pitch, step)), ""
+    doubt = f"a cloud states {header}, which does not fit its {size} bytes of data: {outcome}"
+    return np.ndarray((rows, columns), layout, data, strides=(pitch, step)), doubt
+
+
+def _row_pitch(size: int, rows: int, row_bytes: int, row_step: int) -> int:
+    """Return the bytes from the start of a row to that of the next, by the length of the data."""
+    if rows <= 1 or row_step <= row_bytes or size == rows * row_bytes:
+        return row_bytes
+    if size in (rows * row_step, (rows - 1) * row_step + row_bytes):
+        return row_step
+    if size > rows * row_bytes and not size % rows:
+        return size // rows
+    # The data are cut or too long. A step that is longer than the cloud is wrong all the same.
+    return row_step if row_step < rows * row_bytes else row_bytes

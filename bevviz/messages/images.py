@@ -75,6 +75,8 @@ def decode_image(msg: Any, topic: str, received: int) -> Image:
     scalar = np.dtype((">" if msg.is_bigendian else "<") + encoding.scalar)
     rows, pixel_bytes = int(height * encoding.rows), encoding.channels * scalar.itemsize
     step = int(msg.step) or width * pixel_bytes
+    if data.size == rows * width * pixel_bytes:  # Rows without padding: the stated step is wrong.
+        step = width * pixel_bytes
     needed = (rows - 1) * step + width * pixel_bytes
     if step < width * pixel_bytes or data.size < needed:
         raise MessageError(

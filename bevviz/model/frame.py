@@ -50,6 +50,7 @@ class Cloud:
     received: int = 0
     dropped: int = 0  # points of the message that are NaN, infinite, beyond any sensor's range or (0, 0, 0)
     name: str = ""  # entity name of the LiDAR
+    doubt: str = ""  # what of the message does not fit together, as a sentence without the topic
 
 
 @dataclass(frozen=True, slots=True)

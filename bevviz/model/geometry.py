@@ -120,8 +120,8 @@ def yaw(a_from_b: F64) -> float:
 def project(points: FloatArray, intrinsics: Intrinsics) -> tuple[F32, F32]:
     """Project points of the optical frame into the image.
 
-    Models as in OpenCV and ROS: plumb_bob (Brown-Conrady), rational_polynomial, equidistant
-    (Kannala-Brandt 2006).
+    Models as in OpenCV and ROS: plumb_bob (Brown-Conrady), rational_polynomial with OpenCV's thin prism and
+    tilted sensor, equidistant (Kannala-Brandt 2006).
 
     Args:
         points: (N, 3) metres in the optical frame.
@@ -162,7 +162,7 @@ def rays(uv: FloatArray, intrinsics: Intrinsics) -> F64:
     rays = np.ones((len(points), 3))
     if len(points) == 0:
         return rays
-    d, criteria = _coefficients(intrinsics), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    d, criteria = coefficients(intrinsics), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     if intrinsics.distortion_model in FISHEYE:
         flat = cv2.fisheye.undistortPoints(points, intrinsics.K, d[:4], criteria=criteria)
     else:
@@ -186,20 +186,20 @@ def frustum(
     return np.asarray(directions * depths[:, :, None, None], np.float32).reshape(-1, 8, 3)
 
 
-def _coefficients(intrinsics: Intrinsics) -> F64:
-    """Return the (8,) distortion coefficients, zero if not stated."""
-    d = np.zeros(8)
-    stated = np.ravel(intrinsics.D)[:8]
+def coefficients(intrinsics: Intrinsics) -> F64:
+    """Return the (14,) distortion coefficients in the order of OpenCV, zero if not stated."""
+    d = np.zeros(14)
+    stated = np.ravel(intrinsics.D)[:14]
     d[: len(stated)] = stated
     return d
 
 
 def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[FloatArray, FloatArray]:
     """Distort normalised image coordinates. Return NaN where the polynomial folds over."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(intrinsics).tolist()
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, *tilt = coefficients(intrinsics).tolist()
     r2 = x * x + y * y
     if intrinsics.distortion_model in FISHEYE:
-        k1, k2, k3, k4 = _coefficients(intrinsics)[:4].tolist()
+        k1, k2, k3, k4 = coefficients(intrinsics)[:4].tolist()
         r = np.sqrt(r2)
         theta = np.arctan(r)
         t2 = theta * theta
@@ -213,10 +213,21 @@ def _distort(x: FloatArray, y: FloatArray, intrinsics: Intrinsics) -> tuple[Floa
     slope = numerator * denominator + Polynomial([0, 2]) * turns
     r2 = np.where(r2 < min(_first_root(slope), _first_root(denominator), WIDEST), r2, np.nan)
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    if s1 or s2 or s3 or s4:  # thin prism
+        u, v = u + r2 * (s1 + r2 * s2), v + r2 * (s3 + r2 * s4)
+    return _tilted(u, v, *tilt) if any(tilt) else (u, v)
+
+
+def _tilted(u: FloatArray, v: FloatArray, about_x: float, about_y: float) -> tuple[FloatArray, FloatArray]:
+    """Project normalised image coordinates onto a sensor that is tilted by two angles, as OpenCV does."""
+    cx, sx, cy, sy = np.cos(about_x), np.sin(about_x), np.cos(about_y), np.sin(about_y)
+    turned = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]]) @ [[1, 0, 0], [0, cx, sx], [0, -sx, cx]]
+    onto = [[turned[2, 2], 0, -turned[0, 2]], [0, turned[2, 2], -turned[1, 2]], [0, 0, 1]] @ turned
+    (a, b, c), (d, e, f), (g, h, i) = onto.tolist()
+    scale = 1 / (g * u + h * v + i)
+    return scale * (a * u + b * v + c), scale * (d * u + e * v + f)
 
 
 def _first_root(polynomial: Polynomial) -> float:

@@ -238,7 +238,7 @@ def undistort(image: U8, intrinsics: Intrinsics) -> U8:
         return np.asarray(
             cv2.fisheye.undistortImage(image, intrinsics.K, intrinsics.D[:4], Knew=intrinsics.K)
         )
-    return np.asarray(cv2.undistort(image, intrinsics.K, intrinsics.D))
+    return np.asarray(cv2.undistort(image, intrinsics.K, geometry.coefficients(intrinsics)))
 
 
 def shrink(image: U8, K: F64, pixels: int) -> tuple[U8, F64]:

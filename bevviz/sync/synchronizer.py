@@ -183,6 +183,7 @@ class Synchronizer:
             changed = f"{cloud.topic}: its frame_id changed from '{former}' to '{frame}'"
             self.report.oddities.setdefault(f"{cloud.topic} frame_id", changed)
         self._lidar_frames[cloud.topic] = frame
+        self._note_layout(cloud)
         self._check_units(cloud)
         self.report.clouds += 1
         if cloud.topic in self._partners:
@@ -260,6 +261,7 @@ class Synchronizer:
 
     def add_robot_cloud(self, cloud: Cloud) -> None:
         """Add the robot's points without the ground."""
+        self._note_layout(cloud)
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
         self._robot_clouds[cloud.topic].add(stamp, replace(cloud, stamp=stamp))
 
@@ -324,6 +326,10 @@ class Synchronizer:
             self.report.unstamped[topic] += 1
             return received
         return self.clocks.stamp(topic, stamp, received)
+
+    def _note_layout(self, cloud: Cloud) -> None:
+        if cloud.doubt:
+            self.report.oddities.setdefault(f"{cloud.topic} layout", f"{cloud.topic}: {cloud.doubt}")
 
     def _check_units(self, cloud: Cloud) -> None:
         """Warn of coordinates in millimetres or far from the origin of a map, which no stage reaches."""
