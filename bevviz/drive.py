@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from bevviz.checks import InputChecks
 from bevviz.config import Config, ParameterChange, Preset, changed_config, load
 from bevviz.config.trust import USER
 from bevviz.errors import UserError
@@ -49,6 +50,7 @@ class Drive(Closable, Tabular):
     Attributes:
         frames: the source.
         session: session for single frames. A run over the whole drive has a session of its own.
+        checks: findings about the input, from the single frames or the last run.
 
     Raises:
         UserError: the detector's model or a user-defined function cannot be used.
@@ -56,6 +58,7 @@ class Drive(Closable, Tabular):
 
     def __init__(self, frames: FrameSource, config: Config, notes: Sequence[str] = ()) -> None:
         self.frames, self.session = frames, Session(config)
+        self.checks = InputChecks(frames, config)
         self._notes = list(notes)
         self._results: OrderedDict[tuple[int, int], FrameResult] = OrderedDict()
         self._poses: dict[int, F64] = {}  # estimated by runs over the drive, by stamp
@@ -86,7 +89,7 @@ class Drive(Closable, Tabular):
     @property
     def warnings(self) -> list[str]:
         """Losses and irregularities so far, one sentence each."""
-        return [*map(python_words, self._notes), *map(python_words, self.frames.warnings)]
+        return [*map(python_words, self._notes), *map(python_words, self.checks.warnings)]
 
     @property
     def times(self) -> F64:
@@ -140,6 +143,7 @@ class Drive(Closable, Tabular):
         key = number, id(self.config)
         if key not in self._results:
             self._results[key] = self.session.run_single(self.raw(number))
+            self.checks.observe(self._results[key])
             while len(self._results) > MAX_RESULTS:
                 self._results.popitem(last=False)
         self._results.move_to_end(key)
@@ -286,7 +290,9 @@ class Drive(Closable, Tabular):
 
     def __iter__(self) -> Iterator[FrameResult]:
         """Yield the result of every frame in order, with tracks and anomalies. Results are computed ahead."""
-        return iterate_results(self.frames, self.new_session())
+        for result in iterate_results(self.frames, self.new_session()):
+            self.checks.observe(result)
+            yield result
 
     def new_session(self) -> Session:
         """Return a session for a run over the whole drive. It has its own tracks and shares the networks.
@@ -295,11 +301,13 @@ class Drive(Closable, Tabular):
         """
         self._results.clear()
         self._poses.clear()
+        self.checks = InputChecks(self.frames, self.config)
         return Session(self.config, loader=self.session.loader, odometry=Odometry(self._poses))
 
     def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
         """Run every frame in order and pass the results to the observers, see ``bevviz.pipeline.run.run``."""
-        return run(self.frames, self.new_session(), observers)
+        session = self.new_session()
+        return run(self.frames, session, [*observers, self.checks])
 
     @errors_about_arguments()
     def evaluate(

@@ -270,7 +270,7 @@ def test_a_lasting_anomaly_is_one_and_is_held() -> None:
     assert [index for index, _, _ in drive.said] == [1]
     drive.frame(camera=late)
     assert [index for index, _, _ in drive.said] == [1, 10]
-    assert str(drive.summary) == "2 sync (first at 0.1 s)"
+    assert str(drive.summary) == "2 sync (first: zed at 0.1 s)"
 
 
 def test_news_is_told_once_if_its_first_frame_was_skipped() -> None:

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from bevviz.bags.source import BagSource
+from bevviz.checks import InputChecks
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import WIDTH, BagInfo, describe_bag, render_bag_contents, render_bag_info
-from bevviz.pipeline.sensor_check import SensorCheck
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.detector import DEMO_MODEL
 from tests.support import bags
+from tests.support.small_bags import frozen_after
 
 
 def write(path: Path, *without: str, form: str = "mcap") -> Path:
@@ -156,18 +157,6 @@ def test_a_cut_bag_is_described_with_the_loss(tmp_path: Path) -> None:
     assert re.search(r"read \d+ messages, \d+ of them from the incomplete last", " ".join(text.split()))
 
 
-def frozen_after(seconds: float, path: Path) -> Path:
-    """Write 12 s of a drive whose camera repeats one image from a moment on."""
-    messages, image = bags.Messages(), np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
-    items = [
-        item._replace(message=messages.image(item.received, image))
-        if item.topic == bags.IMAGE and item.received >= bags.START + seconds * 1e9
-        else item
-        for item in bags.small_items(messages, scans=120)
-    ]
-    return bags.write(path, items, messages)
-
-
 def test_a_frozen_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(frozen_after(2.0, tmp_path / "drive"))
     assert main(["info", path]) == 0
@@ -190,7 +179,9 @@ def test_the_contents_come_before_the_sensors_are_checked(
 ) -> None:
     """A long drive is described at once."""
     checked: list[int] = []
-    monkeypatch.setattr(SensorCheck, "add", lambda check, frame: checked.append(frame.index))
+    monkeypatch.setattr(
+        InputChecks, "observe_frame", lambda checks, frame, follows: checked.append(frame.index)
+    )
     told: list[BagInfo] = []
 
     def tell(info: BagInfo) -> None:

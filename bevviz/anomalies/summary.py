@@ -28,21 +28,22 @@ class AnomalySummary(Observer[FrameResult]):
         self._onsets = Onsets()
         self._start: int | None = None
         self._count: Counter[str] = Counter()
-        self._first: dict[str, int] = {}
+        self._first: dict[str, tuple[str, int]] = {}  # kind -> subject, nanoseconds from the start
 
     def observe(self, result: FrameResult) -> None:
         """Count the anomalies that begin in this frame."""
         self._start = result.frame.stamp if self._start is None else self._start
         for anomaly in self._onsets.of(result.anomalies):
             self._count[anomaly.kind] += 1
-            self._first.setdefault(anomaly.kind, anomaly.since - self._start)
+            self._first.setdefault(anomaly.kind, (anomaly.subject, anomaly.since - self._start))
 
     def __str__(self) -> str:
         """Return one line, most frequent kind first. Times are in seconds from the first frame."""
-        kinds = [
-            f"{count} {kind.replace('_', ' ')} (first at {self._first[kind] * 1e-9:.1f} s)"
-            for kind, count in self._count.most_common()
-        ]
+        kinds = []
+        for kind, count in self._count.most_common():
+            subject, time = self._first[kind]
+            first = f"{'first: ' if count > 1 else ''}{subject} at {1e-9 * time:.1f} s"
+            kinds.append(f"{count} {kind.replace('_', ' ')} ({first})")
         return ", ".join(kinds) or "none"
 
 

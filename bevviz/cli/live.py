@@ -247,7 +247,7 @@ def _watch_robot(
             control.save = orders.save = live.save
             orders.change = live.update
             if diagnostics is not None:
-                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, source.warnings))
+                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.checks.warnings))
 
             def show(config: Config) -> None:
                 orders.show(config)
@@ -321,7 +321,7 @@ def _watch(
         if comparison.late_images:
             late = f"{comparison.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")
-    warn(source.warnings)
+    warn(live.checks.warnings)
     written_paths = [
         saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths
     ]

@@ -60,9 +60,11 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         print_hints(drive.scene, drive.config)
         recorders.append(Recorder(recording, drive.config, session.stages.provider))
-        return [*recorders, MarkRecorder(recording), anomalies, failures]
+        return [*recorders, MarkRecorder(recording), anomalies, failures, drive.checks]
 
     def finish() -> None:
+        printed = drive.frames.warnings
+        warn(text for text in drive.checks.warnings if text not in printed)
         warn(failures.warnings)
         warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")

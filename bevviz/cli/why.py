@@ -70,6 +70,7 @@ class WhyOptions:
 @garbage_collection_off()
 def _why(options: WhyOptions) -> int:
     from bevviz.bags.source import BagSource
+    from bevviz.checks import InputChecks
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
     from bevviz.why import FrameExplainer
@@ -82,7 +83,8 @@ def _why(options: WhyOptions) -> int:
         session = Session(config, loader=loader)
         row = options.frame.at_frame
         frame = next(iter(source), None) if row is None else source.frame(row)
-        warn(source.warnings)
+        checks = InputChecks(source, config)
+        warn(early := checks.warnings)
         if frame is None:
             option = f"--at {at}" if row is None else f"--at-frame {row}"
             raise UserError(f"{option}: the scan there cannot be read")
@@ -96,6 +98,8 @@ def _why(options: WhyOptions) -> int:
             return 0
         outputs = options.output
         result = session.run(frame) if outputs else session.run_explained(frame)
+        checks.observe(result)
+        warn(text for text in checks.warnings if text not in early)
         questioner = FrameExplainer(result, loader, session.stages.class_names)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
         answers = questioner.explain(selection, subject.limit, bar, everything=subject.all)

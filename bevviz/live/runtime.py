@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bevviz.checks import InputChecks
 from bevviz.config import Config
 from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
 from bevviz.errors import UserError
@@ -105,6 +106,7 @@ class Live:
         self.frames = 0  # frames logged so far
         self._source, self._settings = ThinnedSource(source, lambda: self.config), settings
         self._on_result = on_result
+        self.checks = InputChecks(source, settings.config)
         self._shown = settings.config  # the configuration last passed to ``on_change``
         self._changing = threading.Lock()
         self._over = threading.Event()
@@ -245,7 +247,7 @@ class Live:
                 self._check()
                 on_tick(self.status)
 
-        observers: list[Observer[FrameResult]] = [LoggingObserver(self)]
+        observers: list[Observer[FrameResult]] = [LoggingObserver(self), self.checks]
         if self._on_result is not None:
             observers.append(PublishingObserver(self._on_result, self.notes))
         with ExitStack() as stack:

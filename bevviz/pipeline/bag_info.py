@@ -15,6 +15,7 @@ from bevviz.bags.bag import Recording
 from bevviz.bags.reader import megabytes
 from bevviz.bags.remote import address_of
 from bevviz.bags.source import SECOND, BagSource, iso
+from bevviz.checks import InputChecks
 from bevviz.config import (
     Config,
     DetectorConfig,
@@ -27,15 +28,17 @@ from bevviz.errors import UserError, printable
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
-from bevviz.pipeline.sensor_check import SensorCheck, first_frames
 from bevviz.recording.provenance import model_path
-from bevviz.support import table
+from bevviz.support import progress, table
 from bevviz.support.json_form import LEFT_OUT, json_form
+from bevviz.support.numba_kernel import thread_clock
 
 if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import Stages
 
 WIDTH = 100
+FIRST_FRAMES = 100  # frames on which the input is checked without an option
+FIRST_SECONDS = 2.0  # seconds after which that check ends
 TRIAL_SCAN = 5  # Number of the scan to try. In earlier scans a camera or a transform may still be missing.
 MAX_TIMED_MESSAGES = (
     2_000_000  # Most messages for which times are collected. For more, this would take seconds.
@@ -186,19 +189,35 @@ def describe_bag(
             return info
     with source:
         roles = source.roles
-        frames, check = first_frames(source, TRIAL_SCAN, all_frames), SensorCheck(config)
+        frames, checks = first_frames(source, TRIAL_SCAN, all_frames), InputChecks(source, config)
         first = list(islice(frames, TRIAL_SCAN))
         frame = first[-1] if first else None
         info = _describe(source.recording, roles, config, find_missing(roles, frame, config), frame, source)
         on_contents(info)
-        if not source.recording.single_frames:
-            for read in chain(first, frames):
-                check.add(read)
-        return replace(
-            info,
-            missing=(*source.large_losses(), *info.missing),
-            warnings=(*source.recording.warnings, *source.doubts, *check.warnings),
-        )
+        for read in chain(first, frames):
+            checks.observe_frame(read, follows=not source.recording.single_frames)
+        missing = (*source.large_losses(), *info.missing)
+        return replace(info, missing=missing, warnings=tuple(checks.warnings))
+
+
+def first_frames(source: BagSource, least: int, whole: bool) -> Iterator[Frame]:
+    """Yield the frames on which the input is checked.
+
+    Args:
+        source: an open drive.
+        least: frames that are yielded at any rate. Unrelated single frames are not compared, so no more come.
+        whole: yield all frames.
+    """
+    if whole:
+        yield from progress.bar(source, total=source.total, unit="scan", desc="check sensors")
+        return
+    start = thread_clock()
+    for count, frame in enumerate(source, 1):
+        yield frame
+        if count >= least and (
+            count >= FIRST_FRAMES or source.recording.single_frames or thread_clock() - start > FIRST_SECONDS
+        ):
+            return
 
 
 def _describe(

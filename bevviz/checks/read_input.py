@@ -1,0 +1,39 @@
+"""Content of the input that the checks judge: the source, and a sample of what was read from it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from bevviz.bags.source import BagSource
+from bevviz.config import Config
+from bevviz.model.protocols import Items
+from bevviz.model.results import Anomaly
+
+
+@dataclass(slots=True)
+class SensorFaults:
+    """Faults of sensors, clocks and transforms, by kind and subject."""
+
+    first: dict[tuple[str, str], Anomaly] = field(default_factory=dict)
+    count: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+
+@dataclass(slots=True)
+class ReadInput:
+    """What was read of a drive or from a robot so far.
+
+    Attributes:
+        source: the frames. Its ``warnings`` are the oddities that it counted.
+        config: configuration of the run.
+        faults: faults of the sensors in the frames.
+    """
+
+    source: Items[object]
+    config: Config
+    faults: SensorFaults = field(default_factory=SensorFaults)
+
+    @property
+    def bag(self) -> BagSource | None:
+        """The recorded drive; None: the frames are a robot's or the synthetic drive's."""
+        return self.source if isinstance(self.source, BagSource) else None
