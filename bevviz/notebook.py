@@ -14,7 +14,8 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.recording import blueprints, entities
-from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.addresses import RowCache
+from bevviz.recording.frame_logger import FrameLogger, logged_rows
 from bevviz.recording.recorder import Recorder
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
@@ -138,6 +139,7 @@ class NotebookViewer(Recorder):
         self._marker = FrameLogger(recording, config, scene)
         self._frames = _FrameTimes()
         self._tracks: dict[int, Tracks] = {}
+        self._rows = RowCache()
         self._timeline, self._time = entities.STAMP, 0.0
         self._click: _Click | None = None
         self.viewer.on_event(self._on_event)
@@ -147,6 +149,7 @@ class NotebookViewer(Recorder):
         """Log a frame and store its times and tracks."""
         super().observe(result)
         self._frames.add(result)
+        self._rows.put(result.frame.index, self.logger.rows)
         if result.tracks is not None:
             no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)
             self._tracks[result.frame.index] = replace(result.tracks, trail=no_trail)
@@ -170,9 +173,8 @@ class NotebookViewer(Recorder):
         click = self._click
         if click is None:
             return None
-        picked = select_click(
-            result, self._tracks.get(click.frame), click.path, click.instance, click.position
-        )
+        rows, tracks = self._rows.get(click.frame) or logged_rows(result), self._tracks.get(click.frame)
+        picked = select_click(result, tracks, rows, click.path, click.instance, click.position)
         return Selected(click.frame, picked, click.path, _place(result, picked))
 
     def mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:

@@ -21,6 +21,7 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.pipeline.session import Session
 from bevviz.recording import blueprints, entities
+from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
 from bevviz.workbench.buffers import RecordingBuffer
@@ -58,50 +59,53 @@ def test_rows_of_what_is_drawn_are_rows_of_the_result(result: FrameResult) -> No
     weak = [row for row, is_kept in enumerate(found.kept) if not is_kept]
     aside = [row for row, is_kept in enumerate(result.clusters.kept) if not is_kept]
     assert kept and weak and aside and len(result.objects)
-    assert select_click(result, None, entities.DETECTIONS.path(name), len(kept) - 1, ()) == Selection(
+    rows = logged_rows(result)
+    assert select_click(result, None, rows, entities.DETECTIONS.path(name), len(kept) - 1, ()) == Selection(
         detection=kept[-1], camera=name
     )
-    assert select_click(result, None, entities.WEAK.path(name), 0, ()) == Selection(
+    assert select_click(result, None, rows, entities.WEAK.path(name), 0, ()) == Selection(
         detection=weak[0], camera=name
     )
-    assert select_click(result, None, entities.FUSED, 0, (1, 2, 3)) == Selection(object=0)
-    assert select_click(result, None, entities.OUTLINES.path(entities.FUSED), 0, (1, 2, 3)) == Selection(
-        object=0
-    )
+    assert select_click(result, None, rows, entities.FUSED, 0, (1, 2, 3)) == Selection(object=0)
     assert select_click(
-        result, None, entities.NAMES.path(entities.DETECTIONS.path(name)), 0, ()
-    ) == select_click(result, None, entities.DETECTIONS.path(name), 0, ())
-    assert select_click(result, None, entities.TRUTH, 2, ()) == Selection(truth=2)
+        result, None, rows, entities.OUTLINES.path(entities.FUSED), 0, (1, 2, 3)
+    ) == Selection(object=0)
+    assert select_click(
+        result, None, rows, entities.OUTLINES.path(entities.DETECTIONS.path(name)), 0, ()
+    ) == select_click(result, None, rows, entities.DETECTIONS.path(name), 0, ())
+    assert select_click(result, None, rows, entities.TRUTH, 2, ()) == Selection(truth=2)
     lidar = result.frame.lidar
-    assert select_click(result, None, entities.SET_ASIDE.path(lidar), 0, ()) == Selection(cluster=aside[0])
-    assert select_click(result, None, entities.IMAGE.path(name), None, (10.5, 20.5)) == Selection(
+    assert select_click(result, None, rows, entities.SET_ASIDE.path(lidar), 0, ()) == Selection(
+        cluster=aside[0]
+    )
+    assert select_click(result, None, rows, entities.IMAGE.path(name), None, (10.5, 20.5)) == Selection(
         box=(10.0, 20.0), camera=name
     )
     pose, intrinsics = camera.camera.camera_from_points, camera.camera.intrinsics
     assert pose is not None and intrinsics is not None
     shown = geometry.apply(geometry.inverse(pose), np.array([[0.1, 0.05, 0.5]]))  # an image in the 3D view
     pixel = intrinsics.K @ (0.2, 0.1, 1)
-    in_image = select_click(result, None, entities.IMAGE.path(name), None, shown[0].tolist())
+    in_image = select_click(result, None, rows, entities.IMAGE.path(name), None, shown[0].tolist())
     assert in_image is not None and in_image.box == pytest.approx(pixel[:2], abs=0.01)
     below = geometry.apply(geometry.inverse(pose), np.array([[0.0, 1.0, 0.5]]))  # a line of its frustum
-    assert select_click(result, None, entities.SENSOR.path(name), None, below[0].tolist()) is None
-    assert select_click(result, None, entities.BEV, None, (12.7, 3.2)) == Selection(cell=(3, 12))
+    assert select_click(result, None, rows, entities.SENSOR.path(name), None, below[0].tolist()) is None
+    assert select_click(result, None, rows, entities.BEV, None, (12.7, 3.2)) == Selection(cell=(3, 12))
     point = result.frame.points[5]
-    assert select_click(result, None, entities.POINTS.path(lidar), 5, ()) == Selection(
+    assert select_click(result, None, rows, entities.POINTS.path(lidar), 5, ()) == Selection(
         point=tuple(map(float, point))
     )
-    in_space = select_click(result, None, entities.OBSTACLES.path(lidar), None, tuple(point.tolist()))
+    in_space = select_click(result, None, rows, entities.OBSTACLES.path(lidar), None, tuple(point.tolist()))
     assert in_space is not None
     assert in_space.place == pytest.approx(point, abs=1e-4)
     measured = result.objects.measured
     assert measured is not None
     drawn = [row for row, one in enumerate(measured.size != result.objects.boxes.size) if one.any()]
     last = len(drawn) - 1
-    assert select_click(result, None, entities.MEASURED, last, ()) == Selection(object=drawn[last])
+    assert select_click(result, None, rows, entities.MEASURED, last, ()) == Selection(object=drawn[last])
     center = result.objects.boxes.center[0].tolist()
-    assert select_click(result, None, "/world/anything", None, center) == Selection(object=0)
-    assert select_click(result, None, entities.FUSED, 10_000, ()) is None
-    assert select_click(result, None, "/health/time_ms/total", None, ()) is None
+    assert select_click(result, None, rows, "/world/anything", None, center) == Selection(object=0)
+    assert select_click(result, None, rows, entities.FUSED, 10_000, ()) is None
+    assert select_click(result, None, rows, "/health/time_ms/total", None, ()) is None
 
 
 @pytest.mark.parametrize(

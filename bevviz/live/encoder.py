@@ -23,6 +23,7 @@ from bevviz.live.robot_comparison import ComparedFrame, RobotComparison
 from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
+from bevviz.recording.addresses import RowCache
 from bevviz.recording.cloud import ColoredPoints
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.support.contexts import Closable
@@ -112,6 +113,9 @@ class Encoder:
         clock: returns seconds, for tests.
         network: execution provider of the detector's network, stored in recordings.
 
+    Attributes:
+        rows: rows behind the entities of the newest frames, by number of the frame.
+
     Raises:
         UserError: there is no such blueprint.
     """
@@ -135,6 +139,7 @@ class Encoder:
         self.application = blueprints.application_id(blueprint, scene, config)
         self._stream = _Stream(self.application)
         self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
+        self.rows = RowCache()
         self._whole = float("-inf")
         self._lock = threading.Lock()
         self.recording_id: str = self._stream.recording.get_recording_id() or ""
@@ -173,6 +178,7 @@ class Encoder:
             self._logger.limit = result.config.live.viewer_points
             self._logger.log(result, health, notes, late, states)
             self._logger.limit = None
+            self.rows.put(result.frame.index, self._logger.rows)
             self._log_differences(compared, whole)
             data, thinned = self._stream.read(), None
             if self._logger.clouds:

@@ -15,6 +15,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
 from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks
 from bevviz.recording import entities
+from bevviz.recording.addresses import Rows
 from bevviz.recording.entities import TRACK_COLORS, ClassId
 from bevviz.recording.labels import choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, callouts, draw
@@ -54,6 +55,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         is_unusual |= opinions.opinion == Opinion.CONTRADICTED
     colors = [class_color(name) for name in objects.names]
     is_named = choose_named_in_3d(objects.boxes.center, is_unusual) & is_unusual
+    addresses = Rows("object", range(len(objects)))
     draw(
         to,
         Layer(
@@ -74,6 +76,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
                 **values,
             },
             frame=transform(result.frame.pose),
+            rows=addresses,
         ),
         *callouts(
             entities.FUSED,
@@ -84,6 +87,7 @@ def log_objects(to: Writer, result: FrameResult) -> None:
             ],
             shown(_with_doubts(labels, result), is_named),
             outline_colors(result, colors),
+            rows=addresses,
         ),
     )
     if objects.measured is not None:
@@ -91,7 +95,8 @@ def log_objects(to: Writer, result: FrameResult) -> None:
         measured, looks = objects.measured.chosen(rows), [colors[row] for row in rows]
         # The entity above has the pose.
         style, texts = Style(width=1.0, labels=False), [labels[row] for row in rows]
-        draw(to, Layer(entities.MEASURED, measured, style, labels=texts, colors=looks))
+        addresses = Rows("object", rows)
+        draw(to, Layer(entities.MEASURED, measured, style, labels=texts, colors=looks, rows=addresses))
 
 
 def _with_doubts(labels: list[str], result: FrameResult) -> list[str]:
@@ -134,15 +139,23 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
         boxes = tracks.boxes.chosen(rows[is_drawn])
         labels = [text(tracks, row) for row in rows[is_drawn].tolist()]
         style = Style(width=0.75, labels=False, wire=True)
-        draw(to, Layer(path, boxes, style, labels=labels, class_ids=colors[is_drawn]))
+        addresses = Rows("track", tracks.id[rows[is_drawn]])
+        draw(to, Layer(path, boxes, style, labels=labels, class_ids=colors[is_drawn], rows=addresses))
     points_from_world = geometry.inverse(frame.pose)
     trails = [positions[np.isfinite(positions[:, 0])] for positions in tracks.trail[rows]]
     above = [bev_pixels(config, points_from_world, trail) for trail in trails]
     rims = ground_outlines(geometry.corners(tracks.boxes)[rows])
+    addresses = Rows("track", tracks.id[rows])
     draw(
         to,
-        Layer(entities.TRAILS, trails, Style(width=1.5), class_ids=colors),
-        Layer(entities.OVERLAY.path("trails"), above, Style(width=1.5, order=20.0), class_ids=colors),
+        Layer(entities.TRAILS, trails, Style(width=1.5), class_ids=colors, rows=addresses),
+        Layer(
+            entities.OVERLAY.path("trails"),
+            above,
+            Style(width=1.5, order=20.0),
+            class_ids=colors,
+            rows=addresses,
+        ),
         Layer(
             entities.OVERLAY.path("tracks"),
             bev_pixels(config, points_from_world, rims),
@@ -150,6 +163,7 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
             Style(width=1.0, labels=False, order=20.0),
             labels=[track_label(tracks, row) for row in rows.tolist()],
             class_ids=colors,
+            rows=addresses,
         ),
     )
 
@@ -240,7 +254,7 @@ def log_truth(to: Writer, frame: Frame, config: BevConfig) -> None:
     """Log the ground truth boxes in 3D and over the bird's-eye image."""
     if frame.truth is not None:
         path = entities.OVERLAY.path("ground_truth")
-        draw(to, *_labelled_layers(frame.truth, entities.TRUTH, path, frame.pose, config, _TRUTH))
+        draw(to, *_labelled_layers(frame.truth, entities.TRUTH, path, frame.pose, config, _TRUTH, "truth"))
 
 
 def log_robot(to: Writer, frame: Frame, config: BevConfig) -> None:
@@ -280,15 +294,37 @@ def _robot_layers(boxes: LabelledBoxes3D | LabelledBoxes2D, pose: F64, config: B
 
 
 def _labelled_layers(
-    labelled: LabelledBoxes3D, path: str, overlay: str, pose: F64, config: BevConfig, style: Style
+    labelled: LabelledBoxes3D,
+    path: str,
+    overlay: str,
+    pose: F64,
+    config: BevConfig,
+    style: Style,
+    table: str = "",
 ) -> list[Layer]:
-    """Return the layers of boxes in space, and of the outlines of those in the bird's-eye view."""
+    """Return the layers of boxes in space, and of the outlines of those in the bird's-eye view.
+
+    ``table``: table of the frame that has the boxes; empty: none.
+    """
     labels, world_from_boxes = scored(labelled.labels, labelled.scores), _pose(labelled)
     rows, outlines = bev_outlines(config, labelled.boxes, geometry.inverse(pose) @ world_from_boxes)
     above = Style(style.color, 0.75, labels=False, order=10.0)
     return [
-        Layer(path, labelled.boxes, style, labels=labels, frame=transform(world_from_boxes)),
-        Layer(overlay, outlines, above, labels=[labelled.labels[row] for row in rows]),
+        Layer(
+            path,
+            labelled.boxes,
+            style,
+            labels=labels,
+            frame=transform(world_from_boxes),
+            rows=Rows(table, range(len(labelled.boxes))) if table else None,
+        ),
+        Layer(
+            overlay,
+            outlines,
+            above,
+            labels=[labelled.labels[row] for row in rows],
+            rows=Rows(table, rows) if table else None,
+        ),
     ]
 
 

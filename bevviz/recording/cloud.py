@@ -17,6 +17,7 @@ from bevviz.config.sections import Quantity
 from bevviz.model.frame import F32, I32, I64, RING_FIELDS, Bool, Frame
 from bevviz.model.results import Clusters, ClusterState, FrameResult, Tracks
 from bevviz.recording import entities, retention
+from bevviz.recording.addresses import Rows
 from bevviz.recording.boxes import track_class_ids, track_ids_of_clusters
 from bevviz.recording.entities import ClassId
 from bevviz.recording.layers import Layer, Style, draw
@@ -50,6 +51,7 @@ def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -
         cloud_fields = fields[path] if len(frame.clouds) > 1 else frame.fields
         ids_by_quantity = quantity_ids(quantities, points, heights[start:end], cloud_fields)
         to.put(path, ColoredPoints(rr.Points3D(points, class_ids=class_ids), ids_by_quantity))
+        to.note_rows(path, Rows("point", range(start, end)))
         start = end
 
 
@@ -361,6 +363,7 @@ def log_clusters(
             Style(labels=False),
             [f"{row}: {count} points" for row, count in counts],
             class_ids=[entities.CLUSTER_CLASS[state] for state in states],
+            rows=Rows("cluster", others),
         ),
     )
 

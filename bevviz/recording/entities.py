@@ -308,11 +308,6 @@ def space(path: str) -> str:
     return f"tf#{path}"
 
 
-def boxes_of(path: str) -> str:
-    """Return the entity of the boxes of these outlines or names. Other entities are returned unchanged."""
-    return path.removesuffix("/outlines").removesuffix("/names")
-
-
 # --- class ids ---------------------------------------------------------------------------------
 
 

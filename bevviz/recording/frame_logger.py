@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -15,6 +16,7 @@ from bevviz.config import Config, config_yaml, stated_lines
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
+from bevviz.recording.addresses import EntityRows
 from bevviz.recording.boxes import (
     TrackLanes,
     clear_late,
@@ -411,6 +413,18 @@ class FrameLogger(Writer):
         if not self.root:
             states |= diagnostic_states(result.frame)
         self._state_lanes.log(self, states)
+
+
+def logged_rows(result: FrameResult, log_more: Callable[[Writer], object] | None = None) -> EntityRows:
+    """Return the rows behind the entities of a frame whose log is no longer at hand.
+
+    Args:
+        result: the frame and its results.
+        log_more: as in ``FrameLogger.log``; it gets the writer.
+    """
+    logger = FrameLogger(rr.RecordingStream("bevviz"), result.config, Scene("", result.frame.lidar))
+    logger.log(result, log_more=None if log_more is None else partial(log_more, logger))
+    return logger.rows
 
 
 def log_run_settings(to: Writer, config: Config, scene: Scene, network: str = "") -> None:

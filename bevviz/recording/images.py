@@ -24,6 +24,7 @@ from bevviz.model.results import (
     Masks,
 )
 from bevviz.recording import entities, retention
+from bevviz.recording.addresses import Rows
 from bevviz.recording.labels import NameRoom, shown, under
 from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.primitives import (
@@ -189,7 +190,7 @@ def log_detections(
     says = [texts.get(row, label) for row, label in zip(kept.tolist(), labels, strict=True)]
     outlines = Style(width=1.5, order=31.0)
     names = shown(labels, has_name)
-    draw(to, boxes, *callouts(path, xyxy, says, names, outline_colors, outlines, frame=name))
+    draw(to, boxes, *callouts(path, xyxy, says, names, outline_colors, outlines, frame=name, rows=boxes.rows))
     if detections.masks is not None:
         _log_masks(to, name, detections, detections.masks, kept)
 
@@ -206,7 +207,7 @@ def _width(camera: Camera) -> float:
 
 def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows: I64) -> None:
     """Log the outlines of the masks."""
-    lines, colors = [], []
+    lines, colors, drawn = [], [], list[int]()
     for row in rows.tolist():
         if not masks.has(row):
             continue
@@ -218,7 +219,9 @@ def _log_masks(to: Writer, name: str, detections: Detections, masks: Masks, rows
             closed = np.concatenate([outline[:, 0], outline[:1, 0]])
             lines.append((closed + corner) / masks.grid[:2])
             colors.append(class_color(detections.names[row]))
-    draw(to, Layer(entities.MASKS.path(name), lines, colors=colors, frame=name))
+            drawn.append(row)
+    addresses = Rows("detection", drawn, name)
+    draw(to, Layer(entities.MASKS.path(name), lines, colors=colors, frame=name, rows=addresses))
 
 
 def _detection_layer(
@@ -231,8 +234,16 @@ def _detection_layer(
 ) -> Layer:
     labels = scored((detections.names[row] for row in rows), detections.score[rows])
     class_ids = [entities.DETECTION_CLASS[DetectionState(state)] for state in detections.state[rows]]
-    boxes = detections.xyxy[rows]
-    return Layer(path, boxes, style, labels, colors=colors, class_ids=class_ids, frame=camera)
+    return Layer(
+        path,
+        detections.xyxy[rows],
+        style,
+        labels,
+        colors=colors,
+        class_ids=class_ids,
+        frame=camera,
+        rows=Rows("detection", rows, camera),
+    )
 
 
 def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = False) -> None:
@@ -273,6 +284,7 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
     strips: list[F32] = []
     colors: list[tuple[int, ...]] = []
     labels: list[str] = []
+    drawn, drawn_cameras = list[int](), list[str]()
     for camera in cameras:
         pose, intrinsics = camera_pose(frame, camera), camera.camera.intrinsics
         detections, fusion = camera.detections, camera.fusion
@@ -296,9 +308,13 @@ def log_frustums(to: Writer, frame: Frame, cameras: Sequence[CameraResult]) -> N
             for name, is_matched in zip(names, matched[rows], strict=True)
         ]
         labels += scored(names, detections.score[rows])
+        drawn += rows.tolist()
+        drawn_cameras += [camera.camera.name] * len(rows)
     if strips:
         style = Style(width=1.0, labels=False)
-        draw(to, Layer(entities.FRUSTUMS, np.concatenate(strips), style, labels, colors=colors))
+        addresses = Rows("detection", drawn, drawn_cameras)
+        lines = np.concatenate(strips)
+        draw(to, Layer(entities.FRUSTUMS, lines, style, labels, colors=colors, rows=addresses))
 
 
 # --- bird's-eye view ---------------------------------------------------------------------------

@@ -57,11 +57,6 @@ def under(bounds: F32) -> F32:
     return np.stack([bounds[:, ::2].mean(axis=1), bounds[:, 3]], axis=1)
 
 
-def box_row(instance: int, count: int) -> int:
-    """Return the row of the box for an instance of outlines or names. A single box has two instances."""
-    return 0 if count == 1 and instance in (0, 1) else instance
-
-
 def choose_named_in_3d(places: F32 | F64, first: Bool | None = None, height: float = 1.0) -> Bool:
     """Choose the 3D boxes that get a name: the nearest ones, as long as names do not overlap.
 

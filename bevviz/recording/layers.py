@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.recording import entities
+from bevviz.recording.addresses import Rows
 from bevviz.recording.primitives import CORNER, strips
 from bevviz.recording.projection import edges
 from bevviz.recording.writer import Writer
@@ -78,6 +79,7 @@ class Layer:
         widths: as ``Style.width``, of each item.
         values: further columns.
         frame: pose of the items in the fixed frame; or name of the camera whose image they are drawn over.
+        rows: rows of the frame's tables that the items show. None: a click is on a place.
     """
 
     path: str
@@ -90,6 +92,7 @@ class Layer:
     widths: Sequence[float] | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     frame: rr.AsComponents | str | None = None
+    rows: Rows | None = None
 
 
 def draw(to: Writer, *layers: Layer, put: Callable[..., None] | None = None) -> None:
@@ -120,6 +123,8 @@ def _draw(to: Writer, layer: Layer, put: Callable[..., None]) -> None:
         _log_image_frame(to, layer.path, layer.frame)
     elif layer.frame is not None:
         put(layer.path, layer.frame)
+    if layer.rows is not None:
+        to.note_rows(layer.path, layer.rows)
     put(layer.path, archetype(**shapes, **fields), *([rr.AnyValues(**values)] if values else []))
 
 
@@ -149,7 +154,8 @@ def _doubled(layer: Layer) -> Layer:
 
     items = np.array(twice(layer.items), np.float32)
     labels, says, colors = map(twice, (layer.labels, layer.says, layer.colors))
-    return replace(layer, items=items, labels=labels, says=says, colors=colors)
+    rows = None if layer.rows is None else layer.rows.doubled()
+    return replace(layer, items=items, labels=labels, says=says, colors=colors, rows=rows)
 
 
 def _log_image_frame(to: Writer, path: str, camera: str) -> None:
@@ -171,6 +177,7 @@ def callouts(
     style: Style = _OUTLINE,
     frame: str | None = None,
     name_color: Look = NAME_COLOR,
+    rows: Rows | None = None,
 ) -> Iterator[Layer]:
     """Yield the layers of outlines and names over the (K,) boxes at ``path``.
 
@@ -183,6 +190,7 @@ def callouts(
         style: look of the outlines.
         frame: name of the camera, for boxes in an image.
         name_color: colour of all names.
+        rows: as in ``Layer``.
     """
     if isinstance(boxes, Boxes3D):
         lines = edges(geometry.corners(boxes))
@@ -190,8 +198,8 @@ def callouts(
     else:
         lines = rectangles(boxes + CORNER)
         places = (lines[:, 2] + lines[:, 3]) / 2
-    yield Layer(entities.OUTLINES.path(path), lines, style, says=says, colors=colors, frame=frame)
-    yield from name_layers(path, places, names, says, style.order, name_color, frame)
+    yield Layer(entities.OUTLINES.path(path), lines, style, says=says, colors=colors, frame=frame, rows=rows)
+    yield from name_layers(path, places, names, says, style.order, name_color, frame, rows)
 
 
 def name_layers(
@@ -202,6 +210,7 @@ def name_layers(
     order: float | None = None,
     color: Look = NAME_COLOR,
     frame: rr.AsComponents | str | None = None,
+    rows: Rows | None = None,
 ) -> Iterator[Layer]:
     """Yield the layer of the names next to items at ``path``; without names, there is none.
 
@@ -213,10 +222,11 @@ def name_layers(
         order: draw order of the items; names are in front of them.
         color: colour of all names.
         frame: as in ``Layer``.
+        rows: as in ``Layer``.
     """
     if any(names):
         style = Style(color, 0.0, labels=True, order=None if order is None else order + 1)
-        yield Layer(entities.NAMES.path(path), places, style, labels=names, says=says, frame=frame)
+        yield Layer(entities.NAMES.path(path), places, style, labels=names, says=says, frame=frame, rows=rows)
 
 
 def rectangles(bounds: F32) -> F32:

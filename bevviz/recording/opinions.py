@@ -10,6 +10,7 @@ import numpy as np
 from bevviz.model.frame import F32, I64, Boxes3D, Camera
 from bevviz.model.results import FrameResult, Objects, Opinion
 from bevviz.recording import entities
+from bevviz.recording.addresses import Rows
 from bevviz.recording.labels import NameRoom, choose_named_in_3d, shown, under
 from bevviz.recording.layers import Layer, Style, callouts, draw, name_layers
 from bevviz.recording.primitives import CORNER, scored, texts_by_row, transform
@@ -39,6 +40,7 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
         for name, is_missed in zip(fused.names, missed.tolist(), strict=True)
     ]
     has_name = choose_named_in_3d(fused.boxes.center, missed) & missed
+    addresses = Rows("detection", fused.detection, fused.camera)
     draw(
         to,
         Layer(
@@ -56,6 +58,7 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
                 "reason": [reasons.get(row, "") for row in range(len(fused))],
             },
             frame=transform(result.frame.pose),
+            rows=addresses,
         ),
         *callouts(
             entities.FUSION,
@@ -65,6 +68,7 @@ def log_fusion(to: Writer, result: FrameResult) -> None:
             colors,
             Style(width=1.0),
             name_color=StateColor.DOUBTFUL.value,
+            rows=addresses,
         ),
     )
 
@@ -188,11 +192,20 @@ def _log_outlines(
         if camera is not None:
             strokes = [stroke + np.float32(CORNER) for stroke in strokes]
         chosen = [name if is_doubtful and next(named) else "" for name in names]
+        addresses = _addresses(result, outlines)
         draw(
             to,
-            Layer(path, strokes, style, says=says, frame=camera),
-            *name_layers(path, places(outlines), chosen, says, order, frame=camera),
+            Layer(path, strokes, style, says=says, frame=camera, rows=addresses),
+            *name_layers(path, places(outlines), chosen, says, order, frame=camera, rows=addresses),
         )
+
+
+def _addresses(result: FrameResult, outlines: OpinionOutlines) -> Rows:
+    """Return the rows that outlines show: objects, and for missed ones the detections of our fusion."""
+    if outlines.opinion != MISSED:
+        return Rows("object", outlines.rows)
+    fused = _indexed_objects(result, MISSED)
+    return Rows("detection", fused.detection[outlines.rows], [fused.camera[row] for row in outlines.rows])
 
 
 def _outline_names(result: FrameResult, outlines: OpinionOutlines) -> list[str]:

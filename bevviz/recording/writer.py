@@ -11,6 +11,7 @@ import rerun as rr
 
 from bevviz.model.frame import F64, I64, Codec, VideoClip
 from bevviz.recording import entities
+from bevviz.recording.addresses import EntityRows, Rows
 from bevviz.support.contexts import Closable
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # in nanoseconds; the others are sequences
@@ -55,6 +56,7 @@ class Writer(Closable):
         self._all_entities: set[str] = set()  # entities that any frame had
         self._previous_entities: set[str] = set()  # entities with data of the previous frame
         self._frame_entities: set[str] = set()
+        self._rows: dict[str, Rows] = {}
         self.apart = False  # whether frames may be viewed without their previous frames
         self.streams_video = True  # False: each video picture is logged as an image
         self._codecs: dict[str, Codec] = {}  # codec of entities that are video
@@ -64,7 +66,7 @@ class Writer(Closable):
 
     def begin(self, index: int, stamp: int, received: int) -> None:
         """Start a frame. Stamps are in nanoseconds; ``received`` is 0 if it is unknown."""
-        self._frame_entities = set()
+        self._frame_entities, self._rows = set(), {}
         clock = self._clock
         self.set_time(index, stamp, received)
         if clock.keys() != self._clock.keys():
@@ -115,6 +117,15 @@ class Writer(Closable):
     def close(self) -> None:
         """Send scalars that wait."""
         self.flush()
+
+    @property
+    def rows(self) -> EntityRows:
+        """Rows behind the items of each entity of this frame, or of the last one after ``end``."""
+        return self._rows
+
+    def note_rows(self, path: str, rows: Rows) -> None:
+        """Note the rows that the items of an entity show."""
+        self._rows[path] = rows
 
     # --- logging -------------------------------------------------------------------------------
 

@@ -15,12 +15,13 @@ from bevviz.findings.frame_findings import Finding, find_findings
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints, entities
+from bevviz.recording.addresses import EntityRows, RowCache
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import FrameCache, RecordingBuffer
-from bevviz.workbench.findings_layer import FindingRows, log_layer
+from bevviz.workbench.findings_layer import log_layer
 from bevviz.workbench.source import Settings
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
@@ -52,7 +53,7 @@ class DriveRecording(Closable):
         self._frame_versions: dict[int, int] = {}  # of the frames in ``_frames``
         self._rows_by_stamp: dict[int, int] = {}
         self._drawn: list[tuple[int, int, int]] = []  # stamp, number and receive time, sorted
-        self._layers: dict[tuple[int, Settings], FindingRows] = {}  # by frame number and settings
+        self._rows = RowCache()  # by frame number and settings
         self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
         self._drawing = threading.Lock()  # guards the frames on demand, and the logger that draws them
         self._waiting_numbers = 0  # frames whose numbers are logged and not sent
@@ -192,9 +193,13 @@ class DriveRecording(Closable):
             self._recoloured.add(number)
         self._log(logger, result, find_findings(explainer), settings, cloud=number in self._recoloured)
 
-    def findings_of(self, number: int, settings: Settings, path: str) -> Sequence[Finding]:
-        """Return the findings behind the rows of an entity in a frame."""
-        return self._layers.get((number, settings), {}).get(path, ())
+    def entity_rows(self, number: int, settings: Settings) -> EntityRows | None:
+        """Return the rows behind the entities of a frame as drawn. None: they are not kept.
+
+        Over the input of the sensors, a frame with other values shows the frame as opened.
+        """
+        rows = self._rows.get((number, settings))
+        return rows if rows is None or not settings else {**(self._rows.get((number, ())) or {}), **rows}
 
     def _log(
         self,
@@ -205,16 +210,14 @@ class DriveRecording(Closable):
         *,
         cloud: bool = False,
     ) -> None:
-        layers: list[FindingRows] = []
-
         def log_more() -> None:
-            layers.append(log_layer(logger, result, findings))
+            log_layer(logger, result, findings)
 
         if self.on_demand and not settings:
             logger.log_frame(result, log_more)
         else:
             logger.log(result, log_more=log_more, cloud=cloud)
-        self._layers[result.frame.index, settings] = layers[0]
+        self._rows.put((result.frame.index, settings), logger.rows)
 
 
 def end_unused_streams() -> None:

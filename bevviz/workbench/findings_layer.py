@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from bevviz.findings.frame_findings import Finding
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
+from bevviz.recording.addresses import Rows
 from bevviz.recording.labels import choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, draw
 from bevviz.recording.primitives import transform
@@ -20,8 +20,6 @@ from bevviz.stages.robot_results import in_points_frame
 from bevviz.support.colors import StateColor
 from bevviz.why.subject import projected_boxes, single_box
 
-FindingRows: TypeAlias = Mapping[str, Sequence[Finding]]  # findings of an entity, one per logged row
-
 LAYERS = {
     "missed": (entities.MARKED.path("missed"), StateColor.BAD.value),
     "false": (entities.MARKED.path("false"), StateColor.DOUBTFUL.value),
@@ -30,15 +28,11 @@ LAYERS = {
 DRAWN_AS = {"doubtful": "false"}
 
 
-def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) -> FindingRows:
+def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) -> None:
     """Log the boxes in space, in the bird's-eye view and in every image.
 
     Call this within a frame of the writer.
-
-    Returns:
-        The findings behind the rows of each entity.
     """
-    layer: dict[str, Sequence[Finding]] = {}
     for kind, (path, color) in LAYERS.items():
         layer_findings = [finding for finding in findings if DRAWN_AS.get(finding.what, finding.what) == kind]
         if not layer_findings:
@@ -52,8 +46,8 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
         is_named = choose_named_in_3d(boxes.center) & is_missed
         pose = transform(result.frame.pose)
         style = Style(color, 1.5, labels=is_missed, wire=True)
-        draw(writer, Layer(path, boxes, style, shown(labels, is_named), says=labels, frame=pose))
-        layer[path] = layer_findings
+        texts = shown(labels, is_named)
+        draw(writer, Layer(path, boxes, style, texts, says=labels, frame=pose, rows=_rows(layer_findings)))
         single_boxes = [single_box(boxes, row) for row in range(len(boxes))]
         for camera in result.frame.cameras:
             xyxy = dict(enumerate(projected_boxes(single_boxes, camera)))
@@ -64,14 +58,20 @@ def log_layer(writer: Writer, result: FrameResult, findings: Sequence[Finding]) 
                     Style(color, labels=False, order=35.0),
                 )
                 texts = [labels[row] for row in image_boxes]
-                draw(writer, Layer(image, np.array([*image_boxes.values()]), style, texts, frame=camera.name))
-                layer[image] = [layer_findings[row] for row in image_boxes]
+                addresses = _rows([layer_findings[row] for row in image_boxes])
+                items = np.array([*image_boxes.values()])
+                draw(writer, Layer(image, items, style, texts, frame=camera.name, rows=addresses))
         above, (rows, outlines) = entities.OVERLAY.path(kind), bev_outlines(result.config.bev, boxes)
         if len(rows):
             style, texts = Style(color, 1.5, labels=False, order=30.0), [labels[row] for row in rows]
-            draw(writer, Layer(above, outlines, style, texts))
-            layer[above] = [layer_findings[row] for row in rows]
-    return layer
+            addresses = _rows([layer_findings[row] for row in rows])
+            draw(writer, Layer(above, outlines, style, texts, rows=addresses))
+
+
+def _rows(findings: Sequence[Finding]) -> Rows:
+    """Return the rows that findings are about."""
+    selections = [finding.selection for finding in findings]
+    return Rows([one.kind for one in selections], [one.row for one in selections])
 
 
 def _box(result: FrameResult, finding: Finding) -> Boxes3D:

@@ -27,12 +27,14 @@ from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import entities
+from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
+from bevviz.workbench.findings_layer import log_layer
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.source import Settings, Source
@@ -470,11 +472,12 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def select(
         self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
     ) -> Selection | None:
-        """Return the selection of a click in a frame: a finding, or see ``select_click``."""
-        rows = self.recording.findings_of(number, settings, path)
-        if instance is not None and 0 <= instance < len(rows):
-            return rows[instance].selection
-        return select_click(self.look(number, settings), self._tracks.get(number), path, instance, position)
+        """Return the selection of a click in a frame, see ``select_click``."""
+        result, rows = self.look(number, settings), self.recording.entity_rows(number, settings)
+        if rows is None:
+            findings = find_findings(self.explainer(result))
+            rows = logged_rows(result, lambda writer: log_layer(writer, result, findings))
+        return select_click(result, self._tracks.get(number), rows, path, instance, position)
 
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
         """Mark the object of an answer in every view of a page."""

@@ -28,7 +28,7 @@ from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Variants
 from bevviz.recording import entities
-from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.frame_logger import FrameLogger, logged_rows
 from bevviz.why import Answer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
@@ -345,7 +345,8 @@ class RunningRobot(Source):
         if instance is not None and points is not None and path == entities.POINTS.path(result.frame.lidar):
             rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
-        return select_click(result, result.tracks, path, instance, position)
+        drawn = self.live.encoder.rows.get(number) or logged_rows(result)
+        return select_click(result, result.tracks, drawn, path, instance, position)
 
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None = None) -> None:
         """Mark the object of an answer in every view of all pages."""
