@@ -19,7 +19,7 @@ import numpy as np
 
 from bevviz.config import Config, load
 from bevviz.evaluate.ground_truth import truth_of
-from bevviz.fleet.fix import Sample, SampleFrame, f1, find_fix, keys_for, text_of
+from bevviz.fleet.fix import Sample, SampleFrame, find_fix, keys_for, text_of
 from bevviz.pipeline.session import Variants
 from tests.support import small_drives
 
@@ -103,7 +103,7 @@ def main() -> None:
     print(f"{3 * options.drives} drives simulated in {time.perf_counter() - start:.0f} s", flush=True)
 
     def judged(config: Config) -> float:
-        return f1(judging.counts(judging.scores([config])[0]))
+        return judging.f1([config])[0]
 
     default = judged(load())
     print(f"default: F1 {default:.3f}", flush=True)

@@ -12,7 +12,7 @@ import pytest
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.evaluate.ground_truth import truth_of
-from bevviz.fleet.fix import Fix, Sample, SampleFrame, f1, find_fix, keys_for
+from bevviz.fleet.fix import Fix, Sample, SampleFrame, find_fix, keys_for
 from bevviz.fleet.parameter_search import Settings, choices_of, search
 from bevviz.pipeline.session import Variants
 from tests.support import small_drives
@@ -48,7 +48,7 @@ def test_two_wrong_parameters_are_repaired(samples: tuple[Sample, Sample]) -> No
     keys = ["detector.conf_threshold", "fusion.min_iou"]
     fix = find_fix(config, keys, choosing, confirming, trials=24)
     assert set(fix.settings) == set(keys)
-    default = f1(confirming.counts(confirming.scores([load()])[0]))
+    default = confirming.f1([load()])[0]
     assert fix.f1_after >= default - 0.01 and fix.f1_before < default - 0.1
     assert fix.confirmed and fix.f1_change[0] > 0
     assert 0 < fix.fixed <= fix.missed and fix.cause_fixed == fix.fixed
@@ -62,7 +62,7 @@ def test_the_file_repeats_what_was_measured(samples: tuple[Sample, Sample], tmp_
     fix = find_fix(config, ["fusion.min_rating", "fusion.split"], choosing, confirming, trials=16)
     file = tmp_path / "fix.yaml"
     file.write_text(fix.yaml())
-    repeated = f1(confirming.counts(confirming.scores([load(file)])[0]))
+    repeated = confirming.f1([load(file)])[0]
     assert repeated == pytest.approx(fix.f1_after)
 
 

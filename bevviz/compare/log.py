@@ -10,10 +10,10 @@ import rerun as rr
 from bevviz.evaluate.differences import (
     DIFFERENT,
     WORST_FIRST,
+    BeforeAfter,
     Change,
     Difference,
     FrameDifferences,
-    TruthComparison,
 )
 from bevviz.model.frame import F64
 from bevviz.recording import entities
@@ -120,13 +120,15 @@ class DifferenceLogger(Writer):
             arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
             self.put(entities.FROM_A, arrows)
 
-    def _log_judged(self, judged: TruthComparison, world_from_points: F64) -> None:
+    def _log_judged(self, judged: BeforeAfter, world_from_points: F64) -> None:
+        assert judged.truth is not None
+        labels_of, all_boxes = judged.truth.labels, judged.truth.boxes
         rows = np.array([*judged.broken, *judged.fixed], np.int64)
         is_broken = np.arange(len(rows)) < len(judged.broken)
-        is_named = choose_named_in_3d(judged.boxes.center[rows], is_broken, HEIGHT)
+        is_named = choose_named_in_3d(all_boxes.center[rows], is_broken, HEIGHT)
         for outcome, selected in (("broken", is_broken), ("fixed", ~is_broken)):
-            names = [f"{outcome}: {judged.labels[row]}" for row in rows[selected].tolist()]
-            labels, boxes = shown(names, is_named[selected]), judged.boxes.chosen(rows[selected])
+            names = [f"{outcome}: {labels_of[row]}" for row in rows[selected].tolist()]
+            labels, boxes = shown(names, is_named[selected]), all_boxes.chosen(rows[selected])
             style = Style(_OUTCOME_COLORS[outcome], 3.5, labels=True, wire=True)
             path, pose = entities.DIFFERENCE.path(outcome), transform(world_from_points)
             draw(self, Layer(path, boxes, style, labels, frame=pose))
@@ -188,7 +190,8 @@ def _totals(differences: FrameDifferences) -> Iterator[tuple[str, str, str]]:
             "-" if b.clusters is None else str(b.clusters),
         )
     if (judged := differences.judged) is not None:
-        yield f"found of {len(judged.labels)} that are there", str(judged.a.sum()), str(judged.b.sum())
+        there, *found = judged.found
+        yield f"found of {there} that are there", str(found[0]), str(found[1])
     for camera in differences.images:
         yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
 

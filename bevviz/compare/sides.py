@@ -13,7 +13,7 @@ from bevviz.compare.log import DifferenceLogger
 from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate.differences import FrameDifferences, compare_with_truth, differences, seen
+from bevviz.evaluate.differences import FrameDifferences, before_after, differences, seen
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
@@ -104,7 +104,7 @@ def _compare_sides(
     if b is None:
         return ComparedFrame(frame, a, b)
     truth = None if truths is None else truths(frame)
-    judged = None if truth is None else compare_with_truth(a, b, truth)
+    judged = None if truth is None else before_after(a.objects, b.objects, truth)
     return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b), judged))
 
 

@@ -15,13 +15,14 @@ import numpy as np
 
 from bevviz.config import ParameterChange
 from bevviz.errors import printable
+from bevviz.evaluate import ObjectScore
 from bevviz.evaluate.differences import (
     DIFFERENT,
     WORST_FIRST,
+    BeforeAfter,
     Change,
     Difference,
     FrameDifferences,
-    TruthComparison,
 )
 from bevviz.model.protocols import Observer
 from bevviz.support import table
@@ -145,9 +146,8 @@ class ComparisonSummary(Observer[FrameComparison]):
         self._clusters: Counter[str] = Counter()
         self._other_clusters = 0  # frames in which the number of clusters differs
         self._detected = False
-        self._judged: dict[str, Counter[str]] = defaultdict(Counter)  # by class of the ground truth
-        self._wrong: dict[str, Counter[str]] = {"A": Counter(), "B": Counter()}  # by name
-        self._names: set[str] = set()  # names that the ground truth accepts
+        self._scores = {"A": ObjectScore(), "B": ObjectScore()}
+        self._changes: dict[str, Counter[str]] = defaultdict(Counter)  # by class of the ground truth
         self._moved: list[float] = []
 
     @property
@@ -178,7 +178,7 @@ class ComparisonSummary(Observer[FrameComparison]):
         self._detected |= bool(differences.a.images or differences.b.images)
         judged = differences.judged
         if judged is not None:
-            self._judge(judged)
+            self._judge(judged, differences)
         differing = [d for d in differences.objects if d.change is not Change.SAME]
         self.frames.append(
             DifferingFrame(
@@ -197,28 +197,30 @@ class ComparisonSummary(Observer[FrameComparison]):
             )
         )
 
-    def _judge(self, judged: TruthComparison) -> None:
-        self._names |= judged.names
-        self._wrong["A"].update(judged.wrong_a)
-        self._wrong["B"].update(judged.wrong_b)
-        for row, label in enumerate(judged.labels):
-            counts = self._judged[label.lower()]
-            counts["there"] += 1
-            counts["A"] += bool(judged.a[row])
-            counts["B"] += bool(judged.b[row])
+    def _judge(self, judged: BeforeAfter, differences: FrameDifferences) -> None:
+        sides = (("A", differences.a, judged.before), ("B", differences.b, judged.after))
+        truth = judged.truth
+        assert truth is not None
+        for side, result, matches in sides:
+            assert matches is not None
+            self._scores[side].count(result.names, truth, matches)
         for outcome, rows in (("fixed", judged.fixed), ("broke", judged.broken)):
             for row in rows:
-                self._judged[judged.labels[row].lower()][outcome] += 1
+                self._changes[truth.labels[row].lower()][outcome] += 1
 
     @property
     def truth(self) -> TruthCounts | None:
         """Labelled objects that each side finds, by class, and the number of false ones. None: no truth."""
-        if not self._judged:
+        of_sides = {side: score.classes for side, score in self._scores.items()}
+        classes = {}
+        for name, counts in of_sides["A"].items():
+            if there := counts["tp"] + counts["fn"]:
+                found = {side: of_side[name]["tp"] for side, of_side in of_sides.items()}
+                classes[name] = Counter(there=there, **found, **self._changes[name])
+        if not classes:
             return None
-        wrong = {
-            side: sum(n for name, n in w.items() if name in self._names) for side, w in self._wrong.items()
-        }
-        return TruthCounts(self._judged, SideCounts(**wrong))
+        wrong = {side: score.total["fp"] for side, score in self._scores.items()}
+        return TruthCounts(classes, SideCounts(**wrong))
 
     @property
     def worst(self) -> Sequence[DifferingFrame]:
@@ -273,21 +275,14 @@ class ComparisonSummary(Observer[FrameComparison]):
         truth = self.truth
         if truth is None or not self._detected:
             return
-        total: Counter[str] = sum(self._judged.values(), Counter())
         columns = ("there", "A", "B", "fixed", "broke")
-        rows = [(name, *(str(c[column]) for column in columns)) for name, c in sorted(self._judged.items())]
+        rows = [*_rows({name: Counter(counts) for name, counts in truth.classes.items()}, columns)]
+        *_, fixed, broke = rows[-1]
+        heads = ("of the truth", "there", "found by A", "found by B", "fixed by B", "broken by B")
         yield ""
-        yield from table.lines(
-            [
-                ("of the truth", "there", "found by A", "found by B", "fixed by B", "broken by B"),
-                *rows,
-                ("all", *(str(total[column]) for column in columns)),
-            ]
-        )
-        yield (
-            f"B fixed {total['fixed']}, broke {total['broke']}; objects that are none: "
-            f"{truth.wrong.A} in A, {truth.wrong.B} in B"
-        )
+        yield from table.lines([heads, *rows])
+        wrong = f"{truth.wrong.A} in A, {truth.wrong.B} in B"
+        yield f"B fixed {fixed}, broke {broke}; objects that are none: {wrong}"
 
     def _no_difference(self) -> str:
         frames = f"{len(self.frames)} frames"

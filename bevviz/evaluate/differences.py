@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.evaluate.matching import judge, position_text
+from bevviz.evaluate.matching import Matches, judge, position_text
 from bevviz.model import box_overlap, geometry
-from bevviz.model.frame import F32, F64, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.results import FrameResult, Objects
 from bevviz.stages.fusion import assign
 
@@ -87,7 +87,7 @@ class FrameDifferences:
     b: SideResult
     objects: tuple[Difference, ...]
     images: Mapping[str, tuple[Difference, ...]]  # by camera
-    judged: TruthComparison | None = None  # None: no ground truth
+    judged: BeforeAfter | None = None  # None: no ground truth
 
     @property
     def counts(self) -> Counter[Change]:
@@ -122,22 +122,33 @@ def seen(result: FrameResult) -> SideResult:
     clusters = None
     if result.clusters is not None:
         clusters = int(result.clusters.kept.sum())
-    if result.objects is None:
-        return SideResult(Boxes3D.empty(), (), np.zeros(0, np.float32), images, clusters)
-    return SideResult(result.objects.boxes, result.objects.names, result.objects.score, images, clusters)
+    return replace(side_of(result.objects or Objects.empty()), images=images, clusters=clusters)
+
+
+def side_of(objects: Objects) -> SideResult:
+    """Return objects as one side of a comparison."""
+    return SideResult(objects.boxes, objects.names, objects.score)
 
 
 def differences(
-    index: int, stamp: int, a: SideResult, b: SideResult, judged: TruthComparison | None = None
+    index: int, stamp: int, a: SideResult, b: SideResult, judged: BeforeAfter | None = None
 ) -> FrameDifferences:
-    """Return the differences of two sides in a frame."""
+    """Return the differences of two sides in a frame.
+
+    Args:
+        index: number of the scan.
+        stamp: stamp of the scan, in nanoseconds.
+        a: side A.
+        b: side B.
+        judged: both sides compared with the ground truth. None: it is unknown.
+    """
     both = [camera for camera in a.images if camera in b.images]
     return FrameDifferences(
         index,
         stamp,
         a,
         b,
-        compare_objects(a, b),
+        compare_objects(a, b) if judged is None else judged.pairs,
         {camera: compare_images(a.images[camera], b.images[camera]) for camera in both},
         judged,
     )
@@ -195,56 +206,91 @@ def _make_pairs(
     return (*pairs, *(Difference(Change.ONLY_B, -1, j, "", b[j]) for j in only_b))
 
 
-# --- ground truth ------------------------------------------------------------------------------
+# --- before and after --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class TruthComparison:
-    """Frame of both sides compared with the ground truth. Row i is the i-th object to be found."""
+class BeforeAfter:
+    """Effects of a change on the objects of one frame.
 
-    labels: tuple[str, ...]
-    boxes: Boxes3D  # in the frame of the points
-    a: Bool  # found by A
-    b: Bool
-    wrong_a: tuple[str, ...]  # names of A's false objects
-    wrong_b: tuple[str, ...]
-    names: frozenset[str]  # names that the labels of this frame accept; other names are not judged
+    Attributes:
+        pairs: every object before and after the change, which are sides A and B.
+        truth: ground truth of the frame; None: unknown.
+        before: the objects before, matched with the ground truth.
+        after: the objects after, matched with the ground truth.
+    """
 
-    @property
-    def fixed(self) -> Sequence[int]:
-        """Rows of objects that only B finds."""
-        rows: list[int] = np.flatnonzero(self.b & ~self.a).tolist()
-        return rows
+    pairs: tuple[Difference, ...]
+    truth: Truth | None = None
+    before: Matches | None = None
+    after: Matches | None = None
 
     @property
-    def broken(self) -> Sequence[int]:
-        """Rows of objects that only A finds."""
-        rows: list[int] = np.flatnonzero(self.a & ~self.b).tolist()
-        return rows
+    def fixed(self) -> list[int]:
+        """Rows of labelled objects that were missed and are found."""
+        return _found_only(self.after, self.before)
+
+    @property
+    def broken(self) -> list[int]:
+        """Rows of labelled objects that were found and are missed."""
+        return _found_only(self.before, self.after)
+
+    @property
+    def found(self) -> tuple[int, int, int]:
+        """Number of objects that had to be found, and how many of them are found before and after."""
+        there = 0 if self.truth is None else int(self.truth.must.sum())
+        missed = (0 if side is None else int(side.missed.sum()) for side in (self.before, self.after))
+        before, after = (there - number for number in missed)
+        return there, before, after
+
+    @property
+    def new_false(self) -> list[int]:
+        """Rows of the objects after that are false and were not. Without ground truth: all new ones."""
+        pairs = [(pair.row_b, pair.name_b, pair.row_a) for pair in self.pairs]
+        return self._false_only(pairs, self.after, self.before)
+
+    @property
+    def false_gone(self) -> list[int]:
+        """Rows of the objects before that were false and are not. Without ground truth: all that are gone."""
+        pairs = [(pair.row_a, pair.name_a, pair.row_b) for pair in self.pairs]
+        return self._false_only(pairs, self.before, self.after)
+
+    @property
+    def changed(self) -> int:
+        """Number of objects that have moved or have another class."""
+        return sum(pair.change in (Change.MOVED, Change.CLASS) for pair in self.pairs)
 
     def text(self, row: int) -> str:
-        """Return class and distance of an object, as ``person at 12.3 m``."""
-        return f"{self.labels[row].lower()} at {self.boxes.distance[row]:.1f} m"
+        """Return class and distance of a labelled object, as ``person at 12.3 m``."""
+        assert self.truth is not None
+        return f"{self.truth.labels[row].lower()} at {self.truth.boxes.distance[row]:.1f} m"
+
+    def _false_only(
+        self, pairs: Iterable[tuple[int, str, int]], matches: Matches | None, others: Matches | None
+    ) -> list[int]:
+        """Return the rows of one side's false objects whose partner on the other side is not false."""
+        if self.truth is None or matches is None or others is None:
+            return [row for row, _, other in pairs if other < 0]
+        names = self.truth.judged_names
+        return [
+            row
+            for row, name, other in pairs
+            if row >= 0 and matches.false[row] and name.lower() in names
+            if other < 0 or not others.false[other]
+        ]
 
 
-def compare_with_truth(a: FrameResult, b: FrameResult, truth: Truth) -> TruthComparison:
-    """Compare both sides of a frame with its ground truth."""
-    to_find = np.flatnonzero(truth.must)
-    (found_a, wrong_a), (found_b, wrong_b) = (_side(side.objects, truth) for side in (a, b))
-    return TruthComparison(
-        labels=tuple(truth.labels[k] for k in to_find),
-        boxes=truth.boxes.chosen(to_find),
-        a=found_a[to_find],
-        b=found_b[to_find],
-        wrong_a=wrong_a,
-        wrong_b=wrong_b,
-        names=frozenset().union(*truth.accepted),
-    )
+def _found_only(matches: Matches | None, others: Matches | None) -> list[int]:
+    """Return the rows of labelled objects that one side finds and the other one misses."""
+    if matches is None or others is None:
+        return []
+    return np.flatnonzero(others.missed & ~matches.missed).tolist()
 
 
-def _side(objects: Objects | None, truth: Truth) -> tuple[Bool, tuple[str, ...]]:
-    """Return (K,) whether each labelled box is found, and the names of the false objects."""
-    if objects is None:
-        return np.zeros(len(truth.labels), bool), ()
-    matches = judge(objects, truth)
-    return ~matches.missed, tuple(objects.names[j].lower() for j in np.flatnonzero(matches.false))
+def before_after(before: Objects | None, after: Objects | None, truth: Truth | None) -> BeforeAfter:
+    """Compare two results of one frame with each other and, if it is known, with the ground truth."""
+    before, after = before or Objects.empty(), after or Objects.empty()
+    pairs = compare_objects(side_of(before), side_of(after))
+    if truth is None:
+        return BeforeAfter(pairs)
+    return BeforeAfter(pairs, truth, judge(before, truth), judge(after, truth))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,25 +78,39 @@ class ObjectScore:
     judged: AcceptedNames = field(default_factory=AcceptedNames)
     errors: list[float] = field(default_factory=list)  # metres, of the true ones
     _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    _false: Counter[str] = field(default_factory=Counter)  # by name
+    _frames: list[tuple[int, int, Counter[str]]] = field(default_factory=list)  # true, missed, false by name
 
     def add(self, objects: Objects, truth: Truth) -> Matches:
         """Match one frame's objects with the ground truth, best score first, and count."""
-        self.judged.add(truth)
         matches = judge(objects, truth)
-        self._false.update(objects.names[j].lower() for j in np.flatnonzero(matches.false))
-        best_first = np.argsort(-objects.score, kind="stable")
-        for j in best_first[matches.true[best_first]]:
+        self.count(objects.names, truth, matches)
+        return matches
+
+    def count(self, names: Sequence[str], truth: Truth, matches: Matches) -> None:
+        """Count the objects of one frame that are matched already."""
+        self.judged.add(truth)
+        false = Counter(names[j].lower() for j in np.flatnonzero(matches.false).tolist())
+        self._frames.append((int(matches.true.sum()), int(matches.missed.sum()), false))
+        for j in np.flatnonzero(matches.true):
             self._labels[truth.labels[matches.partner[j]].lower()]["tp"] += 1
             self.errors.append(float(matches.distance[j]))
         for k in np.flatnonzero(matches.missed):
             self._labels[truth.labels[k].lower()]["fn"] += 1
-        return matches
+
+    @property
+    def frames(self) -> F64:
+        """(F, 3) numbers of true, missed and false objects of each frame."""
+        counts = [
+            (true, missed, sum(n for name, n in false.items() if self.judged.of(name) is not None))
+            for true, missed, false in self._frames
+        ]
+        return np.array(counts, np.float64).reshape(-1, 3)
 
     @property
     def classes(self) -> dict[str, Counter[str]]:
         """Counts of each class, in lower case: true (tp), false (fp) and missed (fn) objects."""
-        return self.judged.with_false(self._labels, self._false, "fp")
+        false = sum((names for *_, names in self._frames), Counter[str]())
+        return self.judged.with_false(self._labels, false, "fp")
 
     @property
     def total(self) -> Counter[str]:

@@ -14,24 +14,22 @@ import numpy as np
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, load, preset_differences
 from bevviz.errors import UserError
+from bevviz.evaluate import ObjectScore
+from bevviz.evaluate.differences import before_after
+from bevviz.evaluate.f1_change import f1, f1_change
 from bevviz.evaluate.ground_truth import Truth, truth_source
-from bevviz.evaluate.matching import AcceptedNames, judge
 from bevviz.fleet.causes import Cause, Findings
-from bevviz.fleet.findings import judged_findings
 from bevviz.fleet.parameter_search import Settings, search
-from bevviz.model.frame import F64, Bool, Frame
-from bevviz.model.results import FrameResult
+from bevviz.model.frame import F64, Frame
 from bevviz.pipeline.session import Variants
 from bevviz.support.json_form import json_form, rounded
-from bevviz.why import FrameExplainer
-from bevviz.why.false_objects import false_reasons
+from bevviz.why.experiment import Experiment, Outcome
 
 FRAMES = 60  # frames to choose on, and as many to confirm
 TRIALS = 72
 OF_CAUSE = 0.5  # share of these frames that have findings of the cause
 FEW = 6  # drives below which parts of drives are left out instead of whole drives
 PARTS = 10  # of a drive
-DRAWS = 2000  # of the bootstrap
 COMMON = 0.05  # least share of a reason among the findings whose parameters are searched
 
 _GROUND = ("ground.distance_threshold", "ground.method", "clustering.min_points", "voxel.size")
@@ -91,14 +89,6 @@ class SampleFrame:
     weight: float
 
 
-@dataclass(frozen=True, slots=True)
-class FrameScore:
-    """Outcome of one configuration on one frame."""
-
-    found: Bool  # (K,) objects of the ground truth
-    false: Counter[str]  # false objects by name
-
-
 @dataclass
 class Sample:
     """Frames that configurations are scored on.
@@ -110,55 +100,35 @@ class Sample:
 
     frames: Sequence[SampleFrame]
     variants: Variants = field(default_factory=Variants)
-    _names: AcceptedNames = field(default_factory=AcceptedNames)
 
-    def __post_init__(self) -> None:
+    def outcomes(self, configs: Sequence[Config]) -> Iterator[tuple[SampleFrame, list[Outcome]]]:
+        """Yield the outcome of each configuration on each frame."""
+        truths = {id(sampled.frame): sampled.truth for sampled in self.frames}
+        experiment = Experiment(lambda frame: truths[id(frame)], self.variants)
         for sampled in self.frames:
-            self._names.add(sampled.truth)
+            yield sampled, [experiment.outcome(sampled.frame, config) for config in configs]
 
-    def scores(self, configs: Sequence[Config]) -> list[list[FrameScore]]:
-        """Run each configuration on each frame. Return the scores of each configuration."""
-        scores: list[list[FrameScore]] = [[] for _ in configs]
-        for sampled in self.frames:
-            for of_config, config in zip(scores, configs, strict=True):
-                result = self.variants.perceive(sampled.frame, config)
-                of_config.append(self._score(result, sampled.truth))
-        return scores
+    def counts(self, score: ObjectScore) -> F64:
+        """Return (F, 3) true, missed and false objects of each frame, by the weight of the frames."""
+        return np.asarray(score.frames * np.array([[sampled.weight] for sampled in self.frames]))
+
+    def f1(self, configs: Sequence[Config]) -> list[float]:
+        """Run each configuration on each frame. Return the F1 of each, by the weight of the frames."""
+        scores = [ObjectScore() for _ in configs]
+        for sampled, outcomes in self.outcomes(configs):
+            for score, outcome in zip(scores, outcomes, strict=True):
+                score.add(outcome.objects, sampled.truth)
+        return [float(f1(self.counts(score).sum(axis=0))) for score in scores]
 
     def reasons(self, config: Config) -> Counter[str]:
         """Run a configuration. Return the number of missed and false objects by reason."""
-        reasons: Counter[str] = Counter()
-        for sampled in self.frames:
-            result = self.variants.perceive(sampled.frame, config)
-            if result.objects is None:
-                continue
-            matches = judge(result.objects, sampled.truth)
-            explainer = FrameExplainer(result, truth=sampled.truth)
-            findings = judged_findings(explainer, matches, false_reasons(explainer.traces))
-            reasons.update(f["reason"] for f in findings if f["outcome"] != "found")
-        return reasons
-
-    def _score(self, result: FrameResult, truth: Truth) -> FrameScore:
-        if result.objects is None:
-            return FrameScore(np.zeros(len(truth.must), bool), Counter())
-        matches = judge(result.objects, truth)
-        names = [result.objects.names[j].lower() for j in np.flatnonzero(matches.false).tolist()]
-        return FrameScore(truth.must & ~matches.missed, Counter(n for n in names if self._names.of(n)))
-
-    def counts(self, scores: Sequence[FrameScore]) -> F64:
-        """Return (F, 3) weighted true, missed and false objects of each frame."""
-        rows = [
-            (score.found.sum(), (s.truth.must & ~score.found).sum(), score.false.total())
-            for s, score in zip(self.frames, scores, strict=True)
-        ]
-        weights = np.array([s.weight for s in self.frames])
-        return np.asarray(np.array(rows, np.float64).reshape(-1, 3) * weights[:, None], np.float64)
-
-
-def f1(counts: F64) -> float:
-    """Return the F1 of (F, 3) true, missed and false objects."""
-    true, missed, false = counts.sum(axis=0)
-    return float(2 * true / max(2 * true + missed + false, 1e-9))
+        return Counter(
+            row.reason
+            for _, [outcome] in self.outcomes([config])
+            if outcome.result.objects is not None
+            for row in outcome.rows(reasons=True)
+            if row.state != "found"
+        )
 
 
 F1 = Annotated[float, rounded(6)]
@@ -267,10 +237,10 @@ def find_fix(
 
     def scored(settings: Sequence[Settings]) -> list[float]:
         configs = [changed(config, one) for one in settings]
-        valid = [c for c in configs if c is not None]
-        scores = iter(choosing.scores(valid))
+        valid = [config for config in configs if config is not None]
+        values = iter(choosing.f1(valid))
         tick(len(settings))
-        return [-1.0 if c is None else f1(choosing.counts(next(scores))) for c in configs]
+        return [-1.0 if config is None else next(values) for config in configs]
 
     tried: dict[tuple[tuple[str, Any], ...], float] = {}
     for point, value in search(config, keys, scored, trials, defaults=defaults):
@@ -310,33 +280,33 @@ def _confirmed(
     """Compare the present configuration with the changed one on the frames to confirm on."""
     after = changed(config, settings)
     assert after is not None
-    old, new = sample.scores([config, after])
-    counts = sample.counts(old), sample.counts(new)
-    units = sorted({s.unit for s in sample.frames})
-    of_unit = np.array([units.index(s.unit) for s in sample.frames])
-    sums = [np.stack([c[of_unit == i].sum(axis=0) for i in range(len(units))]) for c in counts]
-    rng = np.random.default_rng(0)
-    draws = rng.integers(len(units), size=(DRAWS, len(units)))
-    differences = [f1(sums[1][draw]) - f1(sums[0][draw]) for draw in draws]
-    low, high = np.quantile(differences, [0.025, 0.975]).tolist()
+    old, new = ObjectScore(), ObjectScore()
     totals: Counter[str] = Counter(cause_fixed=0, cause_missed=0)
-    for s, a, b in zip(sample.frames, old, new, strict=True):
-        fixed, missed = int((b.found & ~a.found).sum()), int((s.truth.must & ~a.found).sum())
-        totals.update(fixed=fixed, missed=missed, broken=int((a.found & ~b.found).sum()))
-        totals.update(found=int(a.found.sum()), false_before=a.false.total(), false_after=b.false.total())
-        if s.of_cause:
-            totals.update(cause_fixed=fixed, cause_missed=missed)
+    for sampled, outcomes in sample.outcomes([config, after]):
+        objects, new_objects = (outcome.objects for outcome in outcomes)
+        old.add(objects, sampled.truth)
+        new.add(new_objects, sampled.truth)
+        change = before_after(objects, new_objects, sampled.truth)
+        there, found, _ = change.found
+        fixed = len(change.fixed)
+        totals.update(fixed=fixed, missed=there - found, found=found, broken=len(change.broken))
+        if sampled.of_cause:
+            totals.update(cause_fixed=fixed, cause_missed=there - found)
+    units = [sampled.unit for sampled in sample.frames]
+    gain = f1_change(sample.counts(old), sample.counts(new), units)
     return Fix(
         settings=settings,
-        confirmed=bool(settings) and low > 0,
+        confirmed=bool(settings) and gain.is_better,
         searched=keys,
         trials=trials,
-        f1_before=f1(counts[0]),
-        f1_after=f1(counts[1]),
-        f1_change=(low, high),
+        f1_before=gain.before,
+        f1_after=gain.after,
+        f1_change=(gain.low, gain.high),
         frames=len(sample.frames),
-        units=len(units),
+        units=len(set(units)),
         parts=parts,
+        false_before=old.total["fp"],
+        false_after=new.total["fp"],
         **totals,
     )
 

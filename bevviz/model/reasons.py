@@ -66,6 +66,27 @@ class ReasonKind(StrEnum):
     PROBLEM = "problem"
 
 
+_OF_STAGE = {  # stage -> reasons for which it lost an object, or made a false one
+    "sensors": (ReasonKind.OUT_OF_VIEW, ReasonKind.HIDDEN, ReasonKind.NO_POINTS),
+    "ground": (ReasonKind.GROUND,),
+    "clustering": (
+        *(ReasonKind.NOISE, ReasonKind.NO_CLUSTER, ReasonKind.TOO_SMALL, ReasonKind.TOO_LARGE),
+        *(ReasonKind.SPLIT, ReasonKind.MERGED),
+    ),
+    "detector": (
+        *(ReasonKind.NOT_RUN, ReasonKind.NOT_DETECTED, ReasonKind.BELOW_THRESHOLD),
+        *(ReasonKind.SUPPRESSED, ReasonKind.DETECTOR_ERROR),
+    ),
+    "fusion": (
+        *(ReasonKind.NOT_FUSED, ReasonKind.LOW_OVERLAP, ReasonKind.TOO_FEW_POINTS, ReasonKind.TOO_FAR),
+        *(ReasonKind.TAKEN, ReasonKind.MISFIT, ReasonKind.OTHER_CLUSTER, ReasonKind.LOST_IN_FUSION),
+        *(ReasonKind.SHARED_BOX, ReasonKind.BORROWED, ReasonKind.MISNAMED, ReasonKind.MISPLACED),
+        *(ReasonKind.DUPLICATE, ReasonKind.WRONG_DEPTH, ReasonKind.WALL),
+    ),
+    "objects": (ReasonKind.NOT_AMONG, ReasonKind.CONTRADICTED),
+}
+STAGES = {kind: stage for stage, kinds in _OF_STAGE.items() for kind in kinds}
+
 PARAMETERS = {  # the parameter that decides
     ReasonKind.GROUND: "ground.distance_threshold",
     ReasonKind.NOISE: "clustering.min_points",

@@ -1,4 +1,4 @@
-"""Parameter sweeps. Imports `evaluate` and below."""
+"""Parameter sweeps. Imports `why` and below."""
 
 from bevviz.sweep.run import Parameter, Sweep, SweepOutcome, combine, parse
 

@@ -1,4 +1,4 @@
-"""Swept parameters, and the run of every combination of their values on the same frames."""
+"""Swept parameters, and the outcome of every combination of their values on the same frames."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.errors import UserError, printable
 from bevviz.evaluate import ObjectScore, Truth
+from bevviz.evaluate.f1_change import f1_change
 from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
-from bevviz.model.results import FrameResult
-from bevviz.pipeline.session import Variants, check_same_frames
+from bevviz.pipeline.session import check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
+from bevviz.why.experiment import Experiment, Outcome
 
 MOST = 500  # combinations of values, at most
-PARTS = 20  # parts of a drive that are left out in turn to estimate the noise of F1
-SIGNIFICANT = 2.0  # standard errors by which two values of F1 differ
 
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*:\s*({_NUMBER})\s*")
@@ -138,46 +137,19 @@ class SweepOutcome:
     failures: int = 0
     judged: int = 0  # frames with ground truth
     score: ObjectScore = field(default_factory=ObjectScore)
-    frame_counts: list[tuple[int, int, Counter[str]]] = field(
-        default_factory=list
-    )  # true, missed, false names
 
-    def add(self, result: FrameResult, truth: Truth | None) -> None:
-        """Add the result of one frame."""
+    def add(self, outcome: Outcome) -> None:
+        """Add the outcome of one frame."""
+        result = outcome.result
         self.frames += 1
         self.failures += len(result.failures)
         self.counts.update(count_results(result))
-        self.counts["objects"] += 0 if result.objects is None else len(result.objects)
+        self.counts["objects"] += len(outcome.objects)
         for stage in STAGES:
             self.seconds[stage].append(result.timings.get(stage, 0.0))
-        if truth is not None and result.objects is not None:
+        if outcome.truth is not None and outcome.matches is not None and result.objects is not None:
             self.judged += 1
-            matches = self.score.add(result.objects, truth)
-            false = Counter(result.objects.names[j].lower() for j in np.flatnonzero(matches.false))
-            self.frame_counts.append((int(matches.true.sum()), int(matches.missed.sum()), false))
-
-    @property
-    def f1_of_parts(self) -> F64:
-        """(B,) F1 without each of B parts of the drive. The parts are runs of consecutive judged frames.
-
-        Neighbouring frames show the same objects. So parts, and not single frames, are left out.
-        """
-        judged = self.score.judged
-        counts = np.array(
-            [
-                (2 * true, missed + sum(n for name, n in false.items() if judged.of(name) is not None))
-                for true, missed, false in self.frame_counts
-            ]
-        )
-        parts = np.array([part.sum(axis=0) for part in np.array_split(counts, min(len(counts), PARTS))])
-        rest = parts.sum(axis=0) - parts
-        return np.asarray(rest[:, 0] / np.maximum(rest.sum(axis=1), 1))
-
-    @property
-    def one_object(self) -> float:
-        """Change of F1 if one more object were right. It is the least difference that is not noise."""
-        total = self.score.total
-        return 2 / max(2 * total["tp"] + total["fp"] + total["fn"], 1)
+            self.score.count(result.objects.names, outcome.truth, outcome.matches)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -261,15 +233,14 @@ class Sweep:
         self.parameters, self.configs = parameters, configs
         self.outcomes = {values: SweepOutcome() for values in configs}
         self.truth = truth
-        self._variants = Variants()
+        self._experiment = Experiment(truth)
         for config in configs.values():
-            self._variants.check(config)
+            self._experiment.variants.check(config)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> int:
         """Run every combination on the frame. Return the index of the frame."""
-        truth = self.truth(frame) if self.truth else None
         for values, config in self.configs.items():
-            self.outcomes[values].add(self._variants.perceive(frame, config, network), truth)
+            self.outcomes[values].add(self._experiment.outcome(frame, config, network=network))
         return frame.index
 
     def finish(self, index: int) -> int:
@@ -287,25 +258,14 @@ class Sweep:
 
     @property
     def alike(self) -> Sequence[Values]:
-        """Values that are the best within the noise, the one with the highest F1 first.
-
-        The noise is the standard error of the difference in F1 on the same frames, by leaving out each part
-        of the drive in turn. It is at least one object.
-        """
+        """Values that are the best within the noise, the one with the highest F1 first."""
         rated = self._rated
         if not rated:
             return ()
-        best, *others = rated
-        outcomes = self.outcomes
-        top, top_parts = outcomes[best].score.f1, outcomes[best].f1_of_parts
-        alike = [best]
-        for values in others:
-            outcome = outcomes[values]
-            parts = top_parts - outcome.f1_of_parts
-            error = math.sqrt((len(parts) - 1) / len(parts) * float(((parts - parts.mean()) ** 2).sum()))
-            if top - outcome.score.f1 <= max(SIGNIFICANT * error, outcomes[best].one_object):
-                alike.append(values)
-        return alike
+        best = self.outcomes[rated[0]].score.frames
+        return [
+            values for values in rated if not f1_change(self.outcomes[values].score.frames, best).is_better
+        ]
 
     @property
     def _rated(self) -> Sequence[Values]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE, Truth
 from bevviz.model import box_overlap, geometry
-from bevviz.model.class_names import DATA_SETS
 from bevviz.model.reasons import Reason, ReasonKind, scored
 from bevviz.model.results import Decision, FrameResult, Objects
 from bevviz.why.evidence import MOST, camera_and_fusion
@@ -53,9 +52,7 @@ def _false_reasons(traces: FrameIndex) -> Iterator[tuple[int, Reason]]:
             if (doubt := _doubt(traces, objects, row)) is not None:
                 yield row, doubt
         return
-    # A label of the same data set in another frame may accept a name that no label of this frame does.
-    families = [names for names in DATA_SETS if names.keys() & set(truth.labels)] or DATA_SETS
-    judged = frozenset().union(*truth.accepted, *(names for family in families for names in family.values()))
+    judged = truth.judged_names
     for row in np.flatnonzero(matches.false).tolist():
         if objects.names[row].lower() in judged:
             yield row, _cause(traces, objects, row)

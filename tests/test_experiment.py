@@ -1,0 +1,155 @@
+"""Experiments: states of objects under several configurations, and which configuration is better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from bevviz.config import load
+from bevviz.evaluate import Truth, truth_of
+from bevviz.evaluate.differences import before_after
+from bevviz.evaluate.f1_change import f1_change
+from bevviz.model.frame import Boxes3D, Frame
+from bevviz.model.results import FrameResult, Objects
+from bevviz.pipeline.session import Variants
+from bevviz.why.experiment import Experiment
+from tests.support import small_drives
+
+FRAMES = 2
+
+
+@cache
+def drive() -> tuple[list[Frame], small_drives.KnownDetections]:
+    loader, frames = small_drives.KnownDetections(), []
+    for snapshot in small_drives.snapshots(small_drives.source(3, FRAMES), FRAMES):
+        image = snapshot.frame.cameras[0].image
+        assert image is not None
+        loader.add(image.stamp, small_drives.candidates(snapshot))
+        frames.append(snapshot.frame)
+    return frames, loader
+
+
+def truth(frame: Frame) -> Truth:
+    assert frame.truth is not None
+    return truth_of(frame, frame.truth)
+
+
+def test_the_table_has_the_state_of_each_object_under_each_configuration() -> None:
+    frames, loader = drive()
+    configurations = {"default": load(), "strict": load(settings=["detector.conf_threshold=0.9"])}
+    table = Experiment(truth, Variants(loader)).table(frames, configurations, reasons=True)
+    rows = table.to_pylist()
+    for frame in frames:
+        wanted = np.flatnonzero(truth(frame).must).tolist()
+        for name in configurations:
+            of_side = [r for r in rows if (r["frame"], r["configuration"]) == (frame.index, name)]
+            states = {r["object"]: r["state"] for r in of_side if r["state"] != "false"}
+            assert list(states) == [f"truth//{row}" for row in wanted]
+            if name == "strict":  # Every detection has a score of 0.8.
+                assert set(states.values()) == {"missed"} and len(of_side) == len(wanted)
+            else:
+                assert "found" in states.values()
+    lost = [r for r in rows if r["configuration"] == "strict" and r["reason"] == "below threshold"]
+    assert lost and {r["stage"] for r in lost} == {"detector"}
+    assert all(r["reason"] == r["stage"] == "" for r in rows if r["state"] == "found")
+    boxes = truth(frames[0]).boxes
+    for r in rows:
+        if r["frame"] == 0 and r["object"].startswith("truth"):
+            k = int(r["object"].rpartition("/")[2])
+            assert [r["x"], r["y"], r["z"]] == pytest.approx(boxes.center[k].tolist())
+            assert r["distance"] == pytest.approx(np.hypot(r["x"], r["y"]), rel=1e-5)
+
+
+def test_without_ground_truth_objects_are_reported_or_doubtful() -> None:
+    frames, loader = drive()
+    unlabelled = [replace(frame, truth=None) for frame in frames]
+    table = Experiment(variants=Variants(loader)).table(unlabelled, {"default": load()})
+    assert (
+        set(table["state"].to_pylist()) <= {"reported", "doubtful"}
+        and "reported" in table["state"].to_pylist()
+    )
+    assert all(name.startswith("object//") for name in table["object"].to_pylist())
+
+
+def test_a_kept_result_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    (frame, other), loader = drive()
+    runs: list[int] = []
+    perceive = Variants.perceive
+
+    def counted(self: Variants, frame: Frame, *rest: object) -> FrameResult:
+        runs.append(frame.index)
+        return perceive(self, frame, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Variants, "perceive", counted)
+    experiment = Experiment(truth, Variants(loader), kept=2)
+    first = experiment.outcome(frame, load())
+    assert experiment.outcome(frame, load(settings=["voxel.size=0.05"])).result is not first.result
+    assert experiment.outcome(frame, load()).result is first.result and runs == [0, 0]
+    experiment.outcome(other, load())
+    experiment.outcome(frame, load())
+    assert runs == [0, 0, 1, 0]
+
+
+# --- before and after --------------------------------------------------------------------------
+
+
+def boxes(*places: float) -> Boxes3D:
+    center = np.array([(x, 0, 0) for x in places], np.float32).reshape(-1, 3)
+    return Boxes3D(center, np.ones_like(center), np.zeros(len(center), np.float32))
+
+
+def cars(*places: float) -> Objects:
+    none = np.zeros(len(places), np.int32)
+    score = np.ones(len(places), np.float32)
+    return Objects(boxes(*places), ("car",) * len(places), score, none, ("",) * len(places), none)
+
+
+def test_fixed_broken_new_false_and_false_gone_are_told_apart() -> None:
+    places, must = (10, 20, 30, 40), np.array([True, True, True, False])
+    labels = Truth(boxes(*places), ("car",) * 4, (frozenset({"car"}),) * 4, must)
+    # 60 stays false, 70 goes, 80 comes. The car at 40 need not be found.
+    change = before_after(cars(10, 20, 60, 70), cars(10, 30, 60.5, 80, 40), labels)
+    assert (change.fixed, change.broken) == ([2], [1])
+    assert (change.new_false, change.false_gone) == ([3], [3])
+    assert change.found == (3, 2, 2) and change.changed == 1
+    unknown = before_after(cars(10, 20, 60, 70), cars(10, 30, 60.5, 80, 40), None)
+    assert (unknown.new_false, unknown.false_gone) == ([1, 3, 4], [1, 3])
+    assert unknown.fixed == unknown.broken == []
+
+
+def test_a_name_that_no_label_accepts_is_not_false() -> None:
+    labels = Truth(boxes(10), ("car",), (frozenset({"car"}),), np.array([True]))
+    benches = replace(cars(50), names=("bench",))
+    assert before_after(None, benches, labels).new_false == []
+    assert before_after(None, cars(50), labels).new_false == [0]
+
+
+# --- which one is better -----------------------------------------------------------------------
+
+
+def test_a_gain_in_all_parts_is_more_than_noise() -> None:
+    before, after = np.tile([6.0, 4, 2], (40, 1)), np.tile([8.0, 2, 2], (40, 1))
+    change = f1_change(before, after)
+    assert (change.before, change.after) == pytest.approx((12 / 18, 16 / 20))
+    assert change.low == pytest.approx(change.high) == pytest.approx(16 / 20 - 12 / 18)
+    assert change.is_better and not f1_change(after, before).is_better
+
+
+def test_a_gain_in_one_part_alone_may_be_chance() -> None:
+    before = np.tile([6.0, 4, 2], (40, 1))
+    after = before.copy()
+    after[:2] = 10, 0, 2
+    change = f1_change(before, after)
+    assert change.after > change.before and change.low == 0 and not change.is_better
+    assert not f1_change(before, before).is_better
+
+
+def test_frames_of_one_drive_are_drawn_together() -> None:
+    """One drive gains and one loses: 20 frames of each are no evidence."""
+    before = np.tile([6.0, 4, 2], (40, 1))
+    after = before + np.repeat([[3.0, -3, 0], [-2, 2, 0]], 20, axis=0)
+    names = ["a"] * 20 + ["b"] * 20
+    assert f1_change(before, after, names).low < 0 < f1_change(before, after, names).high
