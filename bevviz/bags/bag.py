@@ -185,6 +185,11 @@ class Recording(Closable):
             for name in sorted(first)
         )
 
+    def publishers(self, topic: str) -> str:
+        """Return the names of the nodes that published a topic. Empty: the recording does not say them."""
+        owners = (c.owner for f in self.files for c in f.connections if c.topic == topic)
+        return next((owner for owner in owners if isinstance(owner, str)), "")
+
     @cached_property
     def _types_by_topic(self) -> dict[str, str]:
         """Type by topic: that of its first messages, else the first that any file states."""

@@ -54,6 +54,7 @@ _FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of the summary and 
 _STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., chunks, first and last log time
 _COUNT = struct.Struct("<HQ")
 
+PUBLISHERS = "bevviz_publishers"  # key of a channel's metadata: names of the nodes that publish the topic
 NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
@@ -99,10 +100,11 @@ class Channels:
         profiles_by_text: dict[str, list[Qos]] = {"": []}
         for number, (schema, topic, encoding, metadata) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
-            digest, profiles = "", list[Qos]()
+            digest, profiles, publishers = "", list[Qos](), None
             with suppress(DamageError), as_damage():
                 stated = read_metadata(metadata)
                 digest = stated.get("topic_type_hash", "")
+                publishers = stated.get(PUBLISHERS)
                 text = stated.get("offered_qos_profiles", "")
                 is_new = text not in profiles_by_text and len(profiles_by_text) <= MAX_PROFILES
                 if is_new and len(text) <= MAX_PROFILE:
@@ -110,7 +112,9 @@ class Channels:
                 profiles = profiles_by_text.get(text, [])
             extra = ConnectionExtRosbag2(encoding, profiles)
             count = counts.get(number, 0)
-            connections.append(Connection(number, topic, msgtype, definition, digest, count, extra, None))
+            connections.append(
+                Connection(number, topic, msgtype, definition, digest, count, extra, publishers)
+            )
         return connections
 
 

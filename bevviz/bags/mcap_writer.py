@@ -24,6 +24,7 @@ from rosbags.interfaces import (
 from ruamel.yaml import YAML
 
 from bevviz.bags.completion import McapOutput, resume, start_writer
+from bevviz.bags.mcap import PUBLISHERS
 from bevviz.errors import UserError
 from bevviz.support import cleanup
 from bevviz.support.files import claim_target, rename_new
@@ -174,6 +175,8 @@ class McapWriter:
             metadata["offered_qos_profiles"] = profiles.getvalue().decode()
         if connection.digest.startswith("RIHS"):
             metadata["topic_type_hash"] = connection.digest
+        if isinstance(connection.owner, str):
+            metadata[PUBLISHERS] = connection.owner
         return self._writer.register_channel(connection.topic, form, self._schemas[key], metadata)
 
     def _add_schema(self, msgtype: str, definition: MessageDefinition, form: str) -> int:

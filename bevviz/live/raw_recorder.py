@@ -25,9 +25,10 @@ from rosbags.interfaces import (
 
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests
+from bevviz.live.graph import UNKNOWN, PublishedTopic, Subscriptions, TypeRequests, full_name
 from bevviz.live.node import Node
 from bevviz.messages.definitions import store_of
+from bevviz.messages.foreign_boxes import holds_boxes
 
 MEGABYTE = 1_000_000
 LEAD = 3.0  # seconds before the first frame, in which its synchronised messages and transforms came
@@ -101,6 +102,7 @@ class RawRecorder:
     def __init__(self, config: LiveConfig) -> None:
         self.config = config
         self.left_out: dict[str, str] = {}  # published topic that is not recorded -> reason
+        self._types: dict[str, str] = {}  # by recorded topic
         self._messages: deque[tuple[float, RawMessage]] = deque()  # with the monotonic time of ``put``
         self._latched = LatchedMessages()
         self._size = self._since = 0
@@ -123,9 +125,18 @@ class RawRecorder:
         """Time of receipt from which on all messages are in the buffer, nanoseconds. 0: none was dropped."""
         return self._since
 
+    @property
+    def object_topics(self) -> set[str]:
+        """Topics with objects in space that were recorded, also such that came too late for each frame."""
+        types = dict(self._types)  # the receiving thread may add one
+        return {
+            name for name, kind in types.items() if kind.endswith("/Detection3DArray") or holds_boxes(kind)
+        }
+
     def put(self, message: RawMessage) -> None:
         """Add a message, drop old ones, and pass it to the attached sink."""
         now = time.monotonic()
+        self._types[message.connection.topic] = message.connection.msgtype
         with self._lock:
             self._messages.append((now, message))
             self._size += len(message.data)
@@ -164,7 +175,10 @@ class RawRecorder:
                     latched.add(message)
         recent.sort(key=lambda message: message.received)
         first = recent[0].received if recent else time.time_ns()
-        return [*latched.before(first), *recent]
+        messages = [*latched.before(first), *recent]
+        # The last connection of a topic has the names of its nodes, which may be discovered late.
+        newest = {(m.connection.topic, m.connection.msgtype): m.connection for m in messages}
+        return [m._replace(connection=newest[m.connection.topic, m.connection.msgtype]) for m in messages]
 
     def attach(self, sink: Sink, begin: Callable[[list[RawMessage]], None]) -> None:
         """Pass the held messages to ``begin``, and every later one to ``sink``, in the receiving thread."""
@@ -229,7 +243,7 @@ class RawTopics:
     def put(self, topic: PublishedTopic, received: int, info: Mapping[str, Any], data: bytes) -> None:
         """Record a message of any topic."""
         connection = self._connections.get(topic.name)
-        if connection is None or connection.msgtype != topic.type:
+        if connection is None or connection.msgtype != topic.type or _is_named_now(connection, topic):
             connection = self._connections[topic.name] = connection_of(topic)
         sent = info.get("source_timestamp") or received
         self._recorder.put(RawMessage(connection, received, sent, data))
@@ -303,7 +317,17 @@ def connection_of(topic: PublishedTopic) -> Connection:
         digest = ""
     extra = ConnectionExtRosbag2("cdr", [_qos(publisher.qos_profile) for publisher in topic.publishers])
     nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
-    return Connection(0, topic.name, topic.type, nothing, digest, 0, extra, None)
+    return Connection(0, topic.name, topic.type, nothing, digest, 0, extra, _node_names(topic) or None)
+
+
+def _node_names(topic: PublishedTopic) -> str:
+    """Return the names of the publishing nodes. A node is often discovered after its publisher."""
+    return ", ".join(full_name(p) for p in topic.publishers if p.node_name != UNKNOWN)
+
+
+def _is_named_now(connection: Connection, topic: PublishedTopic) -> bool:
+    """Return whether the names of the publishing nodes are known now, and were not before."""
+    return connection.owner is None and bool(_node_names(topic))
 
 
 def _qos(profile: Any) -> Qos:

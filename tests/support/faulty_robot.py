@@ -10,6 +10,7 @@ import json
 import select
 import subprocess
 import sys
+import time
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -95,8 +96,7 @@ def main() -> None:
             print("done", flush=True)
         for publication, publisher in publications.values():
             if publisher is not None and not publication.silent:
-                now = next(iter(nodes.values())).get_clock().now().to_msg()
-                publisher.publish(_message(publication, now))
+                publisher.publish(make_message(publication, time.time_ns()))
 
 
 def _type(kind: str) -> Any:
@@ -106,12 +106,14 @@ def _type(kind: str) -> Any:
     return {"PointCloud2": PointCloud2, "Image": Image, "String": String}[kind]
 
 
-def _message(publication: Publication, stamp: Any) -> Any:
+def make_message(publication: Publication, stamp: int) -> Any:
+    """Return a message of a publication with a stamp in nanoseconds."""
     message = _type(publication.kind)()
     if publication.kind == "String":
         message.data = "not a cloud"
         return message
-    message.header.stamp, message.header.frame_id = stamp, publication.frame
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+    message.header.frame_id = publication.frame
     if publication.kind == "Image":
         message.height, message.width, message.encoding, message.step = 36, 64, "bgr8", 192
         message.data = array("B", bytes(36 * 192))

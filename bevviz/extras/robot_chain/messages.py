@@ -12,7 +12,15 @@ import numpy as np
 from bevviz.bags.message import RawMessage
 from bevviz.bags.source import BagSource
 from bevviz.errors import UserError
-from bevviz.extras.robot_chain.chain import NEAR, SECOND, ObjectMessage, RobotChain, StepOutcome, verdict
+from bevviz.extras.robot_chain.chain import (
+    ENDED,
+    NEAR,
+    SECOND,
+    ObjectMessage,
+    RobotChain,
+    StepOutcome,
+    verdict,
+)
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.detections import decode_boxes
 from bevviz.messages.guard import guard
@@ -37,6 +45,7 @@ class FollowedObject:
         outcomes: one for each step that it could have reached.
         chain: the steps.
         notes: one sentence for each topic that is not in the chain.
+        nodes: names of the nodes that publish a topic, by topic. Empty: the bag does not say them.
     """
 
     label: str
@@ -44,6 +53,7 @@ class FollowedObject:
     outcomes: tuple[StepOutcome, ...]
     chain: RobotChain
     notes: Sequence[str]
+    nodes: Mapping[str, str]
 
     @property
     def is_known(self) -> bool:
@@ -64,10 +74,14 @@ class FollowedObject:
         if change is None:
             kept = [one.topic for one in self.outcomes if one.row >= 0]
             return f"{name}: kept by all steps, the last is {kept[-1]}"
+        if change.state == "unknown":
+            return f"{name}: {ENDED}"
         verb = {"message lost": "lost with the whole message", "not made": "not made"}.get(
             change.state, change.state
         )
-        return f"{name}: {verb} by the step that makes {change.topic}"
+        node = self.nodes[change.topic]
+        maker = f"{node}, which makes {change.topic}" if node else f"the step that makes {change.topic}"
+        return f"{name}: {verb} by {maker}"
 
     def result(self) -> RobotObjectResult:
         """Return the object in plain values."""
@@ -89,7 +103,9 @@ class FollowedObject:
             "text": self.text,
             "steps": [
                 {
-                    "about": step_line(step.topic, self.chain).removeprefix(f"{step.topic}: "),
+                    "about": step_line(step.topic, self.chain, self.nodes[step.topic]).removeprefix(
+                        f"{step.topic}: "
+                    ),
                     "text": outcomes[step.topic].text if step.topic in outcomes else "",
                     "changed": change is not None and step.topic == change.topic,
                 }
@@ -118,7 +134,7 @@ class RobotQuestions:
         self._source, self._frame = source, frame
         self._world, self._middle = frame.world_frame, frame.received
         self.notes: list[str] = []
-        low, high = frame.received - AROUND, frame.received + AROUND
+        low, high = _window(frame.received, source.recording.start, source.recording.end)
         self._tf = TransformBuffer(4 * AROUND / SECOND)
         self._read_transforms(low, high)
         roles = source.roles
@@ -144,6 +160,7 @@ class RobotQuestions:
             name: self._stamps(name, low, high) for name in (*roles.lidars, *(c.topic for c in roles.cameras))
         }
         self.chain = RobotChain({name: those for name, those in messages.items() if name not in few}, sensors)
+        self._nodes = {name: source.recording.publishers(name) for name in names}
 
     def about(self, frame: Frame) -> RobotQuestions:
         """Return the questions about another frame. The chain is the same where the frame is near.
@@ -164,7 +181,9 @@ class RobotQuestions:
         place = np.asarray(center, np.float64)
         world = geometry.apply(self._frame.pose, place[None].astype(np.float32))[0]
         outcomes = self.chain.follow(self._frame.stamp, world)
-        return FollowedObject(self._label(outcomes), place, tuple(outcomes), self.chain, self.notes)
+        return FollowedObject(
+            self._label(outcomes), place, tuple(outcomes), self.chain, self.notes, self._nodes
+        )
 
     def objects(self) -> list[FollowedObject]:
         """Follow every object that a step has in the frame. Changed ones come first, nearest first."""
@@ -188,7 +207,7 @@ class RobotQuestions:
     def lines(self) -> Iterator[str]:
         """Yield one line for each step of the chain."""
         for step in self.chain.steps:
-            yield step_line(step.topic, self.chain)
+            yield step_line(step.topic, self.chain, self._nodes[step.topic])
         yield from self.notes
 
     # --- reading -------------------------------------------------------------------------------
@@ -240,14 +259,24 @@ class RobotQuestions:
         return ObjectMessage(boxes.stamp, message.received, center, boxes.boxes.size, boxes.labels, boxes.ids)
 
 
-def step_line(topic: str, chain: RobotChain) -> str:
-    """Return one line about a step: what it is made from, with delay and loss."""
-    step = chain[topic]
+def _window(received: int, start: int, end: int) -> tuple[int, int]:
+    """Return the log times around a frame that the chain is inferred from.
+
+    Near an end of the bag the times reach further to its other side, so that no fewer messages tell the
+    parents.
+    """
+    low = max(start, min(received - AROUND, end + 1 - 2 * AROUND))
+    return low, low + 2 * AROUND
+
+
+def step_line(topic: str, chain: RobotChain, node: str = "") -> str:
+    """Return one line about a step: its node, what it is made from, with delay and loss."""
+    step, maker = chain[topic], f"by {node}, " if node else ""
     if not step.parents:
-        return f"{topic}: from which it is made cannot be told"
+        return f"{topic}: {maker}from which it is made cannot be told"
     rivals = f" (or {', '.join(step.rivals)}: they cannot be told apart)" if step.rivals else ""
     parts = [f"{1e3 * step.delay:.0f} ms later"]
     if step.parents[0] in chain.messages:
         parts += [f"{step.dropped:.0%} of the objects dropped"]
     parts += [f"{step.lost:.0%} of the messages lost"]
-    return f"{topic}: from {' and '.join(step.parents)}{rivals}, {', '.join(parts)}"
+    return f"{topic}: {maker}from {' and '.join(step.parents)}{rivals}, {', '.join(parts)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,14 @@ from bevviz.extras.robot_chain.chain import ObjectMessage, RobotChain, verdict
 from bevviz.extras.robot_chain.messages import FollowedObject
 from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
+from bevviz.model.results import FrameResult
+from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
 from bevviz.workbench.recorded_drive import RecordedDrive
-from tests.support import bags, documented_json
+from tests.support import bags, chained_robot, documented_json
 from tests.support.live_sessions import live_bench
 from tests.support.robot_graphs import PARENT, TOPICS, Graph, Plant, make_graph
+from tests.support.ros_graphs import own_graph
+from tests.support.waiting import PATIENCE
 from tests.support.workbench_pages import Talk, served
 
 SEEDS = range(500, 508)
@@ -226,3 +231,42 @@ def test_a_running_robot_is_asked_for_its_nodes(bag: tuple[Path, Graph]) -> None
                 change = followed.change
                 right += change is not None and change.topic == TOPICS[plant.node]
     assert right >= len(graph.plants) - 1
+
+
+# --- asked beside a robot -------------------------------------------------------------------------
+
+
+def test_the_nodes_of_a_running_robot_are_named() -> None:
+    """The results come after their frames, and the newest frames of the buffer have no later messages."""
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+    from bevviz.live.raw_recorder import RawRecorder
+    from bevviz.live.source import LiveSource
+
+    config = load()
+    raw = RawRecorder(config.live)
+    with (
+        own_graph(),
+        chained_robot.chained_robot(),
+        LiveSource(config, raw=raw) as robot,
+    ):
+        assert robot.wait(PATIENCE), robot.missing
+        frames = list(islice(robot, 33))[:30]  # those after them have the results of the last one
+        assert raw.object_topics == set(chained_robot.TOPICS.values())
+        assert sum(len(frame.robot_boxes) for frame in frames) < len(frames), "the results came in time"
+        messages = raw.messages()
+    with HeldSeconds(messages, {}) as held:
+        delivered = [DeliveredFrame.of(FrameResult.unprocessed(frame, config)) for frame in frames]
+        place = chained_robot.PLACES[chained_robot.DROPPED].astype(np.float64)
+        texts = []
+        for frame, facts in zip(frames, delivered, strict=True):
+            robot_object = held.robot_questions(facts, frame).at(place)
+            assert isinstance(robot_object, FollowedObject)
+            texts.append(robot_object.text)
+        steps = [step["about"] for step in robot_object.page_form()["steps"]]
+    assert sorted(about.partition(", from ")[0] for about in steps) == [
+        f"by /{node}" for node in sorted(chained_robot.NODES)
+    ]
+    # A busy machine may receive them so late that a step seems to be made from the cloud.
+    if any(about.startswith("by /tracker, from /detector/objects") for about in steps):
+        assert any(text.endswith("dropped by /tracker, which makes /tracker/objects") for text in texts)
+    assert not any("dropped by /detector" in text or "dropped by /planner" in text for text in texts)
