@@ -1,0 +1,116 @@
+"""The judge of ``benchmarks.ideal``: ideal stages restore an object if they are its cause, and only then."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks import ideal, ideal_data
+from benchmarks.ideal_stages import STAGES, MissedObject, missed_rows
+from bevviz.config import changed_config
+from bevviz.model.results import ClusterState
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.stage_log import Memo
+
+ASKED = ideal_data.ASKED[0]
+
+
+@cache
+def drive() -> ideal_data.DataSet:
+    """Return a small drive."""
+    return ideal_data.small([7003])
+
+
+def newly_missed(*settings: str) -> list[MissedObject]:
+    """Return the objects of a frame that are missed with some settings only."""
+    data, memo = drive(), Memo()
+    labelled = data.frames[ASKED]
+    default = ideal.configuration("default", ())
+    config = changed_config(default, settings)
+    before, result = (
+        perceive(labelled.frame, some, data.loader.load(some), memo) for some in (default, config)
+    )
+    rows = set(missed_rows(result, labelled)) - set(missed_rows(before, labelled))
+    stages = data.loader.load(config)
+    return [MissedObject(labelled, row, result, stages, data.classes, memo) for row in sorted(rows)]
+
+
+@pytest.mark.parametrize(
+    ("setting", "stage"),
+    [
+        ("clustering.min_cluster_points=60", "clustering"),
+        ("detector.conf_threshold=0.9", "detection"),
+        ("fusion.max_depth=10", "fusion"),
+    ],
+)
+def test_the_ideal_of_the_mistuned_stage_restores_an_object_and_no_other_stage_does(
+    setting: str, stage: str
+) -> None:
+    missed = newly_missed(setting)
+    assert len(missed) >= 2
+    for one in missed:
+        assert one.restored_by() == ([stage], [])
+
+
+def test_two_mistuned_stages_need_both_ideals() -> None:
+    both = newly_missed("detector.conf_threshold=0.9", "fusion.max_depth=10")
+    alone = {one.row for one in newly_missed("detector.conf_threshold=0.9")}
+    alone &= {one.row for one in newly_missed("fusion.max_depth=10")}
+    found = [one.restored_by() for one in both if one.row in alone]
+    assert len(found) >= 2
+    assert all(answer == ([], [("detection", "fusion")]) for answer in found)
+
+
+def test_all_ideal_stages_restore_every_object() -> None:
+    data, memo = drive(), Memo()
+    labelled, config = data.frames[ASKED], ideal.configuration("reference", ())
+    stages = data.loader.load(config)
+    result = perceive(labelled.frame, config, stages, memo)
+    rows = missed_rows(result, labelled)
+    assert len(rows) >= 5
+    for row in rows:
+        missed = MissedObject(labelled, row, result, stages, data.classes, memo)
+        assert missed.is_found_with(set(STAGES)) and not missed.is_found_with(set())
+
+
+def test_an_ideal_cluster_is_the_object_and_is_kept() -> None:
+    missed = newly_missed("clustering.min_cluster_points=60")[0]
+    result = missed.result
+    assert result.obstacles is not None and result.clusters is not None
+    made = missed.ideal_clusters(result.obstacles, result.clusters, result.config.clustering)
+    own = missed.holds(result.obstacles)
+    assert set(made.labels[own].tolist()) == {len(made) - 1}
+    assert not (made.labels[~own] == len(made) - 1).any()
+    assert made.state[-1] == ClusterState.KEPT
+    assert np.array_equal(np.unique(made.labels[made.labels >= 0]), np.arange(len(made)))
+
+
+def test_alternatives_of_an_answer_are_read_from_words_and_lists() -> None:
+    assert ideal.alternatives(None) == []
+    assert ideal.alternatives("fusion") == [["fusion"]]
+    assert ideal.alternatives(["detector", "ground and clustering"]) == [
+        ["detection"],
+        ["ground", "clustering"],
+    ]
+    assert ideal.alternatives([("clusters", "fusion"), {"stages": ["detection"]}]) == [
+        ["clustering", "fusion"],
+        ["detection"],
+    ]
+
+
+def test_every_reason_of_a_loss_has_a_stage() -> None:
+    from bevviz.model.reasons import ReasonKind
+
+    stageless = {"reported", "failed", "out of view", "hidden", "no points"}
+    others = {"contradicted", "detector's own error", "not among the objects", "lost in the fusion"}
+    losses = {kind.value for kind in list(ReasonKind)[: list(ReasonKind).index(ReasonKind.KEPT)]}
+    assert losses - stageless - others == set(ideal.STAGE_OF)
+
+
+def test_halves_are_apart_and_together_all_frames() -> None:
+    data = drive()
+    seen, unseen = data.asked("seen"), data.asked("unseen")
+    assert not set(seen) & set(unseen)
+    assert sorted(seen + unseen) == data.asked("") == list(ideal_data.ASKED)
