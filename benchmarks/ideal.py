@@ -426,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     frames, most = 12, options.most
     if options.quick:
-        options.seeds, frames, most = options.seeds[:2], 5, min(most, 2)
+        options.seeds, frames, most = options.seeds[:5], 8, min(most, 3)
         options.data = [name for name in options.data if name in ("small", "kitti")]
     misses: list[Miss] = []
     for name, make in data_sets(options.folder, options.seeds, frames).items():
