@@ -116,6 +116,7 @@ class Miss:
     data: str
     drive: str
     frame: int
+    half: str
     configuration: str
     row: int
     label: str
@@ -195,7 +196,7 @@ class FrameBenchmark:
 
     def __init__(self, data: DataSet, position: int, name: str, memo: Memo) -> None:
         self.data, self.name, self.memo = data, name, memo
-        self.labelled = data.frames[position]
+        self.labelled, self.half = data.frames[position], data.half(position)
         self._beside = [(frame, Memo()) for frame in data.neighbours(position)]
         self.config = configuration(name, data.settings)
         self.stages = data.loader.load(self.config)
@@ -230,6 +231,7 @@ class FrameBenchmark:
                 data=self.data.name,
                 drive=self.labelled.drive,
                 frame=self.labelled.number,
+                half=self.half,
                 configuration=self.name,
                 row=row,
                 label=self.labelled.truth.labels[row],
@@ -346,7 +348,7 @@ def share(misses: Sequence[Miss], values: Share) -> tuple[int, int, float, float
 def figures(misses: Sequence[Miss]) -> dict[str, dict[str, Any]]:
     """Return the shares with their intervals and the median times, of all and of each group of misses."""
     groups = {"all": list(misses)}
-    for key in ("data", "configuration"):
+    for key in ("half", "data", "configuration"):
         for value in dict.fromkeys(getattr(miss, key) for miss in misses):
             groups[value] = [miss for miss in misses if getattr(miss, key) == value]
     found: dict[str, dict[str, Any]] = {}

@@ -78,14 +78,15 @@ class DataSet:
         beside = [i for i in (position - 1, position + 1) if 0 <= i < len(frames)]
         return [frames[i] for i in beside if frames[i].drive == drive]
 
-    def asked(self, half: str) -> list[int]:
+    def asked(self, half: str = "") -> list[int]:
         """Return the positions of the frames of one half that are asked about; an empty half is all."""
-        return [i for i, frame in enumerate(self.frames) if frame.asked and self._is_in(half, frame)]
+        return [i for i, f in enumerate(self.frames) if f.asked and half in ("", self.half(i))]
 
-    def _is_in(self, half: str, frame: LabelledFrame) -> bool:
-        """Return whether a frame belongs to a half."""
+    def half(self, position: int) -> str:
+        """Return the half of a frame: methods may be chosen on ``seen`` frames only."""
+        frame = self.frames[position]
         odd = zlib.crc32(f"{self.name}/{frame.drive}/{frame.number}".encode()) % 2
-        return not half or odd == (half == "unseen")
+        return "unseen" if odd else "seen"
 
 
 class LabelDetections(StageLoader):

@@ -113,4 +113,4 @@ def test_halves_are_apart_and_together_all_frames() -> None:
     data = drive()
     seen, unseen = data.asked("seen"), data.asked("unseen")
     assert not set(seen) & set(unseen)
-    assert sorted(seen + unseen) == data.asked("") == list(ideal_data.ASKED)
+    assert sorted(seen + unseen) == data.asked() == list(ideal_data.ASKED)
