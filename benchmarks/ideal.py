@@ -6,6 +6,8 @@ object, and the others run. It shares no rule, order or constant with ``bevviz.w
 
 To judge another version: ``PYTHONPATH=TREE python -P benchmarks/ideal.py``, with this folder copied there.
 
+With ``--blind`` the labels are hidden, and the question is the box around what the image shows of the object.
+
 An answer may have ``restored_by``, its own list of what restores the object. An item is one alternative: the
 name of a stage, or several names joined by "and", "+" or "," or in a list.
 """
@@ -19,7 +21,7 @@ import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +29,16 @@ import numpy as np
 
 from benchmarks.ideal_data import DataSet, LabelledFrame, data_sets
 from benchmarks.ideal_stages import CLUSTERING, DETECTION, FUSION, GROUND, MissedObject, counts, missed_rows
+from benchmarks.pages import write_section
 from bevviz.config import Config, changed_config, load
+from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_log import Memo
 from bevviz.why import FrameExplainer, Selection
 
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
-SEEDS = range(7000, 7012)
+SEEDS = range(7000, 7006)
+HEADING = "## Answers of `bevviz why`"
 DRAWS = 2000  # of whole drives, for the intervals
 
 PRESETS = ("default", "reference")
@@ -192,9 +197,11 @@ class FrameBenchmark:
         position: of the frame in it.
         name: name of the configuration.
         memo: results of stages on the frame.
+        blind: whether the labels are hidden.
     """
 
-    def __init__(self, data: DataSet, position: int, name: str, memo: Memo) -> None:
+    def __init__(self, data: DataSet, position: int, name: str, memo: Memo, *, blind: bool = False) -> None:
+        self.blind = blind
         self.data, self.name, self.memo = data, name, memo
         self.labelled, self.half = data.frames[position], data.half(position)
         self._beside = [(frame, Memo()) for frame in data.neighbours(position)]
@@ -216,15 +223,17 @@ class FrameBenchmark:
         cured = {row: self.name in PLANTED and self._is_found("default", row) for row in missed}
         rows = sorted(rng.permutation(missed).tolist(), key=lambda row: not cured[row])[:most]
         start = time.process_time()
-        explainer = FrameExplainer(self.result, self.data.loader, self.data.classes)
+        explainer = FrameExplainer(self._asked_result(), self.data.loader, self.data.classes)
         for number, row in enumerate(rows):
-            selection = Selection(truth=row)
+            judge = MissedObject(self.labelled, row, self.result, self.stages, self.data.classes, self.memo)
+            selection = self._selection(judge)
+            if selection is None:
+                continue
             explainer.ask(selection)
             question = time.process_time() - start
             start = time.process_time()
             answer = explainer.explain(selection, 1, everything=True)[0]
             search = time.process_time() - start
-            judge = MissedObject(self.labelled, row, self.result, self.stages, self.data.classes, self.memo)
             alone, pairs = judge.restored_by()
             kind = answer.verdict.kind.value
             yield Miss(
@@ -247,6 +256,28 @@ class FrameBenchmark:
                 question=None if number else question,
                 search=None if number else search,
             )
+
+    def _asked_result(self) -> FrameResult:
+        """Return the result that the question is about."""
+        if not self.blind:
+            return self.result
+        return replace(self.result, frame=replace(self.result.frame, truth=None))
+
+    def _selection(self, missed: MissedObject) -> Selection | None:
+        """Return how the object is selected: by its label, or by the image box that shows most of it.
+
+        The result is None if no image shows it.
+        """
+        if not self.blind:
+            return Selection(truth=missed.row)
+        boxes = [
+            (camera.name, missed.image_boxes(camera)[missed.row]) for camera in self.labelled.frame.cameras
+        ]
+        shown = [(name, box) for name, box in boxes if np.isfinite(box).all()]
+        if not shown:
+            return None
+        camera, box = max(shown, key=lambda pair: float(pair[1][2] - pair[1][0]))
+        return Selection(box=tuple(box.tolist()), camera=camera)
 
     def _is_found(self, name: str, row: int) -> bool:
         """Return whether an object is found with another configuration."""
@@ -382,6 +413,21 @@ def _cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
+def section(misses: Sequence[Miss], options: argparse.Namespace) -> str:
+    """Format the section of benchmarks/RESULTS.md."""
+    half = f"the {options.half} half of the frames" if options.half else "all frames"
+    return f"""{HEADING}
+
+`python -m benchmarks.ideal` asks about objects that `evaluate` counts as missed, on {half}: synthetic drives
+{options.seeds[0]} to {options.seeds[-1]}, KITTI and SUSTechPOINTS. One stage, or two, get the ideal result at
+the object, and the other stages run. An answer is right if it names a stage that restores the object so, or
+the pair that does.
+Brackets hold 95 % intervals.
+
+{table(misses)}
+"""
+
+
 def confusion(misses: Sequence[Miss]) -> str:
     """Format, for each reason, which ideal stages restore the objects."""
     by_reason: dict[str, list[Miss]] = defaultdict(list)
@@ -400,7 +446,9 @@ def confusion(misses: Sequence[Miss]) -> str:
 # --- the run -----------------------------------------------------------------------------------
 
 
-def measure(data: DataSet, names: Sequence[str], half: str, most: int) -> Iterator[Miss]:
+def measure(
+    data: DataSet, names: Sequence[str], half: str, most: int, *, blind: bool = False
+) -> Iterator[Miss]:
     """Ask about the missed objects of a data set with each configuration."""
     positions = data.asked(half)
     for position in positions[:1]:  # Compile the loops before the first question is timed.
@@ -408,7 +456,7 @@ def measure(data: DataSet, names: Sequence[str], half: str, most: int) -> Iterat
     for position in positions:
         memo = Memo(600)
         for name in names:
-            yield from FrameBenchmark(data, position, name, memo).misses(most)
+            yield from FrameBenchmark(data, position, name, memo, blind=blind).misses(most)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -421,21 +469,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="synthetic drives")
     parser.add_argument("--configurations", nargs="+", choices=CONFIGURATIONS, default=CONFIGURATIONS)
     parser.add_argument("--half", choices=("seen", "unseen"), default="", help="ask about half of the frames")
-    parser.add_argument("--most", type=int, default=5, help="objects of a frame and configuration")
+    parser.add_argument("--most", type=int, default=3, help="objects of a frame and configuration")
     parser.add_argument("--quick", action="store_true", help="about a minute: few drives, frames and objects")
     parser.add_argument("--wrong", action="store_true", help="list the answers that do not name the cause")
+    parser.add_argument("--blind", action="store_true", help="hide the labels, and ask by image boxes")
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="replace the section of this page")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write each miss and the figures")
     options = parser.parse_args(arguments)
     frames, most = 12, options.most
     if options.quick:
-        options.seeds, frames, most = options.seeds[:5], 8, min(most, 3)
+        options.seeds, frames, most = options.seeds[:3], 6, min(most, 2)
         options.data = [name for name in options.data if name in ("small", "kitti")]
     misses: list[Miss] = []
     for name, make in data_sets(options.folder, options.seeds, frames).items():
         if name not in options.data:
             continue
         start, before = time.perf_counter(), len(misses)
-        misses += measure(make(), options.configurations, options.half, most)
+        misses += measure(make(), options.configurations, options.half, most, blind=options.blind)
         print(f"{name}: {len(misses) - before} misses, {time.perf_counter() - start:.0f} s", flush=True)
         if options.json:
             tree = {"misses": [asdict(miss) for miss in misses], "figures": figures(misses)}
@@ -447,6 +497,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 where = f"{m.data} {m.drive} {m.frame} {m.configuration} row {m.row}"
                 print(f"{where}: restored by {said}: {m.text}")
     print(table(misses), confusion(misses), sep="\n")
+    if options.write:
+        write_section(options.write, section(misses, options))
 
 
 if __name__ == "__main__":

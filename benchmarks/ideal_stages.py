@@ -135,7 +135,7 @@ class MissedObject:
 
     def _ideal_detections(self, result: CameraResult) -> Detections | None:
         """Return the detections of a camera with one of the object, and no other one of it."""
-        detections, box = result.detections, self._image_boxes(result.camera)[self.row]
+        detections, box = result.detections, self.image_boxes(result.camera)[self.row]
         if detections is None or not np.isfinite(box).all():
             return detections
         state = detections.state.copy()
@@ -175,7 +175,7 @@ class MissedObject:
             own = np.flatnonzero(detections.kept & right & (self._owners(camera) == self.row))
             if not len(own):
                 continue
-            boxes = self._image_boxes(camera.camera)[[self.row]]
+            boxes = self.image_boxes(camera.camera)[[self.row]]
             d = int(own[geometry.iou(detections.xyxy[own], boxes)[:, 0].argmax()])
             k, box = self._fused_box(result, camera, d, clusters)
             if box is None:
@@ -228,7 +228,7 @@ class MissedObject:
 
     # --- the object in images ------------------------------------------------------------------
 
-    def _image_boxes(self, camera: Camera) -> F32:
+    def image_boxes(self, camera: Camera) -> F32:
         """Return (K, 4) image boxes of all labels, NaN where out of view."""
         projected = image_boxes(self.truth.boxes, camera)
         if camera.name != self.labelled.frame.cameras[0].name:
@@ -240,7 +240,7 @@ class MissedObject:
     def _owners(self, result: CameraResult) -> Any:
         """Return (D,) the row of the label that each detection shows, whatever its class; -1: none."""
         assert result.detections is not None
-        boxes = self._image_boxes(result.camera)
+        boxes = self.image_boxes(result.camera)
         seen = np.isfinite(boxes).all(axis=1)
         overlap = np.where(seen, geometry.iou(result.detections.xyxy, np.nan_to_num(boxes, nan=-1.0)), 0.0)
         return np.where(overlap.max(axis=1, initial=0) >= OWN, overlap.argmax(axis=1), -1)
