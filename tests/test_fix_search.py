@@ -39,9 +39,9 @@ def session(bag: Path) -> Iterator[WorkbenchSession]:
 def ended(session: WorkbenchSession) -> str:
     """Return the state of the search after its end."""
     end = time.monotonic() + PATIENCE
-    while session.tools.fix.state == "running" and time.monotonic() < end:
+    while session.tools.fix.jobs[-1].going and time.monotonic() < end:
         time.sleep(0.05)
-    return session.tools.fix.state
+    return session.tools.fix.jobs[-1].state
 
 
 @pytest.mark.long
@@ -64,7 +64,7 @@ def test_a_cancelled_search_can_be_begun_again(session: WorkbenchSession) -> Non
     fix = session.tools.fix
     for _ in range(2):
         fix.begin()
-        fix.end()
+        fix.cancel()
         assert ended(session) == "cancelled"
     assert session.progress()["fix"]["settings"] == []
 

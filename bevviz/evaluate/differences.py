@@ -260,6 +260,13 @@ class BeforeAfter:
         """Number of objects that have moved or have another class."""
         return sum(pair.change in (Change.MOVED, Change.CLASS) for pair in self.pairs)
 
+    @property
+    def balance(self) -> tuple[int, int]:
+        """Number of objects that get better and that get worse. Without ground truth: new and gone ones."""
+        if self.truth is None:
+            return len(self.new_false), len(self.false_gone)
+        return len(self.fixed) + len(self.false_gone), len(self.broken) + len(self.new_false)
+
     def text(self, row: int) -> str:
         """Return class and distance of a labelled object, as ``person at 12.3 m``."""
         assert self.truth is not None

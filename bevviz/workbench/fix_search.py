@@ -1,39 +1,47 @@
-"""Search of parameters that repair the drive of a page, in a background thread."""
+"""Search of parameters that repair the drive of a page."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
+from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
-    from bevviz.fleet.fix import Fix
-    from bevviz.workbench.source import Settings, Source
+    from bevviz.workbench.source import Source
 
 
-class FixSearch:
-    """Search of a fix for the missed and false objects of a recorded drive, as ``bevviz fix`` makes it.
+@dataclass(slots=True)
+class FixJob(Job):
+    """Search of a fix. ``settings`` are those that repair the drive.
+
+    Attributes:
+        text: its result in words.
+    """
+
+    text: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the search as JSON for the page."""
+        return Job.as_dict(self) | {"text": self.error or self.text}
+
+
+class FixSearch(Jobs[FixJob]):
+    """Searches of a fix for the missed and false objects of a recorded drive, as ``bevviz fix`` makes them.
 
     Args:
         source: the drive. Questions about it come first.
         paths: paths of its bag.
         truth: stated topic of the ground truth.
         labels: stated label files.
-
-    Attributes:
-        state: empty before the first search; running, over, cancelled or failed.
     """
 
     def __init__(self, source: Source, paths: Sequence[Path], truth: str | None, labels: Path | None) -> None:
+        super().__init__("fix", source.news.tell)
         self._source, self._paths, self._truth, self._labels = source, tuple(paths), truth, labels
-        self._stop = threading.Event()
-        self.state = ""
-        self._done = self._total = 0
-        self._text = ""
-        self._settings: Settings = ()
 
     def begin(self) -> None:
         """Start to search.
@@ -41,73 +49,39 @@ class FixSearch:
         Raises:
             UserError: a search is running, or there is no ground truth.
         """
-        if self.state == "running":
-            raise UserError("a fix is being searched: wait for it, or cancel it")
+        self.check_idle("a fix is being searched")
         if self._source.truth_of is None:
             raise UserError("there is no ground truth, by which a fix is judged")
-        self._stop.clear()
-        self.state, self._done, self._total, self._text, self._settings = "running", 0, 0, "", ()
-        threading.Thread(target=self._run, name="fix", daemon=True).start()
-        self._source.news.tell()
-
-    def end(self) -> None:
-        """Cancel the search. It ends after the settings in progress."""
-        self._stop.set()
+        self.start(FixJob(len(self.jobs)), self._search)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the search as JSON for the page."""
-        return {
-            "state": self.state,
-            "done": self._done,
-            "total": self._total,
-            "text": self._text,
-            "settings": list(self._settings),
-        }
+        """Return the newest search as JSON for the page. Before the first one, the state is empty."""
+        return (self.jobs[-1] if self.jobs else FixJob(0, state="")).as_dict()
 
-    def _run(self) -> None:
-        from bevviz.fleet.fix import text_of
+    def _search(self, job: FixJob) -> None:
+        """Search the parameters that decide what is missed or false."""
+        from bevviz.fleet.fix import TRIALS, DriveFrames, draw_samples, find_fix, keys_for, text_of
 
-        try:
-            fix = self._search()
-            if fix is None:
-                self._text = "Nothing that a parameter decides is missed or false."
-            else:
-                self._settings = tuple(f"{key}={text_of(value)}" for key, value in fix.settings.items())
-                self._text = "\n".join(line.strip() for line in fix.lines() if "--set" not in line)
-            self.state = "over"
-        except _CancelledError:
-            self.state = "cancelled"
-        except Exception as error:
-            self._text = str(error) if isinstance(error, UserError) else first_line(error)
-            self.state = "failed"
-        self._source.news.tell()
+        def pause() -> None:
+            """Tell the pages, and wait until no question is being answered."""
+            self._source.news.tell()
+            self._source.wait_for_quiet()
+            job.check()
 
-    def _search(self) -> Fix | None:
-        """Return the fix. None: no parameter decides what is missed or false."""
-        from bevviz.fleet.fix import TRIALS, DriveFrames, draw_samples, find_fix, keys_for
+        def count(number: int) -> None:
+            job.done = min(job.done + number, job.total)
+            pause()
 
         config = self._source.pipeline.config
         drive = DriveFrames(self._paths, "drive", range(self._source.scans), frozenset())
         choosing, confirming, parts = draw_samples(
-            [drive], config, truth=self._truth, kitti=self._labels, tick=lambda _: self._pause()
+            [drive], config, truth=self._truth, kitti=self._labels, tick=lambda _: pause()
         )
         keys = keys_for(choosing.reasons(config), config)
         if not keys:
-            return None
-        self._total = TRIALS
-        return find_fix(config, keys, choosing, confirming, tick=self._count, parts=parts)
-
-    def _count(self, number: int) -> None:
-        self._done = min(self._done + number, self._total)
-        self._pause()
-
-    def _pause(self) -> None:
-        """Tell the pages, and wait until no question is being answered."""
-        self._source.news.tell()
-        self._source.wait_for_quiet()
-        if self._stop.is_set():
-            raise _CancelledError
-
-
-class _CancelledError(Exception):
-    """The search was cancelled."""
+            job.text = "Nothing that a parameter decides is missed or false."
+            return
+        job.total = TRIALS
+        fix = find_fix(config, keys, choosing, confirming, tick=count, parts=parts)
+        job.settings = tuple(f"{key}={text_of(value)}" for key, value in fix.settings.items())
+        job.text = "\n".join(line.strip() for line in fix.lines() if "--set" not in line)

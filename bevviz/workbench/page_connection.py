@@ -21,11 +21,8 @@ if TYPE_CHECKING:
     from bevviz.why import Answer, Selection
     from bevviz.why.identity import Identity
     from bevviz.workbench.buffers import News
-    from bevviz.workbench.fix_search import FixSearch
-    from bevviz.workbench.reports import ReportMaker
     from bevviz.workbench.session import WorkbenchSession
     from bevviz.workbench.source import Message, Settings
-    from bevviz.workbench.trials import TrialRunner
 
 LEGEND = ("person", "cyclist", "car", "truck", "bus")  # classes in the legend of the page
 TOGETHER = 0.05  # seconds in which news are collected before they are sent
@@ -377,10 +374,10 @@ class PageConnection:
             return
         workbench = self._workbench
         if message["what"] == "report":
-            runner: ReportMaker | FixSearch | TrialRunner = workbench.reports
+            workbench.reports.cancel()
         else:
-            runner = workbench.tools.fix if message["what"] == "fix" else workbench.tools.trials
-        await asyncio.to_thread(runner.end)
+            tools = workbench.tools
+            (tools.fix if message["what"] == "fix" else tools.trials).cancel()
 
     async def _report(self, number: int, message: Message) -> None:
         reports = self._workbench.reports

@@ -1,20 +1,21 @@
-"""Bug reports that the page requests. A background thread makes them."""
+"""Bug reports that the page requests."""
 
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from bevviz.bags.remote import beside
 from bevviz.bags.source import iso
 from bevviz.config import Config, changed_config
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
+from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
     from bevviz.pipeline.notes import Note
@@ -27,41 +28,21 @@ LONGEST = 600.0  # seconds before or after the frame, at most
 
 
 @dataclass(slots=True)
-class ReportJob:
-    """A finished report, or the one in progress.
+class ReportJob(Job):
+    """A finished report, or the one in progress. ``settings`` are the tried values that it tells of.
 
     Attributes:
-        number: number in the address of its files.
-        name: file name without suffix.
-        settings: the values that were tried, which it tells of.
-        state: running, over, cancelled or failed.
-        error: reason of the failure.
-        done: number of finished frames.
-        total: number of frames.
+        name: file name without suffix. Its number is in the address of its files.
         files: paths of its files.
-        stop: cancels the report when it is set.
     """
 
-    number: int
-    name: str
-    settings: Settings = ()
-    state: str = "running"
-    error: str = ""
-    done: int = 0
-    total: int = 0
+    name: str = ""
     files: list[Path] = field(default_factory=list)
-    stop: threading.Event = field(default_factory=threading.Event)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON for the page."""
-        return {
-            "number": self.number,
+        return Job.as_dict(self) | {
             "name": self.name,
-            "settings": list(self.settings),
-            "state": self.state,
-            "error": self.error,
-            "done": self.done,
-            "total": self.total,
             "files": [
                 {"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._existing_files()
             ],
@@ -113,23 +94,18 @@ def folder_beside(paths: Sequence[Path]) -> Path:
     return folder if os.access(folder, os.W_OK | os.X_OK) else Path.cwd()
 
 
-class ReportMaker:
-    """Reports of a workbench session, made one at a time.
+class ReportMaker(Jobs[ReportJob]):
+    """Reports of a workbench session.
 
     Args:
         session: the workbench session.
         bag_of: returns the bag that has a frame.
         folder: folder of the reports.
-
-    Attributes:
-        made: the reports, the newest last.
     """
 
     def __init__(self, session: QuestionLog, bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
+        super().__init__("report", session.source.news.tell)
         self._session, self._bag_of, self._folder = session, bag_of, folder
-        self._tell = session.source.news.tell
-        self._thread: threading.Thread | None = None
-        self.made: list[ReportJob] = []
 
     def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> ReportJob:
         """Start to make a report.
@@ -147,8 +123,7 @@ class ReportMaker:
         """
         from bevviz.report.make import ReportRequest
 
-        if self.made and self.made[-1].state == "running":
-            raise UserError("a report is being made: wait for it, or cancel it")
+        self.check_idle("a report is being made")
         if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
             raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
         session, bag = self._session, self._bag_of(number)
@@ -173,31 +148,14 @@ class ReportMaker:
             tried=session.tried_on(number, settings, about[0] if about else None) if settings else None,
             notes=session.notes(),
         )
-        report = ReportJob(len(self.made), output.stem, settings)
-        self.made.append(report)
-        self._thread = threading.Thread(target=self._make, args=(report, request), name="report", daemon=True)
-        self._thread.start()
-        self._tell()
+        report = ReportJob(len(self.jobs), settings, name=output.stem)
+        self.start(report, partial(self._make, request))
         return report
 
-    def end(self) -> None:
-        """Cancel the report in progress. It keeps the frames until then."""
-        if self.made:
-            self.made[-1].stop.set()
-        if self._thread is not None:
-            self._thread.join()
-
-    def _make(self, report: ReportJob, request: ReportRequest) -> None:
+    def _make(self, request: ReportRequest, report: ReportJob) -> None:
         from bevviz.report.make import make
 
-        try:
-            written = make(request, [_ReportProgress(report, self._tell)], report.stop)
-            report.files = written.files
-            report.state = "cancelled" if written.interrupted else "over"
-        except Exception as error:
-            report.error = str(error) if isinstance(error, UserError) else first_line(error)
-            report.state = "failed"
-        self._tell()
+        report.files = make(request, [_ReportProgress(report, self._tell)], report.stop).files
 
 
 class _ReportProgress(Observer[FrameResult]):

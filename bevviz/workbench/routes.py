@@ -123,7 +123,7 @@ class Site:
         """Return a file of a report that this server made."""
         workbench, number = await self._startup.session(), request.path_params["number"]
         try:
-            reports = [] if workbench is None else workbench.reports.made
+            reports = [] if workbench is None else workbench.reports.jobs
         except UserError:  # the page of an artificial robot
             reports = []
         path = reports[number].file(request.path_params["name"]) if number < len(reports) else None

@@ -107,7 +107,7 @@ class WorkbenchSession(Closable):
     def close(self) -> None:
         """Stop the trials, the reports and the run, and release the files."""
         if self._tools is not None:
-            self._tools.fix.end()
+            self._tools.fix.cancel()
             self._tools.trials.end()
         if self._reports is not None:
             self._reports.end()
@@ -117,9 +117,9 @@ class WorkbenchSession(Closable):
         """Return the progress message for the page."""
         message = {"type": "progress", **self.source.progress(), "reports": [], "trials": []}
         if self._reports is not None:
-            message["reports"] = [report.as_dict() for report in self._reports.made]
+            message["reports"] = [report.as_dict() for report in self._reports.jobs]
         if self._tools is not None:
-            message["trials"] = [trial.as_dict() for trial in self._tools.trials.trials]
+            message["trials"] = [trial.as_dict() for trial in self._tools.trials.jobs]
             message["fix"] = self._tools.fix.as_dict()
         return message
 
@@ -231,7 +231,7 @@ class WorkbenchSession(Closable):
             selection, _ = self.follow(identity, number, settings)
             row = answer.subject.row if answer.subject.kind == "truth" else -1
             answer_then = None if selection is None else self.ask(number, settings, selection)[0]
-        texts = [trial.text for trial in self.tools.trials.trials if trial.settings == settings]
+        texts = [trial.text for trial in self.tools.trials.jobs if trial.settings == settings]
         drive = texts[-1] if texts else ""
         return TriedValues(
             settings, answer_then, effects(before.objects, after.objects, subjects, row), drive

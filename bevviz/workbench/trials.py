@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bevviz.config import Config, changed_config, changes
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.evaluate import ObjectScore, Truth
+from bevviz.evaluate.differences import BeforeAfter, before_after
 from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
@@ -26,6 +27,7 @@ from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
+from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.source import Settings
 
@@ -33,42 +35,24 @@ RUNS = 6  # trials that are kept
 
 
 @dataclass(slots=True)
-class Trial:
+class Trial(Job):
     """A run over the drive with other values, and its effect on each frame.
 
     Attributes:
-        number: number of the run, from 0.
-        settings: the settings that differ from those the drive was opened with.
-        total: number of frames of the drive.
-        state: waiting, running, over, cancelled or failed.
-        error: reason of the failure.
-        done: number of finished frames.
         strip: per frame its stamp, how many objects get better and how many get worse. Without ground truth,
             how many objects appear and how many disappear.
         counts: number of changes by kind.
         scores: score before and after.
         known: whether there is ground truth.
-        stop: cancels the run when it is set.
         buffer: recording of its results, for the pages that show its settings.
     """
 
-    number: int
-    settings: Settings
-    total: int
     state: str = "waiting"
-    error: str = ""
-    done: int = 0
     strip: list[tuple[int, int, int]] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
     known: bool = False
-    stop: threading.Event = field(default_factory=threading.Event)
     buffer: RecordingBuffer = field(default_factory=RecordingBuffer)
-
-    @property
-    def going(self) -> bool:
-        """Whether the trial is waiting or running."""
-        return self.state in ("waiting", "running")
 
     @property
     def text(self) -> str:
@@ -87,14 +71,8 @@ class Trial:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trial as JSON for the page."""
-        return {
-            "number": self.number,
+        return Job.as_dict(self) | {
             "lane": self.lane,
-            "settings": list(self.settings),
-            "state": self.state,
-            "error": self.error,
-            "done": self.done,
-            "total": self.total,
             "counts": {key: number for key, number in self.counts.items() if number},
             "better": sum(good > bad for _, good, bad in self.strip),
             "worse": sum(bad > good for _, good, bad in self.strip),
@@ -103,18 +81,13 @@ class Trial:
         }
 
 
-class TrialRunner:
-    """Runner of trials over a drive, one at a time.
-
-    Attributes:
-        trials: the newest trials, the newest last.
-    """
+class TrialRunner(Jobs[Trial]):
+    """Trials over a drive. The newest ``RUNS`` are kept."""
 
     def __init__(self, drive: RecordedDrive) -> None:
+        super().__init__("trial", drive.news.tell)
         self._drive = drive
-        self._thread: threading.Thread | None = None
         self._begun = 0  # number of trials until now
-        self.trials: list[Trial] = []
 
     def begin(self, settings: Settings) -> None:
         """Run the drive with these settings. A trial that is running is cancelled.
@@ -132,34 +105,18 @@ class TrialRunner:
         trial = Trial(self._begun, settings, drive.again.total, known=drive.truth_of is not None)
         self._begun += 1
         drive.lanes[trial.lane] = trial.buffer
-        self.trials.append(trial)
-        for old in self.trials[:-RUNS]:
-            self.trials.remove(old)
-            drive.lanes.pop(old.lane).close()
         drive.findings.replace(tuple(DIFFERENCES))
-        self._thread = threading.Thread(target=self._run, args=(trial, session), name="trial", daemon=True)
-        self._thread.start()
-        drive.news.tell()
+        self.start(trial, partial(self._run_drive, session))
+        for old in self.jobs[:-RUNS]:
+            self.jobs.remove(old)
+            drive.lanes.pop(old.lane).close()
 
-    def end(self) -> None:
-        """Cancel the running trial. Its results until then stay."""
-        if self.trials:
-            self.trials[-1].stop.set()
-        if self._thread is not None:
-            self._thread.join()
-
-    def _run(self, trial: Trial, session: Session) -> None:
+    def _run_drive(self, session: Session, trial: Trial) -> None:
         drive = self._drive
-        try:
-            while not drive.over and not trial.stop.wait(0.1):
-                pass  # The results of the first run are needed for comparison.
-            trial.state = "running"
-            run(drive.again, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
-            trial.state = "cancelled" if trial.stop.is_set() else "over"
-        except Exception as error:
-            trial.state = "failed"
-            trial.error = str(error) if isinstance(error, UserError) else first_line(error)
-        drive.news.tell()
+        while not drive.over and not trial.stop.wait(0.1):
+            pass  # The results of the first run are needed for comparison.
+        trial.state = "running"
+        run(drive.again, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
 
 
 class _TrialObserver(Observer[FrameResult]):
@@ -173,26 +130,21 @@ class _TrialObserver(Observer[FrameResult]):
     def observe(self, result: FrameResult) -> None:
         """Log a frame, list its differences and count them."""
         drive, trial, frame = self._drive, self._trial, result.frame
-        before, truth = drive.objects(frame.index), drive.truth(frame)
+        before, after = drive.objects(frame.index), result.objects
         explainer = drive.explainer(result)
         if not drive.recording.on_demand:  # Else a page tries the values on the frames that it shows.
             drive.recording.draw_tried(self._logger, explainer, trial.settings)
-        side_effects = effects(before, result.objects, explainer.traces.truth)
-        findings = list(difference_findings(explainer, side_effects, before, self._reasons))
+        change = before_after(before, after, drive.truth(frame))
+        findings = list(difference_findings(explainer, change, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
-        trial.counts["changed"] += side_effects.changed
+        trial.counts["changed"] += change.changed
         for tried in (False, True):
             drive.findings.add((finding for finding, side in findings if side == tried), tried=tried)
-        good, bad = (
-            (side_effects.good, side_effects.harm)
-            if side_effects.known
-            else (len(side_effects.more), len(side_effects.gone))
-        )
-        trial.strip.append((frame.stamp, good, bad))
-        if truth is not None:
-            for score, objects in zip(trial.scores, (before, result.objects), strict=True):
-                if objects is not None:
-                    score.add(objects, truth)
+        trial.strip.append((frame.stamp, *change.balance))
+        sides = (before, change.before), (after, change.after)
+        for score, (objects, matches) in zip(trial.scores, sides, strict=True):
+            if objects is not None and matches is not None and change.truth is not None:
+                score.count(objects.names, change.truth, matches)
         trial.done += 1
         self._show()
         drive.wait_for_quiet()
@@ -210,7 +162,7 @@ class _TrialObserver(Observer[FrameResult]):
 
 def difference_findings(
     explainer: FrameExplainer,
-    side_effects: Effects,
+    change: BeforeAfter,
     before: Objects | None,
     reasons: Mapping[tuple[int, str], str],
 ) -> Iterator[tuple[Finding, bool]]:
@@ -218,31 +170,23 @@ def difference_findings(
 
     Args:
         explainer: explainer of the result with the other values.
-        side_effects: their effects.
+        change: their effects.
         before: objects of the drive as opened.
         reasons: reasons of the findings of the drive as opened, by frame and text of the selection.
     """
-    frame = explainer.traces.result.frame
-
-    def tried(kind: str, selection: Selection) -> tuple[Finding, bool]:
-        return finding_of(frame, kind, explainer.about(selection)), True
-
-    for effect in side_effects.made:
-        if effect.truth >= 0:
-            yield tried("fixed", Selection(truth=effect.truth))
-    for effect in side_effects.more:
-        if not side_effects.known or effect.truth < 0:
-            yield tried("new false" if side_effects.known else "new", Selection(object=effect.after))
-    for effect in side_effects.gone:
+    frame, known = explainer.traces.result.frame, change.truth is not None
+    selections = [("fixed", Selection(truth=row)) for row in change.fixed]
+    selections += [("new false" if known else "new", Selection(object=row)) for row in change.new_false]
+    selections += [("broken", Selection(truth=row)) for row in change.broken]
+    for kind, selection in selections:
+        yield finding_of(frame, kind, explainer.about(selection)), True
+    for row in change.false_gone:
         assert before is not None
-        if effect.missed:
-            yield tried("broken", Selection(truth=effect.truth))
-        elif not side_effects.known or effect.truth < 0:
-            kind, selection = "false gone" if side_effects.known else "gone", Selection(object=effect.before)
-            name, distance = before.names[effect.before], float(before.boxes.distance[effect.before])
-            x, y, z = geometry.apply(frame.pose, before.boxes.center[[effect.before]])[0].tolist()
-            reason = reasons.get((frame.index, str(selection)), ReasonKind.REPORTED.value)
-            yield Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z)), False
+        kind, selection = "false gone" if known else "gone", Selection(object=row)
+        name, distance = before.names[row], float(before.boxes.distance[row])
+        x, y, z = geometry.apply(frame.pose, before.boxes.center[[row]])[0].tolist()
+        reason = reasons.get((frame.index, str(selection)), ReasonKind.REPORTED.value)
+        yield Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z)), False
 
 
 def trial_effects(
