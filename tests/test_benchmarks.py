@@ -9,23 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, anomalies, calib, ground, kitti, large, performance, size, why
+from benchmarks import accuracy, anomalies, calib, ground, ideal, kitti, large, performance, size
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.pages import write_section
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
-from benchmarks.truth import Rule, scene_of
-from benchmarks.why import Bench, ask_all, configurations, details_of, section_of
 from bevviz.bags.bag import Recording
 from bevviz.cli import main
-from bevviz.model.reasons import ReasonKind
-from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.stages.clustering import dbscan
-from bevviz.why.verdict import HOPELESS
 from tests.support import bags
-from tests.support.planted_faults import at, drive, planted
-from tests.support.planted_faults import run as run_fault
 
 pytestmark = pytest.mark.long
 
@@ -103,40 +96,6 @@ def test_memory_is_that_of_the_program_alone() -> None:
     assert mine.all()
 
 
-def test_why_is_right_about_objects_and_its_hints_hold() -> None:
-    """Two frames of a fixed drive, three configurations; the whole of it is in benchmarks/RESULTS.md."""
-    tallies = ask_all([1040], frames=31, every=30)
-    every = [
-        tally.of([reason for reason in ReasonKind if reason not in HOPELESS]) for tally in tallies.values()
-    ]
-    asked, right = (sum(counts[key] for counts in every) for key in ("asked", "right"))
-    assert asked >= 100 and right / asked >= 0.95
-    given, hold = (sum(tally.hints[key] for tally in tallies.values()) for key in ("given", "hold"))
-    assert given >= 10 and hold / given >= 0.9
-    assert "| merged |" in details_of(tallies) and "A question takes " in section_of(tallies, "2 frames.")
-
-
-def test_the_rule_judges_answers_about_planted_faults(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    reasons = {
-        "hidden_person": ("person", 16.3, ReasonKind.HIDDEN),
-        "flat_car": ("car", 10.0, ReasonKind.GROUND),
-        "merged_people": ("person", 9.9, ReasonKind.MERGED),
-        "shared_box": ("person", 8.7, ReasonKind.SHARED_BOX),
-    }
-    for name, (label, ahead, reason) in reasons.items():
-        preset = "lidar" if name == "merged_people" else "reference"
-        scene = scene_of(drive(), at(name))
-        rule = Rule(at(name), scene, run_fault(name, preset))
-        assert {rule.cause(row).reason for row in planted(name, label, ahead)} == {reason}
-    monkeypatch.setattr("bevviz.why.verdict._Decider.decide", lambda _: (ReasonKind.NOISE, False))
-    bench = Bench(configurations()["default"], StageLoader())
-    bench.frame(at("flat_car"), scene_of(drive(), at("flat_car")), "frame")
-    noise, all_ = bench.tally.of([ReasonKind.NOISE]), bench.tally.of([*ReasonKind])
-    assert noise["right"] == noise["asked"] == all_["right"] and len(bench.tally.wrong) > 50
-
-
 def test_a_section_replaces_only_its_older_version(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Title\n\n## One\n\nold\n\n## Two\n\nkept\n")
@@ -150,7 +109,7 @@ def test_the_page_has_a_section_for_each_benchmark() -> None:
     page = (Path(__file__).parents[1] / "benchmarks/RESULTS.md").read_text()
     for module in (calib, performance):
         assert page.count(module.BEGIN) == page.count(module.END) == 1
-    headings = [text.strip().splitlines()[0] for text in (why.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]
+    headings = [text.strip().splitlines()[0] for text in (ideal.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]
     sources = (inspect.getsource(module) for module in (kitti, size, large, ground))
     headings += [heading for source in sources for heading in re.findall(r'"(## [^"\n]+)', source)]
     assert len(headings) == 7
