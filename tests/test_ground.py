@@ -19,6 +19,7 @@ from bevviz.model.frame import F32, F64, Bool
 from bevviz.model.results import Ground
 from bevviz.stages.clustering import dbscan
 from bevviz.stages.ground import RING_COUNT, RING_SCALE, _sort_into_bins, segment_ground
+from tests.support import rooms
 
 Terrain = Callable[[F64, F64], F64]
 
@@ -332,3 +333,26 @@ def test_plane_is_repeatable() -> None:
     np.testing.assert_array_equal(segment_ground(points, config).mask, segment_ground(points, config).mask)
     other = segment_ground(points, config.model_copy(update={"seed": 4}))
     assert (other.mask != segment_ground(points, config).mask).any()
+
+
+@pytest.mark.parametrize("ceiling", [2.6, 4.0])
+@pytest.mark.parametrize("half", [4.0, 6.0, 8.0])
+@pytest.mark.parametrize("height", [0.6, 1.0, 1.4])
+def test_a_ceiling_is_no_ground(height: float, half: float, ceiling: float) -> None:
+    """A solid-state LiDAR sees most of the ceiling and little of the floor, or none."""
+    points, is_person = rooms.scan(height, half, ceiling)
+    ground = segment_ground(points, GroundConfig())
+    level = points[:, 2] - ground.height
+    assert not np.nanmax(level, initial=-np.inf) > 0, "no ground lies above the sensor"
+    assert ground.mask[is_person].mean() <= 0.15
+
+
+def test_a_road_above_the_origin_of_its_frame_is_ground() -> None:
+    """Points in a map's frame lie at its heights. What stands on the road lies above it."""
+    x, y = np.meshgrid(np.arange(-15, 15, 0.3), np.arange(-15, 15, 0.3))
+    road = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], -1)
+    car = np.random.default_rng(0).uniform([4, -1, 0.3], [8, 1, 1.5], (2000, 3))
+    points = (np.concatenate([road, car]) + np.array([0, 0, 12])).astype(np.float32)
+    ground = segment_ground(points, GroundConfig())
+    assert ground.mask[: len(road)].mean() > 0.95
+    assert not ground.mask[len(road) :].any()

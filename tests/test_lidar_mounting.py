@@ -28,6 +28,7 @@ from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.sync.gravity import _least_turn, ground_normal
 from bevviz.sync.synchronizer import Synchronizer
+from tests.support import rooms
 
 LIDAR, BASE, ODOM, IMU = "rslidar", "base_link", "odom", "imu_link"
 ROLES = Roles(lidars=("/points",), lidar_names=(LIDAR,))
@@ -286,3 +287,36 @@ def test_beams_without_a_return_are_no_points() -> None:
 def test_a_cloud_within_one_cube_has_no_ground() -> None:
     """No plane can be drawn through a single point: the clouds of a depth camera are that dense."""
     assert ground_normal(np.random.default_rng(0).uniform(0.01, 0.02, (500, 3)).astype(np.float32)) is None
+
+
+PERSONS = [((2.0, 0.0),), ((1.5, 1.0), (-1.8, 1.2), (0.5, -2.0))]
+
+
+@pytest.mark.parametrize("persons", PERSONS)
+@pytest.mark.parametrize("half", [4.0, 6.0, 8.0])
+@pytest.mark.parametrize("height", [0.6, 1.0, 1.4])
+def test_a_solid_state_lidar_upside_down_in_a_room_is_turned(
+    height: float, half: float, persons: tuple[tuple[float, float], ...]
+) -> None:
+    points, is_person = rooms.scan(height, half, 3.0, persons, upside_down=True)
+    normal = ground_normal(points)
+    assert normal is not None and normal[2] < -0.99
+    frame, sync = built(Cloud(0, LIDAR, points), np.eye(4), by_ground)
+    assert any("turned by 180 degrees" in warning for warning in sync.upright.warnings.values())
+    result = seen(frame)
+    assert result.ground is not None and result.voxels is not None
+    level = result.voxels.points[:, 2] - result.ground.height
+    assert np.median(level) == pytest.approx(-height, abs=0.1)
+    high = is_person & (frame.points[:, 2] > 0.3 - height)
+    assert not result.ground.mask[result.voxels.inverse[high]].any()
+
+
+@pytest.mark.parametrize("persons", [*PERSONS, ()])
+@pytest.mark.parametrize("half", [2.5, 4.0, 6.0, 8.0])
+@pytest.mark.parametrize("height", [0.3, 0.6, 1.0, 1.4])
+def test_a_ceiling_does_not_turn_a_lidar(
+    height: float, half: float, persons: tuple[tuple[float, float], ...]
+) -> None:
+    """The floor lies below the view of the LiDAR, and objects do not reach the ceiling."""
+    normal = ground_normal(rooms.scan(height, half, 2.6, persons)[0])
+    assert normal is None or normal[2] > 0.97

@@ -185,12 +185,26 @@ def _segment_polar(points: F32, config: GroundConfig) -> Ground:
 
 
 def _first_plane(points: F32, order: I32, start: I32, config: GroundConfig) -> F64 | None:
-    """Fit a plane to the ground around the sensor, from the lowest points of the bins."""
+    """Fit a plane to the ground around the sensor, from the lowest points of the bins.
+
+    A ceiling is no ground: where the sensor sees little floor, most of these points are on the ceiling.
+    """
     steepest = math.radians(config.max_slope)
     expected = math.nan if config.sensor_height is None else -config.sensor_height
     low = _near_ground(points, _lowest(points, order, start), expected, config.max_step, math.tan(steepest))
-    inliers = _largest_plane(low, config.distance_threshold, config, math.cos(steepest))
-    return _fit_plane(low, inliers) if inliers.any() else None
+    while len(low):
+        inliers = _largest_plane(low, config.distance_threshold, config, math.cos(steepest))
+        if not inliers.any():
+            return None
+        plane = _fit_plane(low, inliers)
+        height = _above(low, plane)
+        below = height < -config.distance_threshold
+        # A road above the origin, in a frame that is not the sensor's, has most points above it.
+        is_above_sensor = config.sensor_height is None and -plane[3] > config.distance_threshold * plane[2]
+        if not is_above_sensor or below.sum() < (height > config.distance_threshold).sum():
+            return plane
+        low = low[below & ~inliers]
+    return None
 
 
 def _sort_into_bins(points: F32, rings: int, sectors: int) -> tuple[F32, F32, I32, I32]:

@@ -38,6 +38,12 @@ SUPPORT, BELOW = 0.15, 0.02  # shares of the near points: least in the ground, m
 FLOOR, UNDER, LOWEST = 0.05, 0.01, 0.5
 ASTRAY, SURE = math.radians(45.0), 0.25  # angle to z at which a plane may be a wall, and its SUPPORT
 HEIGHTS = 0.15, 6.0  # metres from the ground to a LiDAR
+# Metres: side of a column of points, from its lowest point to the floor that it stands on, and least distance
+# of a LiDAR from a ceiling.
+COLUMN, TOUCH, CLOSE = 0.5, 0.7, 0.7
+SECTORS, OPEN = 36, 0.2  # of a turn, and share of them in which a room has no wall, at most
+INSIDE = 0.75  # share of the distance to the wall within which objects stand
+LOOSE, STANDING = 0.3, 0.7  # shares of the columns that touch: most for a ceiling, least for a floor
 TRIES = 5  # scans that are searched for the ground
 
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # FLU from RDF (REP 103)
@@ -204,9 +210,18 @@ def ground_normal(points: F32) -> F64 | None:
     opposite = (normals @ normals[floor].T < -math.cos(DISAGREEMENT)).any(axis=1)
     astray = normals[:, 2] < math.cos(ASTRAY)
     fit = (support > np.where(astray, SURE, SUPPORT)) & (below < BELOW)
-    fit &= (heights > HEIGHTS[0]) & (heights < HEIGHTS[1]) & ~(astray & opposite)
+    fit &= (heights > HEIGHTS[0]) & (heights < HEIGHTS[1])
     upwards = normals[:, 2] > math.cos(DISAGREEMENT)
+    downwards = fit & (normals[:, 2] < -math.cos(DISAGREEMENT))
     usual = fit & upwards
+    if downwards.any() and not usual.any():
+        best = int(np.argmax(np.where(downwards, support, -1.0)))
+        carries = _carries_objects(sample, normals[best], distance[:, best], heights[best])
+        if carries is not None:
+            fit &= downwards if carries else ~downwards
+            floor &= not carries
+            opposite &= not carries
+    fit &= ~(astray & opposite)
     best = int(np.argmax(np.where(usual if usual.any() else fit, support, -1.0)))
     if (astray[best] or not fit[best]) and (floor & upwards).any():
         return _Z
@@ -216,6 +231,41 @@ def ground_normal(points: F32) -> F64 | None:
     _, _, axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
     normal: F64 = axes[2] * np.sign(axes[2] @ normals[best])
     return normal
+
+
+def _carries_objects(points: F64, normal: F64, rise: F64, height: float) -> bool | None:
+    """Return whether a plane with walls around it is the floor of the room, and not its ceiling.
+
+    The walls touch both. Objects before the walls stand on the floor. In an empty room a plane above the
+    LiDAR is its ceiling, unless a LiDAR is hardly mounted so close to one.
+
+    Args:
+        points: (N, 3) points.
+        normal: (3,) normal of the plane, towards the sensor.
+        rise: (N,) heights of the points above the plane.
+        height: distance from the sensor to the plane in metres.
+
+    Returns:
+        None: there are no walls around the plane, or the objects do not tell.
+    """
+    place = points @ np.linalg.svd(normal[None])[2][1:].T
+    reach = np.hypot(*place.T)
+    sector = ((np.arctan2(place[:, 1], place[:, 0]) / math.tau + 0.5) * SECTORS).astype(np.int64) % SECTORS
+    off = rise > 2 * THICKNESS
+    wall, edge = np.zeros(SECTORS), np.zeros(SECTORS)
+    np.maximum.at(wall, sector[off], reach[off])
+    np.maximum.at(edge, sector[~off], reach[~off])
+    if (wall < edge - COLUMN).mean() > OPEN:
+        return None
+    _, column = np.unique(np.floor(place[off] / COLUMN).astype(np.int64), axis=0, return_inverse=True)
+    column = column.reshape(-1)
+    foot = np.full(column.max() + 1, np.inf)
+    np.minimum.at(foot, column, rise[off])
+    inside = np.unique(column[reach[off] < INSIDE * wall[sector[off]]])
+    if not len(inside):
+        return height < CLOSE
+    standing = float((foot[inside] < TOUCH).mean())
+    return None if LOOSE <= standing <= STANDING else standing > STANDING
 
 
 def _planes(points: F64, random: np.random.Generator) -> tuple[F64, F64]:
