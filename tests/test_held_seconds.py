@@ -19,8 +19,9 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.why import Selection
+from bevviz.workbench.growing_drive import RESULTS
 from bevviz.workbench.reports import ReportMaker
-from bevviz.workbench.running_robot import MADE, RunningRobot
+from bevviz.workbench.running_robot import RunningRobot
 from bevviz.workbench.session import WorkbenchSession
 from tests.support.live_sessions import live_bench
 from tests.support.waiting import until
@@ -99,7 +100,7 @@ def test_what_is_made_again_is_bounded_and_ends(robot: RunningRobot, drive: Driv
     numbers = [result.frame.index for result in drive.results[:-HELD]]
     for number in numbers:
         robot.look(number)
-    assert len(robot._made) == MADE and len(robot._bags) == 1
+    assert len(robot._results) == min(RESULTS, len(numbers)) and len(robot._bags) == 1
     folder = robot._bags[0].path.parent
     assert [path.name for path in folder.iterdir()] == [robot._bags[0].path.name]
     with pytest.raises(UserError, match="frame 17 is gone"):

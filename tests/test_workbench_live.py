@@ -264,7 +264,7 @@ def test_only_the_newest_frames_and_those_held_are_there(
         bench.hold(result.frame.stamp)
     with pytest.raises(UserError, match="frame 1 is gone"):
         bench.look(1)
-    assert len(bench._held()) == HELD + KEPT
+    assert len(bench._held) == KEPT and len(bench._newest) == HELD
 
 
 def test_a_page_says_that_no_frame_comes(

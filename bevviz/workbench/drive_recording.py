@@ -22,7 +22,7 @@ from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import FrameCache, RecordingBuffer
 from bevviz.workbench.findings_layer import log_layer
-from bevviz.workbench.source import Settings
+from bevviz.workbench.growing_drive import Settings
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
 TOGETHER = 50, 800  # frames whose numbers are sent together: the first ones, and most

@@ -11,7 +11,7 @@ from bevviz.errors import UserError
 from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
-    from bevviz.workbench.source import Source
+    from bevviz.workbench.growing_drive import GrowingDrive
 
 
 @dataclass(slots=True)
@@ -39,7 +39,9 @@ class FixSearch(Jobs[FixJob]):
         labels: stated label files.
     """
 
-    def __init__(self, source: Source, paths: Sequence[Path], truth: str | None, labels: Path | None) -> None:
+    def __init__(
+        self, source: GrowingDrive, paths: Sequence[Path], truth: str | None, labels: Path | None
+    ) -> None:
         super().__init__("fix", source.news.tell)
         self._source, self._paths, self._truth, self._labels = source, tuple(paths), truth, labels
 

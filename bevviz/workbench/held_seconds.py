@@ -5,67 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from bevviz.bags.source import BagSource
-from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.files import write_bag
 from bevviz.live.raw_recorder import RawMessage
 from bevviz.live.source_wrappers import thin
 from bevviz.model.frame import Camera, Frame
-from bevviz.model.results import FrameResult, Tracks
 from bevviz.support.contexts import Closable
 from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.why.robot_questions import RobotQuestions, robot_questions
+from bevviz.workbench.growing_drive import FrameFacts, image_stamps
 
 NEIGHBOURS = (0, -1, 1)  # scans that are tried where the time of receipt is that of one of many packets
 
 SAME = 1_000_000  # nanoseconds, difference of one stamp that was corrected by two estimates of a clock
-
-
-@dataclass(frozen=True, slots=True)
-class DeliveredFrame:
-    """Facts about a frame of the live run, by which it is found among the messages and made again.
-
-    Attributes:
-        number: number of the frame.
-        stamp: its stamp, in nanoseconds.
-        received: time of receipt of its scan, in nanoseconds.
-        logged: time when it was shown, in monotonic seconds.
-        topic: topic of its scan. Empty: the frame has none.
-        images: stamp of the image of each camera. None: the camera had none.
-        config: configuration of its result.
-        tracks: its tracks.
-    """
-
-    number: int
-    stamp: int
-    received: int
-    logged: float
-    topic: str
-    images: tuple[int | None, ...]
-    config: Config
-    tracks: Tracks | None
-
-    @classmethod
-    def of(cls, result: FrameResult) -> DeliveredFrame:
-        """Return the facts about the frame of a result that was just shown."""
-        frame, tracks = result.frame, result.tracks
-        if tracks is not None:  # The trail of the last seconds is much larger than the tracks.
-            tracks = replace(tracks, trail=np.zeros((len(tracks), 0, 3), np.float32))
-        return cls(
-            frame.index,
-            frame.stamp,
-            frame.received,
-            time.monotonic(),
-            frame.clouds[0].topic if frame.clouds else "",
-            _image_stamps(frame),
-            result.config,
-            tracks,
-        )
 
 
 class HeldSeconds(Closable):
@@ -86,7 +43,7 @@ class HeldSeconds(Closable):
         UserError: the bag cannot be written.
     """
 
-    def __init__(self, messages: Sequence[RawMessage], frames: Mapping[int, DeliveredFrame]) -> None:
+    def __init__(self, messages: Sequence[RawMessage], frames: Mapping[int, FrameFacts]) -> None:
         self.frames, self.made = frames, time.time_ns()
         self._robot: RobotQuestions | None = None
         self._folder = ScratchFolder()
@@ -104,11 +61,11 @@ class HeldSeconds(Closable):
             source.close()
         self._folder.close()
 
-    def start(self, delivered: DeliveredFrame) -> int:
+    def start(self, delivered: FrameFacts) -> int:
         """Return the log time of the first scan of the topic that a frame is of."""
         return int(self._source(delivered).scans[0])
 
-    def frame(self, delivered: DeliveredFrame) -> Frame:
+    def frame(self, delivered: FrameFacts) -> Frame:
         """Make a frame again. It has the number and the stamp of the live run.
 
         An image that came too late for the live run is left out. Other images become a problem of the frame.
@@ -128,7 +85,7 @@ class HeldSeconds(Closable):
                 return _as_delivered(frame, delivered)
         raise UserError(f"frame {delivered.number} cannot be made again: its scan is not among the messages")
 
-    def robot_questions(self, delivered: DeliveredFrame, frame: Frame) -> RobotQuestions:
+    def robot_questions(self, delivered: FrameFacts, frame: Frame) -> RobotQuestions:
         """Return the questions about the robot's own chain around a frame.
 
         Raises:
@@ -137,7 +94,7 @@ class HeldSeconds(Closable):
         self._robot = robot_questions(self._source(delivered), frame, self._robot)
         return self._robot
 
-    def _source(self, delivered: DeliveredFrame) -> BagSource:
+    def _source(self, delivered: FrameFacts) -> BagSource:
         """Return the bag with the scans of a topic first: the first LiDAR by name may have been silent."""
         topic = delivered.topic
         if topic not in self._sources:
@@ -153,7 +110,7 @@ class HeldSeconds(Closable):
         return self._sources[topic]
 
 
-def _as_delivered(frame: Frame, delivered: DeliveredFrame) -> Frame:
+def _as_delivered(frame: Frame, delivered: FrameFacts) -> Frame:
     """Return a frame with the number, stamp, images and points of the live run."""
     frame = replace(frame, index=delivered.number, stamp=delivered.stamp)
     if len(delivered.images) == len(frame.cameras):
@@ -163,7 +120,7 @@ def _as_delivered(frame: Frame, delivered: DeliveredFrame) -> Frame:
             for camera, is_late in zip(frame.cameras, late, strict=True)
         ]
         frame = replace(frame, cameras=tuple(cameras))
-    if not _are_near(_image_stamps(frame), delivered.images):
+    if not _are_near(image_stamps(frame), delivered.images):
         problem = "made again from the messages, with other images than the live run had"
         frame = replace(frame, problems=(*frame.problems, problem))
     return thin(frame, delivered.config.live.points)
@@ -176,10 +133,6 @@ def _without_late_image(camera: Camera) -> Camera:
     return replace(
         camera, image=None, problems=(*camera.problems, "its image came too late for the live run")
     )
-
-
-def _image_stamps(frame: Frame) -> tuple[int | None, ...]:
-    return tuple(None if camera.image is None else camera.image.stamp for camera in frame.cameras)
 
 
 def _are_near(stamps: tuple[int | None, ...], others: tuple[int | None, ...]) -> bool:

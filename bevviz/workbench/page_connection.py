@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from bevviz.why import Answer, Selection
     from bevviz.why.identity import Identity
     from bevviz.workbench.buffers import News
+    from bevviz.workbench.growing_drive import Message, Settings
     from bevviz.workbench.session import WorkbenchSession
-    from bevviz.workbench.source import Message, Settings
 
 LEGEND = ("person", "cyclist", "car", "truck", "bus")  # classes in the legend of the page
 TOGETHER = 0.05  # seconds in which news are collected before they are sent

@@ -14,7 +14,7 @@ from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer
 from bevviz.why.answer_results import AnswerResult
-from bevviz.workbench.source import Message
+from bevviz.workbench.growing_drive import Message
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 BESIDE = 6  # further answers that are listed

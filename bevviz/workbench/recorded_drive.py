@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
 import threading
-from collections import OrderedDict, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -23,30 +21,26 @@ from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
-from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import run
-from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import entities
+from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import logged_rows
-from bevviz.why import Answer, Selection
-from bevviz.why.click import select_click
+from bevviz.why import Answer
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.findings_layer import log_layer
+from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
-from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.thumbnails import Thumbnails
 
-KEPT = 6  # results of recently viewed frames that are kept
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
-RAW = 4  # frames that are kept as they were read
 
 
-class RecordedDrive(Source, Observer[FrameResult]):
+class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     """Recorded drive as the source of a page. A run over all frames is recorded in the background.
 
     An overview of single frames comes before the run of a long drive. The run replaces its findings.
@@ -86,17 +80,8 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self.over = False
         self._overview: OverviewFrames | None = None  # while it is made
         self._done, self._error = 0, ""
-        self._stamps: list[tuple[int, int]] = []  # (stamp, number) of each known frame, sorted
-        self._stamp_by_number: dict[int, int] = {}
         self._reached = 0  # newest stamp that the run has reached
-        self._tracks: dict[int, Tracks] = {}
-        self._objects: dict[int, Objects | None] = {}
         self._onsets = Onsets()
-        self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
-        self._raw: OrderedDict[int, Frame] = OrderedDict()  # frames as read, by number
-        self._variants = Variants(drive.session.loader)
-        self._looking = threading.RLock()  # guards the reading of frames, _raw, _results and _making
-        self._making: defaultdict[tuple[int, Settings], threading.Lock] = defaultdict(threading.Lock)
         self.robot_bag: BagSource | None = None
         self._robot: RobotQuestions | None = None
         self._asking, self._counting = 0, threading.Lock()  # number of questions that are being answered
@@ -131,7 +116,8 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def objects(self, number: int) -> Objects | None:
         """Return the objects that the run found in a frame."""
-        return self._objects.get(number)
+        facts = self._facts.get(number)
+        return None if facts is None else facts.objects
 
     # --- run -----------------------------------------------------------------------------------
 
@@ -172,10 +158,10 @@ class RecordedDrive(Source, Observer[FrameResult]):
         stored = None if self._table is None else self._table.load()
         if stored is not None:
             self.findings.restore((group.what, group.name, group.frames) for group in stored.groups)
-            for stamp, number in stored.frames:
-                self._stamp_by_number[number] = stamp
-            self._stamps = sorted((stamp, number) for stamp, number in stored.frames)
-            self._reached = max((stamp for stamp, _ in self._stamps), default=0)
+            with self._lock:
+                self._stamps = {number: stamp for stamp, number in stored.frames}
+                self._times = sorted((stamp, number) for stamp, number in stored.frames)
+            self._reached = max(self._stamps.values(), default=0)
             self._is_listed = True
             self.news.tell()
 
@@ -183,7 +169,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         """Keep the findings of the whole run."""
         if self._table is not None:
             groups = [StoredGroup(*group) for group in self.findings.content()]
-            self._table.save(StoredRun(groups, self._stamps))
+            self._table.save(StoredRun(groups, self.frame_times()))
 
     def _make_overview(self) -> None:
         """List the findings of single frames all over the drive."""
@@ -197,7 +183,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         frame = result.frame
         self.findings.add_overview(frame.index, find_findings(self.explainer(result)))
         self.findings.add_overview_anomalies(frame.index, frame.stamp, result.anomalies)
-        self._know(frame)
+        self._picture(frame)
         self._done += 1
         self.news.tell()
         self.wait_for_quiet()
@@ -212,20 +198,11 @@ class RecordedDrive(Source, Observer[FrameResult]):
         findings = find_findings(self.explainer(result))
         if self.recording.on_demand:
             self.recording.add_numbers(result)
-            self._know(frame)
+            self._picture(frame)
         else:
             self.show(result, findings)
+        self.add(result)
         self._reached = max(self._reached, frame.stamp)
-        with self._looking:  # What was looked at before its pose was known is computed again.
-            if (raw := self._raw.get(frame.index)) is not None and raw.world_frame != frame.world_frame:
-                del self._raw[frame.index]
-            for key, known in list(self._results.items()):
-                if key[0] == frame.index and known.frame.world_frame != frame.world_frame:
-                    del self._results[key]
-        if result.tracks is not None:
-            no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)
-            self._tracks[frame.index] = replace(result.tracks, trail=no_trail)
-        self._objects[frame.index] = result.objects
         if not self._is_listed:
             self.findings.end_overview(frame.index)
             self.findings.add(findings)
@@ -260,7 +237,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def open_overlay(self) -> PageOverlay:
         """Return a new overlay. A page shows what is on its own overlay alone."""
-        with self._looking:
+        with self._lock:
             self._overlays += 1
             overlay = PageOverlay(
                 f"overlay-{self._overlays}", self.recording.mark_logger, self.recording.tried_logger
@@ -270,7 +247,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def close_overlay(self, overlay: PageOverlay) -> None:
         """Remove an overlay whose page is closed."""
-        with self._looking:
+        with self._lock:
             self.lanes.pop(overlay.lane, None)
         overlay.close()
         end_unused_streams()
@@ -278,17 +255,15 @@ class RecordedDrive(Source, Observer[FrameResult]):
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
         self.recording.show(result, findings)
-        self._know(result.frame)
+        self._picture(result.frame)
         if self.opening is None:
             self.opening = result.frame.stamp
             self.news.tell()
 
-    def _know(self, frame: Frame) -> None:
+    def _picture(self, frame: Frame) -> None:
         """Keep the stamp and the thumbnail of a frame."""
         self._thumbnails.add(frame)
-        if frame.index not in self._stamp_by_number:
-            self._stamp_by_number[frame.index] = frame.stamp
-            bisect.insort(self._stamps, (frame.stamp, frame.index))
+        self.know(frame)
 
     def thumbnail(self, number: int) -> bytes | None:
         """Return a small image of the camera near a frame as JPEG. None: there is none yet."""
@@ -311,12 +286,12 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
-        recorded = self._recorded_at(stamp)
+        recorded = self.shown_at(stamp)
         return None if recorded is None else self.recording.row(recorded[0])
 
     def version(self, number: int) -> int:
         """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
-        return int(number in self._objects)
+        return int(number in self._facts)
 
     def piece(self, number: int, *, wanted: bool) -> bytes | None:
         """Return the recording of a frame, which is made if it is not kept.
@@ -331,21 +306,27 @@ class RecordedDrive(Source, Observer[FrameResult]):
         try:
             with self.quiet() if wanted else nullcontext():
                 result = self.look(number) if wanted else self.look_aside(number)
-                if (tracks := self._tracks.get(number)) is not None:
-                    result = replace(result, tracks=replace(tracks, trail=self._trail(number, tracks)))
-                piece = self.recording.draw(result, find_findings(self.explainer(result)), version)
+                findings = find_findings(self.explainer(result))
+                piece = self.recording.draw(self._with_tracks(result), findings, version)
         except UserError:  # There is no such frame, or it cannot be read.
             return None
-        self._know(result.frame)
+        self._picture(result.frame)
         self.news.tell()
         return piece
 
+    def _with_tracks(self, result: FrameResult) -> FrameResult:
+        """Return the result of a frame as opened, with its tracks if the run has reached it."""
+        number = result.frame.index
+        if (tracks := self.tracks(number)) is None:
+            return result
+        return replace(result, tracks=replace(tracks, trail=self._trail(number, tracks)))
+
     def _trail(self, number: int, tracks: Tracks) -> F32:
         """Return the trails of the tracks of a frame, from the tracks of the frames before."""
-        span, stamp = self.drive.config.tracking.trail * 1e9, self._stamp_by_number[number]
+        span, stamp = self.drive.config.tracking.trail * 1e9, self._stamps[number]
         columns = [tracks.boxes.center]
         earlier = number - 1
-        while (before := self._tracks.get(earlier)) and stamp - self._stamp_by_number[earlier] <= span:
+        while (before := self.tracks(earlier)) and stamp - self._stamps[earlier] <= span:
             rows = {track: row for row, track in enumerate(before.id.tolist())}
             places = np.full((len(tracks), 3), np.nan, np.float32)
             for row, track in enumerate(tracks.id.tolist()):
@@ -357,21 +338,16 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     # --- single frames -------------------------------------------------------------------------
 
-    def _recorded_at(self, stamp: int) -> tuple[int, int] | None:
-        """Return stamp and number of the recorded frame that a viewer shows at a stamp, if there is one."""
-        stamps = list(self._stamps)
-        index = bisect.bisect_right(stamps, (stamp + entities.TIME_TOLERANCE, 2**62))
-        return stamps[index - 1] if index else None
-
     def number_at(self, stamp: int) -> int:
         """Return the number of the frame that a viewer shows at a stamp. The run may not have reached it yet.
 
         Raises:
             UserError: no frame has been run yet.
         """
-        if not self._stamps:
+        times = self.frame_times()
+        if not times:
             raise UserError("no frame has been run yet")
-        at, number = self._recorded_at(stamp) or self._stamps[0]
+        at, number = self.shown_at(stamp) or times[0]
         if self.over or stamp <= self._reached or abs(stamp - at) <= entities.TIME_TOLERANCE:
             return number
         return self._find_frame(stamp, number)
@@ -388,65 +364,19 @@ class RecordedDrive(Source, Observer[FrameResult]):
 
     def _stamp_of(self, number: int) -> int:
         """Return the stamp of a frame, or its log time if the frame cannot be read."""
-        if number in self._stamp_by_number:
-            return self._stamp_by_number[number]
-        with self._looking, suppress(UserError):
-            return self._read(number).stamp
+        if number in self._stamps:
+            return self._stamps[number]
+        with suppress(UserError):
+            return self._frame(number).stamp
         return int(self.drive.frames.scans[number])
 
-    def _read(self, number: int) -> Frame:
-        """Return a frame before any stage. Call it with ``_looking``.
+    def read(self, number: int) -> Frame:
+        """Read a frame from the bag.
 
         Raises:
             UserError: there is no such frame, or it cannot be read.
         """
-        if number not in self._raw:
-            self._raw[number] = self.drive.raw(number)
-            while len(self._raw) > RAW:
-                self._raw.popitem(last=False)
-        return self._raw[number]
-
-    def tracks(self, number: int) -> Tracks | None:
-        """Return the tracks that the run found in a frame. None: it has not reached the frame."""
-        return self._tracks.get(number)
-
-    def frame_times(self) -> list[tuple[int, int]]:
-        """Return stamp and number of each recorded frame."""
-        return list(self._stamps)
-
-    def look(self, number: int, settings: Settings = ()) -> FrameResult:
-        """Return the result of a frame, with other values if ``settings`` names some.
-
-        Raises:
-            UserError: there is no such frame, a parameter is unknown, or a value is wrong.
-        """
-        key = number, settings
-        with self._looking:
-            making = self._making[key]
-        with making:
-            with self._looking:
-                if key in self._results:
-                    self._results.move_to_end(key)
-                    return self._results[key]
-                config = self.configured(settings)
-                check_same_frames({"the drive": self.drive.config, "what is tried": config})
-                known_frames = [result.frame for (n, _), result in self._results.items() if n == number]
-                frame = known_frames[0] if known_frames else self._read(number)
-            result = add_explanations(self._variants.perceive(frame, config))
-            with self._looking:
-                self._results[key] = result
-                self._making.pop(key, None)
-                while len(self._results) > KEPT:
-                    self._results.popitem(last=False)
-        return result
-
-    def look_aside(self, number: int) -> FrameResult:
-        """Return the result of a frame as opened. A question waits at most until the frame is read."""
-        with self._looking:
-            if (known := self._results.get((number, ()))) is not None:
-                return known
-            frame = self._read(number)
-        return self.pipeline.run_single(frame)
+        return self.drive.raw(number)
 
     def configured(self, settings: Settings) -> Config:
         """Return the configuration with other values.
@@ -457,7 +387,7 @@ class RecordedDrive(Source, Observer[FrameResult]):
         return changed_config(self.drive.config, settings) if settings else self.drive.config
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
-        """Return the questions about the robot's chain around a frame, see ``Source``."""
+        """Return the questions about the robot's chain around a frame, see ``GrowingDrive``."""
         frames = self.drive.frames
         if not isinstance(frames, BagSource) or len(object_topics(frames)) < 2:
             return None
@@ -469,15 +399,15 @@ class RecordedDrive(Source, Observer[FrameResult]):
         self._robot = robot_questions(self.robot_bag, frame, self._robot)
         return self._robot
 
-    def select(
-        self, number: int, settings: Settings, path: str, instance: int | None, position: Sequence[float]
-    ) -> Selection | None:
-        """Return the selection of a click in a frame, see ``select_click``."""
-        result, rows = self.look(number, settings), self.recording.entity_rows(number, settings)
+    def entity_rows(self, number: int, settings: Settings) -> EntityRows:
+        """Return the rows behind the entities of a frame as it was drawn."""
+        rows = self.recording.entity_rows(number, settings)
         if rows is None:
+            result = self.look(number, settings)
             findings = find_findings(self.explainer(result))
-            rows = logged_rows(result, lambda writer: log_layer(writer, result, findings))
-        return select_click(result, self._tracks.get(number), rows, path, instance, position)
+            drawn = result if settings else self._with_tracks(result)
+            rows = logged_rows(drawn, lambda writer: log_layer(writer, result, findings))
+        return rows
 
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
         """Mark the object of an answer in every view of a page."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bevviz.report.make import ReportRequest
     from bevviz.report.report_subject import TriedValues
     from bevviz.why import Answer
-    from bevviz.workbench.source import Settings, Source
+    from bevviz.workbench.growing_drive import GrowingDrive, Settings
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
@@ -76,7 +76,7 @@ class ReportedBag:
 class QuestionLog(Protocol):
     """Answers and notes of a workbench session, which a report quotes."""
 
-    source: Source
+    source: GrowingDrive
 
     def notes(self) -> list[Note]:
         """Return the notes."""

@@ -5,9 +5,10 @@ The results of the newest frames are in memory. Earlier ones are made again from
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -16,7 +17,7 @@ from typing import Any
 
 import rerun as rr
 
-from bevviz.config import Config, changed_config
+from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
 from bevviz.findings.frame_findings import find_findings
@@ -24,30 +25,26 @@ from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live, ObservingSession
 from bevviz.live.status import give_way
 from bevviz.model.frame import Frame
-from bevviz.model.results import FrameResult, Tracks
-from bevviz.pipeline.perceive import add_explanations
-from bevviz.pipeline.session import Variants
+from bevviz.model.results import FrameResult
 from bevviz.recording import entities
+from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import FrameLogger, logged_rows
 from bevviz.why import Answer, Selection
-from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
+from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, Message, Settings
+from bevviz.workbench.held_seconds import HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportedBag, ReportMaker
 from bevviz.workbench.session import WorkbenchSession
-from bevviz.workbench.source import Message, Settings, Source
 
 KEPT = 4  # held frames that are kept
-MADE = 3  # frames made again that are kept
 BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame needs
 AFTER = 1_000_000_000  # nanoseconds after a scan in which the robot's last node has made something of it
 BAGS = 2  # bags of held seconds that are kept: a report may be cut from the one before the newest
 LISTED_FRAMES = 64  # frames of the held seconds that are listed
-TRIED = 2  # results of held frames with other values that are kept
 LISTED = ("missed", "false", "doubtful", "contradicted", "lost", "unmatched", "unnamed")
 
 
@@ -60,7 +57,7 @@ def robot_session(live: Live) -> WorkbenchSession:
     return session
 
 
-class RunningRobot(Source):
+class RunningRobot(GrowingDrive):
     """Running robot as the source of a page.
 
     Changed parameters are in force for all later frames.
@@ -74,23 +71,16 @@ class RunningRobot(Source):
     """
 
     def __init__(self, live: Live) -> None:
-        super().__init__(live.scene.name, live.session)
+        super().__init__(live.scene.name, live.session, newest=live.config.live.held)
         self.live = live
         self.recording = LiveBuffer(live, live.config.live.output_queue)
         self.commands = {"hold": self._hold, "list": self._list, "snap": self._snap, "mark": self._mark}
-        self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
-        self._kept: OrderedDict[int, FrameResult] = OrderedDict()
-        self._delivered: OrderedDict[int, DeliveredFrame] = OrderedDict()  # of the held seconds, by number
-        self._lock = threading.Lock()  # guards _newest, _kept and _delivered
-        self._made: OrderedDict[int, FrameResult] = OrderedDict()  # frames made again, by number
-        self._bags: deque[HeldSeconds] = deque()
-        self._making = threading.RLock()  # guards _made and _bags
+        self._start = 0  # first stamp of the held seconds; frames that are kept from earlier do not count
+        self._bags: deque[HeldSeconds] = deque()  # guarded by _reading
         self._whole: set[int] = set()  # frames that pages got again, with all points
         self._listing: threading.Thread | None = None
         self._stop = threading.Event()  # ends the listing
-        self._tried_results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._settings: Settings = ()  # settings that pages have changed
-        self._variants = Variants(live.session.loader)
         encoder = live.encoder
         recording = rr.RecordingStream(encoder.application, recording_id=encoder.recording_id)
         recording.set_log_time_enabled(False)
@@ -103,7 +93,7 @@ class RunningRobot(Source):
         """Close the buffer of the pages, and delete the bags."""
         self._end_list()
         self.recording.close()
-        with self._making:
+        with self._reading:
             while self._bags:
                 self._bags.pop().close()
 
@@ -117,20 +107,14 @@ class RunningRobot(Source):
             "over": True,
             "error": self.live.silence,
             "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
-            "held": [str(stamp) for stamp in self._held_stamps()],
+            # Frames that are kept from before the held seconds, and the first frame of these.
+            "held": [str(stamp) for stamp, _ in self.frame_times() if stamp <= self._start],
         }
 
     def observe(self, result: FrameResult) -> None:
         """Keep a new frame."""
-        raw = self.live.raw
-        with self._lock:
-            self._newest.append(result)
-            if raw is not None:
-                self._delivered[result.frame.index] = DeliveredFrame.of(result)
-                oldest = raw.since + BEFORE
-                while self._delivered and next(iter(self._delivered.values())).received < oldest:
-                    number, _ = self._delivered.popitem(last=False)
-                    self._whole.discard(number)
+        self.add(result)
+        self._forget_gone()
         if result.frame.truth is not None and self.truth_of is None:
             self.truth_of = _truth_in_frame
         self.news.tell()
@@ -143,28 +127,20 @@ class RunningRobot(Source):
 
     # --- frames --------------------------------------------------------------------------------
 
-    def _held(self) -> list[FrameResult]:
+    def _forget_gone(self) -> None:
+        """Forget the frames whose messages and results are gone, and find the first of the others."""
+        raw = self.live.raw
+        oldest = math.inf if raw is None else raw.since + BEFORE
         with self._lock:
-            return [*self._kept.values(), *self._newest]
-
-    def _held_stamps(self) -> list[int]:
-        """Return the stamps of kept frames before the held seconds, and of the first frame of these."""
-        start = self._start()
-        return [stamp for stamp, _ in self.frame_times() if stamp <= start]
-
-    def _start(self) -> int:
-        """Return the first stamp of the held seconds. Frames that are kept from earlier do not count."""
-        with self._lock:
-            stamps = [frame.stamp for frame in self._delivered.values()]
-            stamps += [result.frame.stamp for result in self._newest]
-        return min(stamps, default=0)
-
-    def frame_times(self) -> list[tuple[int, int]]:
-        """Return stamp and number of each frame that can be asked about."""
-        with self._lock:
-            results = [*self._kept.values(), *self._newest]
-            times = {frame.stamp: number for number, frame in self._delivered.items()}
-        return sorted({**times, **{result.frame.stamp: result.frame.index for result in results}}.items())
+            newest = {result.frame.index for result in self._newest}
+            stamps = []
+            for number, facts in list(self._facts.items()):
+                if facts.received >= oldest or number in newest:
+                    stamps.append(facts.stamp)
+                elif number not in self._held:
+                    self.forget(number)
+                    self._whole.discard(number)
+            self._start = min(stamps, default=0)
 
     def _shown_at(self, stamp: int) -> tuple[int | None, int]:
         """Return the numbers of the frame that a viewer shows and of the first of the held seconds.
@@ -174,13 +150,11 @@ class RunningRobot(Source):
         Raises:
             UserError: no frame has come yet.
         """
-        times, start = self.frame_times(), self._start()
+        times, start = self.frame_times(), self._start
         if not times:
             raise UserError("no frame has come yet")
         first = next((number for at, number in times if at >= start), times[-1][1])
-        at, shown = max(
-            (one for one in times if one[0] <= stamp + entities.TIME_TOLERANCE), default=(0, None)
-        )
+        at, shown = self.shown_at(stamp) or (0, None)
         is_gone = at < start and stamp > at + entities.TIME_TOLERANCE
         return None if is_gone else shown, first
 
@@ -192,7 +166,7 @@ class RunningRobot(Source):
         """
         number, _ = self._shown_at(stamp)
         if number is None:
-            seconds = (self.frame_times()[-1][0] - self._start()) / 1e9
+            seconds = (self.frame_times()[-1][0] - self._start) / 1e9
             raise UserError(
                 f"that frame is gone: the last {seconds:.0f} s can be asked about "
                 "(live.flight_time, live.raw_size); hold a frame with H to keep it"
@@ -215,10 +189,11 @@ class RunningRobot(Source):
         result = self.look(number)
         index = result.frame.index
         with self._lock:
-            self._kept[index] = result
-            self._kept.move_to_end(index)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
+            self._held[index] = result
+            self._held.move_to_end(index)
+            while len(self._held) > KEPT:
+                self._held.popitem(last=False)
+        self._forget_gone()
         self.findings.replace(LISTED)
         self.findings.add(find_findings(self.explainer(result)))
         self.news.tell()
@@ -226,7 +201,7 @@ class RunningRobot(Source):
 
     def _show_again(self, number: int) -> None:
         """Send a frame again from the flight recorder, if a page was opened after it."""
-        delivered = self._delivered.get(number)
+        delivered = self._facts.get(number)
         if delivered is None or self.recording.opened < delivered.logged or number in self._whole:
             return
         packets = [packet for packet in self.live.flight.packets() if packet.time <= delivered.logged]
@@ -236,51 +211,32 @@ class RunningRobot(Source):
         if start < len(packets):
             first = packets[start].time
             with self._lock:
-                again = self._delivered.items()
+                again = self._facts.items()
                 self._whole.update(n for n, one in again if first <= one.logged <= delivered.logged)
 
-    def look(self, number: int, settings: Settings = ()) -> FrameResult:
-        """Return the result of a held frame, with other values if ``settings`` names some.
-
-        Raises:
-            UserError: the frame is gone, a parameter is unknown, or a value is wrong.
-        """
-        result = next((candidate for candidate in self._held() if candidate.frame.index == number), None)
-        result = result or self._make_again(number)
-        if not settings:
-            return result
-        config = changed_config(self.live.config, settings)
-        if config == result.config:
-            return result
-        key = number, settings
-        if key not in self._tried_results:
-            self._tried_results[key] = add_explanations(self._variants.perceive(result.frame, config))
-            while len(self._tried_results) > TRIED:
-                self._tried_results.popitem(last=False)
-        return self._tried_results[key]
-
-    def _make_again(self, number: int) -> FrameResult:
-        """Return the result of a frame that is made again from the messages, as it was shown.
+    def read(self, number: int) -> Frame:
+        """Make a frame again from the messages.
 
         Raises:
             UserError: the frame is gone, or cannot be made again.
         """
-        with self._making:
-            if number in self._made:
-                self._made.move_to_end(number)
-                return self._made[number]
-            bag, delivered = self._bag(number)
-            frame, config = bag.frame(delivered), delivered.config
-            if isinstance(self.live.session, ObservingSession):
-                result = FrameResult.unprocessed(frame, config)
-            else:
-                result = add_explanations(self._variants.perceive(frame, config))
-            self._made[number] = result = replace(result, tracks=delivered.tracks)
-            while len(self._made) > MADE:
-                self._made.popitem(last=False)
-        return result
+        bag, facts = self._bag(number)
+        return bag.frame(facts)
 
-    def _bag(self, number: int, end: int = 0) -> tuple[HeldSeconds, DeliveredFrame]:
+    def look_aside(self, number: int) -> FrameResult:
+        """Return the result of a frame for background work. The pipeline itself is busy with the robot."""
+        return self.look(number)
+
+    def _perceived(self, frame: Frame, config: Config) -> FrameResult:
+        """Return the result of a frame. One with the values of the live run has the tracks of it."""
+        facts = self._facts.get(frame.index)
+        if isinstance(self.live.session, ObservingSession):
+            result = FrameResult.unprocessed(frame, config)
+        else:
+            result = super()._perceived(frame, config)
+        return result if facts is None or config != facts.config else replace(result, tracks=facts.tracks)
+
+    def _bag(self, number: int, end: int = 0) -> tuple[HeldSeconds, FrameFacts]:
         """Return the bag that has a frame, which is made if no bag has it, and facts about the frame.
 
         Args:
@@ -291,7 +247,7 @@ class RunningRobot(Source):
             if number in bag.frames and bag.made >= end:
                 return bag, bag.frames[number]
         with self._lock:
-            frames = dict(self._delivered)
+            frames = {n: facts for n, facts in self._facts.items() if facts.stamp >= self._start}
         raw = self.live.raw
         if raw is None or number not in frames:
             raise UserError(f"frame {number} is gone: hold one with H, and ask then")
@@ -306,25 +262,22 @@ class RunningRobot(Source):
         Raises:
             UserError: the frame is gone, or the bag cannot be written.
         """
-        with self._making:
+        with self._reading:
             bag, delivered = self._bag(number)
             return ReportedBag([bag.path], delivered.config, bag.start(delivered))
-
-    def tracks(self, number: int) -> Tracks | None:
-        """Return the tracks in a frame."""
-        return self.look(number).tracks
 
     # --- questions -----------------------------------------------------------------------------
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
-        """Return the questions about the robot's chain in the held seconds, see ``Source``."""
-        frames = [result.frame for result in self._held()]
+        """Return the questions about the robot's chain in the held seconds, see ``GrowingDrive``."""
+        with self._lock:
+            frames = [result.frame for result in self._shown_results().values()]
         if self.live.raw is None or len({one.topic for frame in frames for one in frame.robot_boxes}) < 2:
             return None
         frame = self.look(number).frame
         end = frame.received + AFTER
         time.sleep(min(max(0, end - time.time_ns()), AFTER) * 1e-9)
-        with self._making:
+        with self._reading:
             bag, delivered = self._bag(number, end)
             return bag.robot_questions(delivered, frame)
 
@@ -345,8 +298,11 @@ class RunningRobot(Source):
         if instance is not None and points is not None and path == entities.POINTS.path(result.frame.lidar):
             rows = sample_rows(len(result.frame.points), points, result.frame.index)
             instance = int(rows[instance]) if instance < len(rows) else None
-        drawn = self.live.encoder.rows.get(number) or logged_rows(result)
-        return select_click(result, result.tracks, drawn, path, instance, position)
+        return super().select(number, settings, path, instance, position)
+
+    def entity_rows(self, number: int, settings: Settings) -> EntityRows:
+        """Return the rows behind the entities of a frame as it was drawn."""
+        return self.live.encoder.rows.get(number) or logged_rows(self.look(number))
 
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None = None) -> None:
         """Mark the object of an answer in every view of all pages."""
@@ -367,7 +323,7 @@ class RunningRobot(Source):
         if settings != self._settings:
             self.live.update(settings, without=self._settings)
         self._settings = settings
-        return before, add_explanations(self._variants.perceive(before.frame, self.live.config))
+        return before, self._perceived(before.frame, self.live.config)
 
     def configured(self, settings: Settings) -> Config:
         """Return the configuration in force, which has taken on the settings."""

@@ -23,10 +23,10 @@ from bevviz.why.identity import Identity, find, identify
 from bevviz.why.resolve import select_subjects
 from bevviz.why.side_effects import effects
 from bevviz.workbench.fix_search import FixSearch
+from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
-from bevviz.workbench.source import Settings, Source
 from bevviz.workbench.trials import TrialRunner, trial_effects
 
 ASKED = 8  # answers that are kept for reports
@@ -57,7 +57,7 @@ class WorkbenchSession(Closable):
         notes_version: number that changes with the notes. -1: there are none.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: GrowingDrive) -> None:
         self.source = source
         self.notes_version = -1
         self._tools: DriveTools | None = None

@@ -27,9 +27,9 @@ from bevviz.why import FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
+from bevviz.workbench.growing_drive import Settings
 from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.recorded_drive import RecordedDrive
-from bevviz.workbench.source import Settings
 
 RUNS = 6  # trials that are kept
 
