@@ -16,12 +16,15 @@ from benchmarks.fix import noisy
 from bevviz.config import Config
 from bevviz.evaluate import Truth, truth_of
 from bevviz.extras.demo.drive import Snapshot, SyntheticSource
+from bevviz.extras.demo.sensors import Lidar, PinholeCamera
 from bevviz.model.frame import F32, Boxes3D, Camera, Frame, LabelledBoxes3D
 from bevviz.model.results import Detections
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader, Stages
 from tests.support import small_drives
 
-ASKED = (1, 3)  # frames of a small drive that are asked about; the others are their neighbours
+ASKED = (1, 3)  # frames of a drive that are asked about; the others are their neighbours
+LIDARS = ((32, 900), (40, 1000), (64, 1200))  # beams and azimuths
+CAMERA = 512, 288, 352.0  # pixels
 DEMO_ASKED = (20, 70)  # frames of a drive with a LiDAR of 64 beams
 APART = 3  # frames between a frame of that drive and its neighbours
 SUS_NAMES = {"Rider": "Cyclist", "Motor": "motorcycle", "Bus": "bus"}  # label -> label that bevviz knows
@@ -122,19 +125,22 @@ def visible_boxes(snapshot: Snapshot) -> F32:
     return boxes
 
 
-def small(seeds: Sequence[int]) -> DataSet:
-    """Return drives of few beams and pixels. Their detections are weak, doubled or of nothing at times."""
-    loader, frames = small_drives.KnownDetections(), list[LabelledFrame]()
+def drives(seeds: Sequence[int]) -> DataSet:
+    """Return drives of several LiDARs. Their detections are weak, doubled or of nothing at times."""
+    loader, frames, number = small_drives.KnownDetections(), list[LabelledFrame](), ASKED[-1] + 2
     for seed in seeds:
-        rng, drive = np.random.default_rng(seed), small_drives.source(seed, ASKED[-1] + 2)
+        lidar, camera = Lidar(*LIDARS[seed % len(LIDARS)]), PinholeCamera(*CAMERA)
+        drive = SyntheticSource(number * small_drives.APART, seed, lidar=lidar, camera=camera)
+        rng = np.random.default_rng(seed)
         # The stamp of an image tells the loader which image it is.
-        for snapshot in small_drives.snapshots(drive, ASKED[-1] + 2, start=seed * 10**12):
-            frame, number = snapshot.frame, snapshot.frame.index
+        for snapshot in small_drives.snapshots(drive, number, start=seed * 10**12):
+            frame = snapshot.frame
             assert frame.truth is not None and frame.cameras[0].image is not None
             loader.add(frame.cameras[0].image.stamp, noisy(small_drives.candidates(snapshot), rng))
             truth, boxes = truth_of(frame, frame.truth), visible_boxes(snapshot)
-            frames.append(LabelledFrame(str(seed), number, frame, truth, boxes, number in ASKED))
-    return DataSet("small", tuple(frames), loader, (), ("person", "cyclist", "car"))
+            is_asked = frame.index in ASKED
+            frames.append(LabelledFrame(str(seed), frame.index, frame, truth, boxes, is_asked))
+    return DataSet("drives", tuple(frames), loader, (), ("person", "cyclist", "car"))
 
 
 def demo(seeds: Sequence[int]) -> DataSet:
@@ -225,8 +231,8 @@ def data_sets(data: Path, seeds: Sequence[int], most: int) -> dict[str, Callable
         most: most frames of each folder of KITTI.
     """
     return {
-        "small": partial(small, seeds),
-        "demo": partial(demo, seeds[: max(1, len(seeds) // 4)]),
+        "drives": partial(drives, seeds),
+        "demo": partial(demo, seeds[: max(1, len(seeds) // 2)]),
         "kitti": partial(kitti, data, most, by_labels=False),
         "kitti-labels": partial(kitti, data, most, by_labels=True),
         "sus": partial(sus, data),
