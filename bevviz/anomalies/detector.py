@@ -30,12 +30,16 @@ BEHIND = 1.3  # ratio of depth to estimated distance from which a point lies far
 
 
 class AnomalyDetector:
-    """Detector of anomalies in consecutive frames. A lasting anomaly keeps the stamp at which it began."""
+    """Detector of anomalies in consecutive frames. A lasting anomaly keeps the stamp at which it began.
 
-    def __init__(self) -> None:
+    Args:
+        sensors: watch of the sensors, shared by runs on the same frames.
+    """
+
+    def __init__(self, sensors: SensorWatch | None = None) -> None:
         self._active: dict[tuple[str, str], tuple[Anomaly, int]] = {}  # with the stamp it last held at
         self._objects = ObjectWatch()
-        self._sensors = SensorWatch()
+        self._sensors = sensors or SensorWatch()
         self._alone: dict[str, list[tuple[F32, str, int]]] = {}  # camera -> box, class, frames
         self._placed: set[str] = set()  # sensors that had a transform
         self._imaged: set[str] = set()  # cameras that had an image
@@ -51,7 +55,6 @@ class AnomalyDetector:
             self._active.clear()
             self._alone.clear()
             self._objects.clear()
-            self._sensors.clear()
         self._stamp = stamp
         for anomaly in self._found(result, config):
             key = anomaly.kind, anomaly.subject

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from bevviz.anomalies.calibration_drift import PlacementWatch
 from bevviz.anomalies.mounting_changes import MountingWatch, ScanShape
@@ -14,11 +14,16 @@ GAP = 1.0  # seconds between two frames, after which the past tells nothing
 
 
 class SensorWatch:
-    """Detector of faults of cameras, LiDARs and their mountings in consecutive frames."""
+    """Detector of faults of cameras, LiDARs and their mountings in consecutive frames.
+
+    Runs with other configurations on the same frames may share it: the same frame twice is one frame.
+    """
 
     def __init__(self) -> None:
         self._start: int | None = None
         self._stamp = 0
+        self._last: tuple[int, int] | None = None  # number and stamp of the last frame
+        self._found: list[Anomaly] = []  # its faults
         self.clear()
 
     def clear(self) -> None:
@@ -29,16 +34,20 @@ class SensorWatch:
         self._placement = PlacementWatch()
         self._shape: ScanShape | None = None
 
-    def update(self, result: FrameResult) -> Iterator[Anomaly]:
-        """Yield the faults of all sensors in this frame."""
+    def update(self, result: FrameResult) -> Sequence[Anomaly]:
+        """Return the faults of all sensors in this frame."""
         frame = result.frame
+        if (frame.index, frame.stamp) == self._last:
+            return self._found
+        self._last = frame.index, frame.stamp
         if self._start is None or frame.stamp < self._stamp:
             self._start = frame.stamp
         if not 0 <= frame.stamp - self._stamp <= GAP * 1e9:
             self.clear()
         self._stamp = frame.stamp
-        for fault in self._faults(result):
-            yield _anomaly(fault, f" since {1e-9 * (fault.since - self._start):.1f} s")
+        faults = [(fault, 1e-9 * (fault.since - self._start)) for fault in self._faults(result)]
+        self._found = [_anomaly(fault, f" since {since:.1f} s") for fault, since in faults]
+        return self._found
 
     def update_alone(self, frame: Frame) -> Iterator[Anomaly]:
         """Yield the cameras whose image shows nothing. The frame does not follow the frame before."""

@@ -79,20 +79,19 @@ def _compare(options: CompareOptions) -> int:
 
 
 def _configurations(options: CompareOptions) -> int:
-    from bevviz.compare.sides import ComparedSessions
+    from bevviz.compare.sides import Comparison
     from bevviz.pipeline.session import check_same_frames, common_frames
 
     names, (a, b) = _sides(options)
     check_same_frames({"A": a, "B": b})
     decoded = common_frames([a, b])
     with open_bag(options.drive, options.frames, decoded) as source:
-        sessions = ComparedSessions(a, b, options.truth.find(source))
-        return _run(sessions, source, decoded, names, (a, b), options)
+        comparison = Comparison((a, b), truth=options.truth.find(source))
+        return _run(comparison, source, decoded, names, (a, b), options)
 
 
 def _robot(options: CompareOptions, requested: str) -> int:
-    from bevviz.compare.sides import ComparedRobot, robot_topic
-    from bevviz.pipeline.session import Session
+    from bevviz.compare.sides import Comparison, robot_topic
 
     sides = options.sides
     if sides.a or sides.b or sides.set_a or sides.set_b:
@@ -101,8 +100,8 @@ def _robot(options: CompareOptions, requested: str) -> int:
     with open_bag(options.drive, options.frames, config) as source:
         topic = robot_topic(source.roles.robot_detections_3d, requested)
         names = "bevviz", f"the robot's {topic}"
-        compared = ComparedRobot(Session(config), topic, options.truth.find(source))
-        return _run(compared, source, config, names, (config, config), options)
+        comparison = Comparison((config,), topic, options.truth.find(source))
+        return _run(comparison, source, config, names, (config, config), options)
 
 
 def _run(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import rerun as rr
@@ -14,24 +16,38 @@ from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate.differences import FrameDifferences, before_after, differences, seen
-from bevviz.evaluate.ground_truth import TruthLookup
+from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
-from bevviz.pipeline.session import Session, SessionGroup, check_same_frames
+from bevviz.pipeline.session import SessionGroup, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.stages.robot_results import detections_of, in_points_frame
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ComparedFrame:
-    """Results of both sides for a frame, and their differences. None: a side has no result."""
+    """Results of both sides for a frame.
 
-    frame: Frame
-    a: FrameResult | None
+    Attributes:
+        a: result of A.
+        b: result of B. None: the robot published none.
+        truth: ground truth of the frame. None: it is unknown.
+    """
+
+    a: FrameResult
     b: FrameResult | None
-    found: FrameDifferences | None = None
+    truth: Truth | None = None
+
+    @cached_property
+    def found(self) -> FrameDifferences | None:
+        """Differences of the sides. None: a side has no result."""
+        a, b = self.a, self.b
+        if b is None:
+            return None
+        judged = None if self.truth is None else before_after(a.objects, b.objects, self.truth)
+        return differences(a.frame.index, a.frame.stamp, seen(a), seen(b), judged)
 
 
 class SideFailures(Observer[ComparedFrame]):
@@ -42,9 +58,9 @@ class SideFailures(Observer[ComparedFrame]):
 
     def observe(self, result: ComparedFrame) -> None:
         """Collect the failures of a frame."""
-        for side, frame_result in (("A", result.a), ("B", result.b)):
-            if frame_result is not None:
-                self._sides[side].observe(frame_result)
+        self._sides["A"].observe(result.a)
+        if result.b is not None:
+            self._sides["B"].observe(result.b)
 
     @property
     def warnings(self) -> list[str]:
@@ -52,60 +68,37 @@ class SideFailures(Observer[ComparedFrame]):
         return [f"{side}: {text}" for side, failures in self._sides.items() for text in failures.warnings]
 
 
-class ComparedSessions:
-    """Processor that runs two configurations on the same frames.
+class Comparison:
+    """Processor that runs two configurations on the same frames, or one beside the robot's results.
 
     Args:
-        a, b: the configurations.
+        configs: configurations of A and B, or of A alone.
+        topic: the robot's Detection3DArray topic, which is B. Empty: there are two configurations.
         truth: returns the ground truth of a frame, if it is known.
 
     Raises:
         UserError: a detector's model cannot be used, or the configurations need different frames.
     """
 
-    def __init__(self, a: Config, b: Config, truth: TruthLookup | None = None) -> None:
-        check_same_frames({"A": a, "B": b})
-        self._sessions, self._truth = SessionGroup([a, b]), truth
+    def __init__(self, configs: Sequence[Config], topic: str = "", truth: TruthLookup | None = None) -> None:
+        check_same_frames(dict(zip("AB", configs, strict=False)))
+        self._sessions, self._topic, self._truth = SessionGroup(configs), topic, truth
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
-        """Run the stages of both configurations on a frame."""
-        a, b = self._sessions.perceive(frame, network)
-        return ComparedFrame(a.frame, a, b)
+        """Run the stages of the configurations on a frame."""
+        a, *others = self._sessions.perceive(frame, network)
+        truth = None if self._truth is None else self._truth(a.frame)
+        return ComparedFrame(a, others[0] if others else self._published(a), truth)
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
-        """Finish the results of both sides in frame order, and compare them."""
-        assert compared.a is not None
-        assert compared.b is not None
+        """Finish the results of the configurations in frame order."""
+        if self._topic or compared.b is None:
+            return replace(compared, a=self._sessions.finish((compared.a,))[0])
         a, b = self._sessions.finish((compared.a, compared.b))
-        return _compare_sides(compared.frame, a, b, self._truth)
+        return replace(compared, a=a, b=b)
 
-
-class ComparedRobot:
-    """Processor that compares a session with the robot's Detection3DArray topic."""
-
-    def __init__(self, session: Session, topic: str, truth: TruthLookup | None = None) -> None:
-        self._session, self._topic, self._truth = session, topic, truth
-
-    def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
-        """Run the stages on a frame."""
-        result = self._session.perceive(frame, network)
-        return ComparedFrame(result.frame, result, None)
-
-    def finish(self, compared: ComparedFrame) -> ComparedFrame:
-        """Finish the result in frame order, and compare it with the robot's."""
-        assert compared.a is not None
-        robot_result = published_result(compared.frame, self._topic, compared.a.config)
-        return _compare_sides(compared.frame, self._session.finish(compared.a), robot_result, self._truth)
-
-
-def _compare_sides(
-    frame: Frame, a: FrameResult, b: FrameResult | None, truths: TruthLookup | None
-) -> ComparedFrame:
-    if b is None:
-        return ComparedFrame(frame, a, b)
-    truth = None if truths is None else truths(frame)
-    judged = None if truth is None else before_after(a.objects, b.objects, truth)
-    return ComparedFrame(frame, a, b, differences(frame.index, frame.stamp, seen(a), seen(b), judged))
+    def _published(self, a: FrameResult) -> FrameResult | None:
+        return published_result(a.frame, self._topic, a.config)
 
 
 class ComparisonRecorder(Observer[ComparedFrame]):
@@ -141,7 +134,8 @@ class ComparisonRecorder(Observer[ComparedFrame]):
             if result is not None:
                 logger.log(result)
         if compared.found is not None:
-            self._differences.log(compared.found, compared.frame.received, compared.frame.pose)
+            frame = compared.a.frame
+            self._differences.log(compared.found, frame.received, frame.pose)
 
 
 # --- the robot ---------------------------------------------------------------------------------

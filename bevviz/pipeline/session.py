@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 from bevviz.anomalies import AnomalyDetector
+from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import Config, ParameterChange, changes
 from bevviz.errors import UserError
 from bevviz.model import geometry
@@ -33,6 +34,7 @@ class Session:
         loader: loader shared by sessions that share networks.
         memo: results shared by sessions that run on the same frames. The maker of the frames clears it.
         odometry: estimator of the motion, shared by sessions that run on the same frames.
+        sensors: watch of the sensors, shared by sessions that run on the same frames.
 
     Raises:
         UserError: the detector's model or a user-defined function cannot be used.
@@ -48,13 +50,14 @@ class Session:
         loader: StageLoader | None = None,
         memo: Memo | None = None,
         odometry: Odometry | None = None,
+        sensors: SensorWatch | None = None,
     ) -> None:
         self.loader = loader or StageLoader()
         self._detect, self._memo = detect, memo
         self._in_force = config, self.loader.load(config, detect)  # Both are read and replaced together.
         self._odometry = odometry or Odometry()
         self._tracker = Tracker()
-        self._anomalies = AnomalyDetector()
+        self._anomalies = AnomalyDetector(sensors)
 
     @property
     def config(self) -> Config:
@@ -150,6 +153,7 @@ class Variants:
 
     def __init__(self, loader: StageLoader | None = None) -> None:
         self._memo, self._loader, self._odometry = Memo(), loader or StageLoader(), Odometry()
+        self._sensors: dict[str, SensorWatch] = {}  # by the sections that it depends on
         self._frame: Frame | None = None
         self._still: Frame | None = None
         self._lock = threading.Lock()  # guards _frame and _still
@@ -160,7 +164,9 @@ class Variants:
         Raises:
             UserError: the detector's model or a user-defined function cannot be used.
         """
-        return Session(config, loader=self._loader, memo=self._memo, odometry=self._odometry)
+        sections = f"{config.voxel} {config.ground} {config.sync}"
+        sensors = self._sensors.setdefault(sections, SensorWatch())
+        return Session(config, loader=self._loader, memo=self._memo, odometry=self._odometry, sensors=sensors)
 
     def check(self, config: Config) -> None:
         """Check that the stages of a configuration can be loaded.

@@ -198,13 +198,13 @@ class AgentTools:
         return fitted(self._compared(self._drive(drive), settings_a, settings_b))
 
     def _compared(self, asked: AskedDrive, a: Sequence[str], b: Sequence[str]) -> dict[str, Any]:
-        from bevviz.compare.sides import ComparedSessions
+        from bevviz.compare.sides import Comparison
         from bevviz.compare.summary import ComparisonSummary
 
         configs = [agent_config(asked.drive.config, settings) for settings in (a, b)]
         summary = ComparisonSummary((" ".join(a) or "as opened", " ".join(b)), changes(*configs))
         truth_of = truth_source(asked.source.roles, *asked.truth, len(asked.drive))
-        run(asked.source, ComparedSessions(configs[0], configs[1], truth_of), [summary])
+        run(asked.source, Comparison(configs, truth=truth_of), [summary])
         tree = summary.result()
         sides = [
             word for side, settings in (("a", a), ("b", b)) for s in settings for word in (f"--set-{side}", s)
