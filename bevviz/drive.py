@@ -344,7 +344,7 @@ class Drive(Closable, Tabular):
         Raises:
             UserError: the file cannot be written, or there is no such blueprint.
         """
-        from bevviz.evaluate.marks import MarkRecorder
+        from bevviz.findings.marks import MarkRecorder
         from bevviz.pipeline.run import Progress
         from bevviz.recording.recorder import DiskWatch, Recorder
         from bevviz.recording.sinks import open_recording
@@ -369,7 +369,7 @@ class Drive(Closable, Tabular):
         Raises:
             UserError: no viewer can be shown.
         """
-        from bevviz.evaluate.marks import MarkRecorder
+        from bevviz.findings.marks import MarkRecorder
         from bevviz.notebook import NotebookViewer, in_notebook
         from bevviz.recording.recorder import Recorder
         from bevviz.recording.sinks import open_recording
@@ -384,9 +384,14 @@ class Drive(Closable, Tabular):
 
     def _columns(self) -> Columns:
         """Run the whole drive and return a row for each frame: counts, times and problems."""
+        from bevviz.findings.frame_findings import findings_of
         from bevviz.fleet.table import row
+        from bevviz.why.frame_index import FrameIndex
 
-        return [row(result, result.config) for result in self]
+        return [
+            row(result, findings_of(FrameIndex(result)), evaluated=result.frame.truth is not None)
+            for result in self
+        ]
 
 
 @errors_about_arguments()

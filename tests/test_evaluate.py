@@ -402,9 +402,7 @@ def test_a_batch_is_evaluated_against_the_truth(
 ) -> None:
     runs, junit = tmp_path / "runs", tmp_path / "ci.xml"
     command = ["batch", str(drive), "-o", str(runs), "--model", "demo", "--junit", str(junit)]
-    assert main([*command, "--min", "recall=0.1"]) == 2
-    assert "--min, --max and --junit: held to what? Give --truth" in capsys.readouterr().err
-    assert main([*command, "--truth", "--min", "recall=0.1"]) == 0
+    assert main([*command, "--min", "recall=0.1"]) == 0, "truth in the bag is used"
     rows = pq.read_table(runs / "summary.parquet").to_pylist()
     assert sum(row["missed"] for row in rows) == evaluated.metrics["missed"]
     missed = [text for row in rows for text in row["remarks"] if text.startswith("missed ")]
@@ -412,7 +410,7 @@ def test_a_batch_is_evaluated_against_the_truth(
     assert f"{evaluated.metrics['recall']:.3f}</td>" in (runs / "summary.html").read_text()
     assert ElementTree.parse(junit).getroot()[0].get("failures") == "0"
     # The same results, another limit: nothing is run again.
-    assert main([*command, "--truth", "--min", "recall=0.999"]) == 1
+    assert main([*command, "--min", "recall=0.999"]) == 1
     said = capsys.readouterr().err
     assert "1 of 1 bags are complete and up to date" in said
     assert "drive: not kept: recall is 0." in said

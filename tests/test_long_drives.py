@@ -6,6 +6,7 @@ import math
 import os
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.drive import Drive
 from bevviz.findings.finding_list import CELL, FindingFrame, FindingList
-from bevviz.findings.frame_findings import Finding
+from bevviz.findings.frame_findings import Finding, findings_of
 from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
 from bevviz.model.results import FrameResult
 from bevviz.pipeline import result_store
 from bevviz.pipeline.run import run
 from bevviz.recording import entities
 from bevviz.why import Selection
+from bevviz.why.frame_index import FrameIndex
 from bevviz.workbench import drive_recording, recorded_drive
 from bevviz.workbench.buffers import FrameCache, PageState
 from bevviz.workbench.overview import STEP, overview_order
@@ -106,11 +108,12 @@ def test_an_overview_lists_images_that_show_nothing() -> None:
     for number in overview_order(8 * CELL):
         covered = 2 * CELL <= number < 4 * CELL
         frame = frame_with_image(number, np.zeros_like(image) if covered else image)
-        anomalies = detector.update_alone(FrameResult.unprocessed(frame, config), config.anomalies)
+        result = FrameResult.unprocessed(frame, config)
+        anomalies = detector.update_alone(result, config.anomalies)
         assert [(a.kind, a.subject) for a in anomalies] == (
             [("sensor", "camera front: black image")] if covered else []
         )
-        listed.add_overview_anomalies(number, frame.stamp, anomalies)
+        listed.add_overview(number, findings_of(FrameIndex(replace(result, anomalies=anomalies))))
     found = [(kind, name, [one.text for one in frames]) for kind, name, frames in listed.content()]
     text = "camera front: black image, mean grey value 0"
     assert [(kind, name) for kind, name, _ in found] == 2 * [("anomaly", "sensor")]

@@ -11,11 +11,11 @@ import rerun as rr
 
 from bevviz.config import load
 from bevviz.evaluate import judge, truth_of
-from bevviz.evaluate.marks import MarkRecorder
 from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.findings.marks import MarkRecorder
+from bevviz.model.decisions import unmatched_detections
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.recording.images import unexplained_detections
 from bevviz.recording.recorder import Recorder
 from tests.support.recordings import Recording
 
@@ -99,7 +99,7 @@ def test_without_truth_unexplained_things_are_marked(tmp_path: Path) -> None:
     lost = int(np.flatnonzero(camera.detections.kept & (decisions == 0))[0])
     decisions[lost] = 1
     blind = replace(camera, fusion=replace(camera.fusion, detection_decision=decisions))
-    assert lost in unexplained_detections(blind)
+    assert lost in unmatched_detections(blind)
     frame = replace(result().frame, truth=None)
     recording = recorded(tmp_path / "a.rrd", replace(result(), frame=frame, cameras=(blind,)))
     assert says(recording, "/world/unexplained") and says(recording, "/bev/overlay/unexplained")

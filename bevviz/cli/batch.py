@@ -87,7 +87,10 @@ class BatchTruth:
     group: ClassVar = Group("ground truth")
 
     truth: str | None = option(
-        "TOPIC", "evaluate: against the bag's own .../ground_truth, or this Detection3DArray", const=""
+        "TOPIC",
+        "evaluate each bag: refuse one without .../ground_truth, or use this Detection3DArray "
+        "(default: evaluate those with .../ground_truth)",
+        const="",
     )
 
 
@@ -119,9 +122,10 @@ class BatchOptions:
     epilog=TIMES,
 )
 def _batch(options: BatchOptions) -> int:
+    from bevviz.evaluate.metrics import parse_limits
     from bevviz.fleet.jobs import intact_results, lock_folder
 
-    limits = _limits(options)
+    limits = parse_limits(options.limits.min, options.limits.max)
     if options.results.catalog and options.results.serve_catalog:
         raise UserError("--catalog and --serve-catalog: give one of them")
     failed: list[tuple[str, str]] = []
@@ -134,15 +138,6 @@ def _batch(options: BatchOptions) -> int:
             interrupted = False
             complete = intact_results(options.output.resolve(), _warn)
         return _sum_up(complete, failed, limits, options, interrupted)
-
-
-def _limits(options: BatchOptions) -> list[Limit]:
-    from bevviz.evaluate.metrics import parse_limits
-
-    limits = parse_limits(options.limits.min, options.limits.max)
-    if (limits or options.limits.junit) and options.paths and options.truth.truth is None:
-        raise UserError("--min, --max and --junit: held to what? Give --truth, or --truth TOPIC")
-    return limits
 
 
 def _jobs(options: BatchOptions) -> list[Job]:

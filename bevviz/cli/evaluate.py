@@ -94,7 +94,9 @@ def _evaluate(options: EvaluateOptions) -> int:
 
 def _check_detector(config: Config) -> None:
     """Raise an error if no object can have a class."""
-    if not (config.detector.model or config.objects.method != "frustum"):
+    from bevviz.findings.frame_findings import has_detector
+
+    if not has_detector(config):
         raise UserError(
             "without a detector no object has a class, and all would be missed: give --model FILE.onnx, "
             "or another objects.method; --min ground_iou=0.9 needs none"
@@ -108,6 +110,7 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
     """
     from bevviz.anomalies import FailureSummary
     from bevviz.evaluate.log import EvaluationRecorder
+    from bevviz.findings.marks import MarkRecorder
     from bevviz.findings.run_table import list_keeper
     from bevviz.pipeline.session import Session
 
@@ -126,7 +129,8 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         print_hints(frames.scene, config)
         recorder = Recorder(recording, config, session.stages.provider)
-        return [recorder, *judges, EvaluationRecorder(recording, evaluation)]
+        marks = MarkRecorder(recording, evaluation.last_truth)
+        return [recorder, *judges, EvaluationRecorder(recording, evaluation), marks]
 
     def finish() -> None:
         warn(failures.warnings)

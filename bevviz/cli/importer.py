@@ -80,7 +80,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
     from bevviz.config.project import read_project_layers
     from bevviz.config.trust import Trust
     from bevviz.drive import Drive
-    from bevviz.evaluate.marks import MarkRecorder
+    from bevviz.findings.marks import MarkRecorder
     from bevviz.recording import blueprints
     from bevviz.recording.recorder import Recorder
     from bevviz.recording.source_lookup import Origin

@@ -50,7 +50,7 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
         default: file to save if nothing can be shown.
     """
     from bevviz.anomalies import AnomalySummary, FailureSummary
-    from bevviz.evaluate.marks import MarkRecorder
+    from bevviz.findings.marks import MarkRecorder
     from bevviz.recording.recorder import Recorder
 
     anomalies, failures = AnomalySummary(), FailureSummary()

@@ -246,13 +246,13 @@ class BeforeAfter:
     @property
     def new_false(self) -> list[int]:
         """Rows of the objects after that are false and were not. Without ground truth: all new ones."""
-        pairs = [(pair.row_b, pair.name_b, pair.row_a) for pair in self.pairs]
+        pairs = [(pair.row_b, pair.row_a) for pair in self.pairs]
         return self._false_only(pairs, self.after, self.before)
 
     @property
     def false_gone(self) -> list[int]:
         """Rows of the objects before that were false and are not. Without ground truth: all that are gone."""
-        pairs = [(pair.row_a, pair.name_a, pair.row_b) for pair in self.pairs]
+        pairs = [(pair.row_a, pair.row_b) for pair in self.pairs]
         return self._false_only(pairs, self.before, self.after)
 
     @property
@@ -273,17 +273,15 @@ class BeforeAfter:
         return f"{self.truth.labels[row].lower()} at {self.truth.boxes.distance[row]:.1f} m"
 
     def _false_only(
-        self, pairs: Iterable[tuple[int, str, int]], matches: Matches | None, others: Matches | None
+        self, pairs: Iterable[tuple[int, int]], matches: Matches | None, others: Matches | None
     ) -> list[int]:
         """Return the rows of one side's false objects whose partner on the other side is not false."""
         if self.truth is None or matches is None or others is None:
-            return [row for row, _, other in pairs if other < 0]
-        names = self.truth.judged_names
+            return [row for row, other in pairs if other < 0]
         return [
             row
-            for row, name, other in pairs
-            if row >= 0 and matches.false[row] and name.lower() in names
-            if other < 0 or not others.false[other]
+            for row, other in pairs
+            if row >= 0 and matches.false[row] and (other < 0 or not others.false[other])
         ]
 
 

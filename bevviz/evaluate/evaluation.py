@@ -38,17 +38,6 @@ CauseLookup: TypeAlias = "Callable[[FrameResult, Truth], Mapping[int, Reason]]"
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedFrame:
-    """Objects of a frame compared with the ground truth, as text."""
-
-    index: int
-    stamp: int
-    true: tuple[str, ...]  # text as ``person at 12.3 m, 4° left``
-    missed: tuple[str, ...]
-    false: tuple[tuple[str, str, str], ...]  # name, text, cause; a name that no label accepts is not judged
-
-
-@dataclass(frozen=True, slots=True)
 class FrameOutcome:
     """Objects of a frame in words."""
 
@@ -92,6 +81,8 @@ class Evaluation(Observer[FrameResult], Tabular):
     Attributes:
         last: result, ground truth and matches of the last frame.
         causes: causes of its false objects, by row.
+        judged: objects of each frame as text.
+        false_causes: number of false objects by cause. Empty: the causes were not asked for.
 
     Example:
         >>> evaluation = drive.evaluate()
@@ -101,7 +92,8 @@ class Evaluation(Observer[FrameResult], Tabular):
     def __init__(self, truth: TruthLookup, causes: CauseLookup | None = None) -> None:
         self._truth, self._causes = truth, causes
         self.causes: Mapping[int, Reason] = {}
-        self.judged: list[JudgedFrame] = []
+        self.judged: list[FrameOutcome] = []
+        self.false_causes: Counter[str] = Counter()  # number of false objects by cause
         self.without = 0  # frames without ground truth
         self.unusable: list[str] = []  # one sentence for each label that cannot be used
         self.last: tuple[FrameResult, Truth, Matches] | None = None
@@ -127,7 +119,8 @@ class Evaluation(Observer[FrameResult], Tabular):
         self.last = result, truth, matches
         asked = self._causes is not None and matches.false.any()
         self.causes = self._causes(result, truth) if self._causes is not None and asked else {}
-        self.judged.append(_judged_frame(result.frame, objects, truth, matches, self.causes))
+        self.false_causes.update(cause.kind.value for cause in self.causes.values())
+        self.judged.append(_outcome(result.frame, objects, truth, matches, self.causes))
         self._store_positions(objects, truth, matches)
         if result.objects is not None:
             self._precision.add(scored_objects(result, truth), truth)
@@ -148,11 +141,11 @@ class Evaluation(Observer[FrameResult], Tabular):
         for j in np.flatnonzero(matches.false).tolist():
             self._rows.append(("false", objects.names[j].lower(), float(objects.boxes.distance[j])))
 
-    # --- numbers -------------------------------------------------------------------------------
+    def last_truth(self, frame: Frame) -> Truth | None:
+        """Return the ground truth of the last frame, for observers that see it later; None: it has none."""
+        return None if self.last is None or self.last[0].frame is not frame else self.last[1]
 
-    def judges(self, name: str) -> bool:
-        """Return whether some label accepts a name in lower case."""
-        return self._score.judged.of(name) is not None
+    # --- numbers -------------------------------------------------------------------------------
 
     @property
     def metrics(self) -> Mapping[str, float]:
@@ -218,11 +211,8 @@ class Evaluation(Observer[FrameResult], Tabular):
 
     def _judged_rows(self) -> Iterator[tuple[str, str, float]]:
         """Yield outcome, class and distance of the true, false and missed objects."""
-        classes = {name: self._score.judged.of(name) for outcome, name, _ in self._rows if outcome == "false"}
         for outcome, name, distance in self._rows:
-            cls = classes[name] if outcome == "false" else name
-            if cls is not None:
-                yield outcome, cls, distance
+            yield outcome, (outcome == "false" and self._score.judged.of(name)) or name, distance
 
     @property
     def labels(self) -> Mapping[str, int]:
@@ -233,33 +223,13 @@ class Evaluation(Observer[FrameResult], Tabular):
     @property
     def now(self) -> FrameOutcome:
         """Objects of the last frame, as text."""
-        return self._frame(self.judged[-1])
+        return self.judged[-1]
 
     @property
     def worst(self) -> list[FrameOutcome]:
         """Frames with missed or false objects, those with most of them first."""
-        frames = [self._frame(frame) for frame in self.judged]
-        wrong = [frame for frame in frames if frame.missed or frame.false]
+        wrong = [frame for frame in self.judged if frame.missed or frame.false]
         return sorted(wrong, key=lambda f: (-len(f.missed) - len(f.false), f.frame))
-
-    def _frame(self, frame: JudgedFrame) -> FrameOutcome:
-        false = [
-            f"{text}: {cause}" if cause else text for name, text, cause in frame.false if self.judges(name)
-        ]
-        return FrameOutcome(frame.index, frame.stamp, frame.true, frame.missed, false)
-
-    @property
-    def last_causes(self) -> list[str]:
-        """Causes of the false objects of the last frame."""
-        return [cause for name, _, cause in self.judged[-1].false if cause and self.judges(name)]
-
-    @property
-    def false_causes(self) -> Counter[str]:
-        """Number of false objects by cause, the most frequent first. Empty: the causes were not asked for."""
-        causes = Counter(
-            cause for frame in self.judged for name, _, cause in frame.false if cause and self.judges(name)
-        )
-        return Counter(dict(causes.most_common()))
 
     # --- how it is shown -----------------------------------------------------------------------
 
@@ -277,7 +247,7 @@ class Evaluation(Observer[FrameResult], Tabular):
             metrics={
                 name: None if math.isnan(value) else round(value, 6) for name, value in self.metrics.items()
             },
-            false_causes=self.false_causes,
+            false_causes=dict(self.false_causes.most_common()),
             worst=self.worst,
             limits=limits,
         )
@@ -319,25 +289,24 @@ def count_ground(counts: Counter[str], result: FrameResult) -> None:
 # --- words -------------------------------------------------------------------------------------
 
 
-def _judged_frame(
+def _outcome(
     frame: Frame, objects: Objects, truth: Truth, matches: Matches, causes: Mapping[int, Reason]
-) -> JudgedFrame:
+) -> FrameOutcome:
+    """Return the objects of a frame as text, as ``person at 12.3 m, 4° left``."""
+
     def label_text(k: int) -> str:
         return f"{truth.labels[k].lower()} {position_text(truth.boxes, k)}"
 
-    return JudgedFrame(
+    def false_text(j: int) -> str:
+        text = f"{objects.names[j].lower()} {position_text(objects.boxes, j)}"
+        return f"{text}: {causes[j].kind.value}" if j in causes else text
+
+    return FrameOutcome(
         frame.index,
         frame.stamp,
         tuple(label_text(int(matches.partner[j])) for j in np.flatnonzero(matches.true)),
-        tuple(label_text(k) for k in np.flatnonzero(matches.missed).tolist()),
-        tuple(
-            (
-                objects.names[j].lower(),
-                f"{objects.names[j].lower()} {position_text(objects.boxes, j)}",
-                causes[j].kind.value if j in causes else "",
-            )
-            for j in np.flatnonzero(matches.false).tolist()
-        ),
+        tuple(map(label_text, np.flatnonzero(matches.missed).tolist())),
+        tuple(map(false_text, np.flatnonzero(matches.false).tolist())),
     )
 
 
@@ -396,7 +365,7 @@ def tables(evaluation: Evaluation) -> Iterator[list[Row]]:
     by_range = (_row(evaluation, f"{low} to {high} m", f"@{low}-{high}")[:7] for low, high in ranges())
     yield [("range", *heads[1:7]), *by_range]
     if causes := evaluation.false_causes:
-        yield [("false objects", "number"), *((cause, str(count)) for cause, count in causes.items())]
+        yield [("false objects", "number"), *((cause, str(count)) for cause, count in causes.most_common())]
     metrics = evaluation.metrics
     if labels := evaluation.labels:
         columns = [f"ap_{view}_{overlap}" for view in VIEWS for overlap in OVERLAPS]

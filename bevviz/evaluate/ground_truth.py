@@ -15,7 +15,7 @@ from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
-from bevviz.model.class_names import ACCEPTED_NAMES, DATA_SETS
+from bevviz.model.class_names import ACCEPTED_NAMES, judged_names
 from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.stages.robot_results import in_points_frame
 
@@ -45,12 +45,8 @@ class Truth:
 
     @property
     def judged_names(self) -> frozenset[str]:
-        """Names that some label accepts, in lower case. Without a label, an object with such a name is false.
-
-        A label of the same data set in another frame may accept a name that no label of this frame does.
-        """
-        families = [names for names in DATA_SETS if names.keys() & set(self.labels)] or DATA_SETS
-        return frozenset().union(*self.accepted, *(names for one in families for names in one.values()))
+        """Names, in lower case, of which an object without a label is false."""
+        return judged_names(self.labels).union(*self.accepted)
 
     def unlabelled(self, boxes: Boxes3D) -> Bool:
         """Return (J,) whether a box has its centre in an image region without labels (KITTI's DontCare)."""

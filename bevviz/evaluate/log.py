@@ -16,7 +16,6 @@ from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.layers import Layer, Style, callouts, draw
-from bevviz.recording.marks import MARK_COLORS, Mark, box_mark, log_marks
 from bevviz.recording.primitives import document, transform
 from bevviz.recording.writer import SCALAR_WAIT, Writer
 from bevviz.support.colors import TRUTH_COLORS
@@ -28,7 +27,9 @@ _WRONG = ("missed", "false")  # outcomes whose objects have marks
 
 
 class EvaluationRecorder(Observer[FrameResult]):
-    """Observer that logs the evaluation of each frame. The evaluation must see the frame first.
+    """Observer that logs the evaluation of each frame, without the marks of ``findings.marks``.
+
+    The evaluation must see the frame first.
 
     Args:
         recording: target.
@@ -52,14 +53,12 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer, frame = self._writer, result.frame
         writer.begin(frame.index, frame.stamp, frame.received)
         _, truth, matches = self._evaluation.last
-        judges = self._evaluation.judges
         groups: list[BoxGroup] = [
             ("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)
         ]
         if (objects := result.objects) is not None:
-            false = [j for j in np.flatnonzero(matches.false).tolist() if judges(objects.names[j].lower())]
-            groups.append(("false", objects.boxes, false, objects.names))
-            groups.append(("true", objects.boxes, np.flatnonzero(matches.true).tolist(), objects.names))
+            for outcome, is_own in (("false", matches.false), ("true", matches.true)):
+                groups.append((outcome, objects.boxes, np.flatnonzero(is_own).tolist(), objects.names))
         groups = [group for group in groups if group[2]]
         self._boxes(result, groups)
         judged = self._evaluation.now
@@ -72,8 +71,7 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.end()
 
     def _boxes(self, result: FrameResult, groups: Sequence[BoxGroup]) -> None:
-        """Log the boxes, and marks of the wrong ones. Right objects have names only under the pointer."""
-        marks: list[Mark] = []
+        """Log the boxes, with names under the pointer."""
         for outcome, boxes, rows, names in groups:
             chosen, path = boxes.chosen(rows), entities.JUDGED.path(outcome)
             causes = self._evaluation.causes if outcome == "false" else {}
@@ -86,11 +84,6 @@ class EvaluationRecorder(Observer[FrameResult]):
                 Layer(path, chosen, Style(color, 0.5, labels=False), labels, frame=pose),
                 *callouts(path, chosen, says, (), [color] * len(rows)),
             )
-            for state in MARK_COLORS:
-                if state == outcome:
-                    texts = zip(rows, labels, says, strict=True)
-                    marks += [box_mark(state, boxes, *text) for text in texts]
-        log_marks(self._writer, result, marks)
 
     def end(self) -> None:
         """Log the tables of the whole run."""

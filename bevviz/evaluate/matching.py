@@ -22,13 +22,14 @@ class Matches:
     """Objects of a frame matched with its ground truth.
 
     An object is true if it matches a label that has to be found. It is false if it matches no label. It is
-    neither if it matches a label that need not be found, or lies in a region without labels.
+    neither if it matches a label that need not be found, lies in a region without labels, or has a name that
+    the labels do not judge (``Truth.judged_names``).
     """
 
     partner: I32  # (J,) row of the object's label, else -1
     distance: F64  # (J,) metres on the ground plane between the centres, NaN without a label
     true: Bool  # (J,)
-    false: Bool  # (J,) includes names that no label accepts; the caller leaves them out
+    false: Bool  # (J,)
     missed: Bool  # (K,) had to be found, but was not
 
 
@@ -44,7 +45,7 @@ class AcceptedNames:
             self._accepted[label.lower()] = self._accepted.get(label.lower(), frozenset()) | names
 
     def of(self, name: str) -> str | None:
-        """Return the class for which an object without a label counts. None: the name is not judged.
+        """Return the class for which an object without a label counts. None: no label accepts the name.
 
         It is the class of the same name. If there is none, it is the accepting label with the fewest names: a
         "person" counts as a pedestrian rather than as a cyclist.
@@ -66,14 +67,13 @@ class AcceptedNames:
         """
         counts = {label: Counter(label_counts) for label, label_counts in labels.items()}
         for name, number in false.items():
-            if (cls := self.of(name)) is not None:
-                counts.setdefault(cls, Counter())[key] += number
+            counts.setdefault(self.of(name) or name, Counter())[key] += number
         return counts
 
 
 @dataclass
 class ObjectScore:
-    """Counts of objects over frames. A name that no label accepts in any frame is not judged."""
+    """Counts of objects over frames."""
 
     judged: AcceptedNames = field(default_factory=AcceptedNames)
     errors: list[float] = field(default_factory=list)  # metres, of the true ones
@@ -100,10 +100,7 @@ class ObjectScore:
     @property
     def frames(self) -> F64:
         """(F, 3) numbers of true, missed and false objects of each frame."""
-        counts = [
-            (true, missed, sum(n for name, n in false.items() if self.judged.of(name) is not None))
-            for true, missed, false in self._frames
-        ]
+        counts = [(true, missed, false.total()) for true, missed, false in self._frames]
         return np.array(counts, np.float64).reshape(-1, 3)
 
     @property
@@ -156,7 +153,10 @@ def judge(objects: Objects, truth: Truth) -> Matches:
     missed[partner[paired]] = False
     true = paired.copy()
     true[paired] = truth.must[partner[paired]]
-    return Matches(partner, distance, true, ~paired & ~truth.unlabelled(objects.boxes), missed)
+    judged = truth.judged_names
+    is_judged = np.array([name.lower() in judged for name in objects.names], bool)
+    false = ~paired & ~truth.unlabelled(objects.boxes) & is_judged
+    return Matches(partner, distance, true, false, missed)
 
 
 def match(objects: Objects, truth: Truth) -> tuple[I32, F64]:
@@ -230,12 +230,12 @@ class DetectionScore:
         overlap = geometry.iou(detections.xyxy[kept], boxes)
         cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
         partner, free = pair_in_order(cost, 1.0)
-        excused = _in_regions(detections.xyxy[kept], truth)
+        excused, judged = _in_regions(detections.xyxy[kept], truth), truth.judged_names
         to_find = truth.must & np.isfinite(boxes).all(axis=1)
         for name, k, is_excused in zip(names, partner.tolist(), excused.tolist(), strict=True):
             if k >= 0 and to_find[k]:
                 self._labels[truth.labels[k].lower()]["true"] += 1
-            elif k < 0 and not is_excused:
+            elif k < 0 and not is_excused and name in judged:
                 self._false[name] += 1
         for row in np.flatnonzero(free & to_find).tolist():
             self._labels[truth.labels[row].lower()]["missed"] += 1

@@ -13,7 +13,6 @@ import numpy as np
 from bevviz.findings.frame_findings import Finding, Position
 from bevviz.model import geometry
 from bevviz.model.frame import F32
-from bevviz.model.results import Anomaly
 
 REACH = 2.5  # metres that an object may have moved since the last frame with this finding
 GAP = 5  # frames without the finding after which a new group begins
@@ -29,15 +28,16 @@ DIFFERENCES = {  # kind -> remark
     "gone": "The tried values lose it.",
 }
 _SENSOR = "Nothing was tried: no parameter of a stage mends"
-ANOMALIES = {  # kind -> remark
+_ANOMALIES = {  # kind -> remark
     "sensor": f"{_SENSOR} a sensor.",
     "sync": f"{_SENSOR} the clocks of two sensors.",
     "tf": f"{_SENSOR} a transform.",
     "stage": "Nothing was tried: a stage fails or is slow.",
-    "one_sensor": "Nothing was tried: it lasts several frames, click an object of it to ask.",
+    "one sensor": "Nothing was tried: it lasts several frames, click an object of it to ask.",
     "jump": "Nothing was tried: it lasts several frames, click the object to ask.",
     "flicker": "Nothing was tried: it lasts several frames, click the object to ask.",
 }
+REMARKS = DIFFERENCES | _ANOMALIES
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,43 +91,45 @@ class FindingList:
         self._groups: dict[int, FindingGroup] = {}
         self._recent: dict[tuple[str, str], list[FindingGroup]] = {}
         self._overview: dict[int, list[FindingGroup]] = {}  # groups of single frames, by cell of the drive
+        self._anomalies: set[str] = set()  # numbers of those that have begun
         self._number = 0
         self._lock = threading.Lock()
 
     def add(self, findings: Iterable[Finding], *, tried: bool = False) -> None:
         """Add the findings of the next frame.
 
-        A finding near a recent one of the same kind and name joins its group.
+        A finding near a recent one of the same kind and name joins its group. Of an anomaly the frame in
+        which it begins is listed.
         """
         with self._lock:
             taken_groups: set[int] = set()
             for finding in findings:
+                if finding.what == "anomaly":
+                    if finding.number in self._anomalies:
+                        continue
+                    self._anomalies.add(finding.number)
                 group = self._same(finding, taken_groups) or self._new_recent(finding.what, finding.name)
                 self._extend(group, finding, taken_groups, tried)
 
     def add_overview(self, frame: int, findings: Iterable[Finding]) -> None:
         """Add the findings of a single frame. They stay until ``end_overview`` reaches the frame.
 
-        A finding near one of the same kind and name joins its group, within ``CELL`` frames.
+        A finding near one of the same kind and name joins its group, within ``CELL`` frames. There an anomaly
+        is listed once.
         """
         with self._lock:
             groups, taken_groups = self._overview.setdefault(frame // CELL, []), set[int]()
             for finding in findings:
                 kind = finding.what, finding.name
+                subject = finding.subject
+                if subject and any((one.what, one.subject) == ("anomaly", subject) for one in groups):
+                    continue
                 near = _nearest(
                     (one for one in groups if (one.what, one.name) == kind), finding, taken_groups
                 )
                 if near is None:
                     groups.append(near := self._new(*kind))
                 self._extend(near, finding, taken_groups)
-
-    def add_overview_anomalies(self, frame: int, stamp: int, anomalies: Sequence[Anomaly]) -> None:
-        """Add the anomalies of a single frame, once within ``CELL`` frames, until ``end_overview``."""
-        with self._lock:
-            groups = self._overview.setdefault(frame // CELL, [])
-            for anomaly in anomalies:
-                if not any((one.what, one.subject) == ("anomaly", anomaly.subject) for one in groups):
-                    groups.append(self._new_anomaly(frame, stamp, anomaly))
 
     def end_overview(self, frame: int) -> None:
         """Remove the findings of single frames up to the cell of a frame. The run in order has reached it."""
@@ -141,16 +143,16 @@ class FindingList:
     ) -> None:
         """Add one finding to a group."""
         taken_groups.add(group.number)
-        group.position, group.box = finding.position, finding.box
+        group.position, group.box, group.subject = finding.position, finding.box, finding.subject
         group.frames.append(
             FindingFrame(
                 finding.frame,
                 finding.stamp,
                 finding.distance,
-                str(finding.selection),
+                "" if finding.selection is None else str(finding.selection),
                 tried,
-                finding.reason,
-                DIFFERENCES.get(finding.what, ""),
+                finding.text if finding.what == "anomaly" else finding.reason,
+                REMARKS.get(finding.name if finding.what == "anomaly" else finding.what, ""),
                 finding.in_way,
             )
         )
@@ -169,18 +171,6 @@ class FindingList:
         self._number += 1
         group = FindingGroup(self._number, kind, name)
         self._groups[group.number] = group
-        return group
-
-    def add_anomalies(self, frame: int, stamp: int, anomalies: Sequence[Anomaly]) -> None:
-        """Add the anomalies that begin in a frame."""
-        with self._lock:
-            for anomaly in anomalies:
-                self._new_anomaly(frame, stamp, anomaly)
-
-    def _new_anomaly(self, frame: int, stamp: int, anomaly: Anomaly) -> FindingGroup:
-        group = self._new("anomaly", anomaly.kind.replace("_", " "))
-        group.subject, remark = anomaly.subject, ANOMALIES[anomaly.kind]
-        group.frames.append(FindingFrame(frame, stamp, math.nan, "", text=anomaly.text, remark=remark))
         return group
 
     def content(self) -> list[tuple[str, str, list[FindingFrame]]]:

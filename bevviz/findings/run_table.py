@@ -10,12 +10,12 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from bevviz.anomalies import Onsets
 from bevviz.bags.remote import address_of
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, values
 from bevviz.findings.finding_list import FindingFrame, FindingList
-from bevviz.findings.frame_findings import find_findings
+from bevviz.findings.frame_findings import Finding, find_findings
+from bevviz.model.frame import Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key, with_weights
@@ -89,19 +89,17 @@ class ListKeeper(Observer[FrameResult]):
 
     def __init__(self, table: RunTable, session: Session, scans: int) -> None:
         self._table, self._session, self._scans = table, session, scans
-        self._list, self._onsets = FindingList(), Onsets()
+        self._list = FindingList()
         self._frames: list[tuple[int, int]] = []
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
-        self.add(FrameExplainer(result, self._session.loader, self._session.stages.class_names))
+        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names)
+        self.add(result.frame, find_findings(explainer))
 
-    def add(self, explainer: FrameExplainer) -> None:
-        """List the findings of a frame that is explained already."""
-        result = explainer.traces.result
-        frame = result.frame
-        self._list.add(find_findings(explainer))
-        self._list.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
+    def add(self, frame: Frame, findings: Iterable[Finding]) -> None:
+        """List the findings of a frame."""
+        self._list.add(findings)
         self._frames.append((frame.stamp, frame.index))
 
     def end(self) -> None:

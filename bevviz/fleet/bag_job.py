@@ -16,11 +16,12 @@ from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
-from bevviz.evaluate.marks import MarkRecorder
+from bevviz.findings.frame_findings import find_findings, has_detector
+from bevviz.findings.marks import MarkRecorder
 from bevviz.findings.run_table import ListKeeper, list_keeper
-from bevviz.fleet.findings import FINDINGS, FindingCollector, judged_names
+from bevviz.fleet.findings import FINDINGS, FindingCollector
 from bevviz.fleet.jobs import PARTIAL, Job, JobResult
-from bevviz.fleet.table import RunInfo, add_judgement, row, write_table
+from bevviz.fleet.table import RunInfo, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run as run_frames
@@ -106,15 +107,14 @@ def _fill(
             observers: list[Observer[FrameResult]] = [
                 Recorder(sinks.recording, job.config, session.stages.provider)
             ]
-            if job.truth is not None:
+            if job.truth is not None or (source.scene.truth and has_detector(job.config)):
                 evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
-            else:
-                observers.append(MarkRecorder(sinks.recording))
             assert sinks.file is not None
             # The workbench takes stated labels for the frames' own.
             keeper = None if job.truth else list_keeper(source, session, job.config)
-            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, keeper)
+            marks = MarkRecorder(sinks.recording)
+            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, marks, keeper)
             watchers = [*observers, collector, DiskWatch(sinks)]
             if run_frames(source, session, watchers).interrupted:
                 raise KeyboardInterrupt
@@ -153,31 +153,29 @@ class _RowCollector(Observer[FrameResult]):
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
         session: Session,
+        marks: MarkRecorder,
         keeper: ListKeeper | None,
     ) -> None:
-        self._session, self._keeper = session, keeper
+        self._session, self._marks, self._keeper = session, marks, keeper
         self._job, self._rows, self._recording = job, rows, recording
         self._on_frame, self._evaluation = on_frame, evaluation
-        self._findings = FindingCollector(evaluation)
+        self._findings = FindingCollector()
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def observe(self, result: FrameResult) -> None:
-        values = row(result, result.config)
-        if self._evaluation is not None and self._evaluation.last is not None:
-            judgement = self._evaluation.now
-            causes = self._evaluation.last_causes
-            values = add_judgement(values, judgement.missed, judgement.false, causes)
+        truth = None if self._evaluation is None else self._evaluation.last_truth(result.frame)
+        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names, truth)
+        findings = find_findings(explainer)
+        values = row(result, findings, evaluated=truth is not None)
+        values[FINDINGS] = self._findings.of_frame(explainer.traces, findings)
         rank = values["badness"], -len(self._rows)
         if len(self._worst) < PICTURED or rank > self._worst[0][:2]:
             heapq.heappush(self._worst, (*rank, _pictures(result)))
         if len(self._worst) > PICTURED:
             heapq.heappop(self._worst)
-        judged = None if self._evaluation is None else self._evaluation.last
-        truth = None if judged is None else judged[1]
-        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names, truth)
-        values[FINDINGS] = self._findings.of_frame(explainer)
+        self._marks.log(result, findings)
         if self._keeper is not None:
-            self._keeper.add(explainer)
+            self._keeper.add(result.frame, findings)
         self._rows.append({**values, "bag": path_text(self._job.bag), "recording": self._job.name})
         self._on_frame()
         if not self._recording.exists():
@@ -188,9 +186,6 @@ class _RowCollector(Observer[FrameResult]):
             self._keeper.end()
         for _, negative_row, jpegs in self._worst:
             self._rows[-negative_row] |= jpegs
-        if self._evaluation is not None:
-            for values in self._rows:
-                values[FINDINGS] = judged_names(values[FINDINGS], self._evaluation)
 
 
 def _pictures(result: FrameResult) -> Mapping[str, bytes]:

@@ -31,10 +31,14 @@ SAME_OBJECT = 10  # consecutive frames whose findings of one class count as one 
 CHANGED = 2.0  # ratio of rates from which a cause has come or gone between two batches
 SURE = 6.6  # twice the log-likelihood ratio from which two rates differ: 1 % of chance
 
-BASES = {  # kind of finding -> the outcome that it is compared with
+BASES = {  # outcome of a finding -> the outcome that it is compared with; empty: nothing is like it
     "missed": "found",
     "false": "found",
+    "contradicted": "found",
+    "doubtful": "found",
+    "lost": "found",
     "unexplained": "found",
+    "unnamed": "",
     "anomaly": "quiet",
 }
 
@@ -296,7 +300,7 @@ class Findings:
 
 @dataclass(frozen=True, slots=True)
 class ListedFinding:
-    """One missed or false object, unexplained detection or anomaly."""
+    """One finding."""
 
     kind: str
     recording: str
@@ -315,7 +319,7 @@ class Cause:
     """Findings with a condition in common."""
 
     kind: str
-    """missed, false, unexplained or anomaly"""
+    """missed, false, contradicted, doubtful, lost, unexplained or anomaly"""
     reason: str
     """empty: several reasons"""
     text: str

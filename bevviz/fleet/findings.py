@@ -1,4 +1,4 @@
-"""Findings of a batch: a row for each missed, false and found object, with attributes to group them by.
+"""Findings of a batch: a row for each finding and each found object, with attributes to group them by.
 
 A table of frames holds the findings of each frame. ``findings.parquet`` has those of all bags.
 """
@@ -6,7 +6,7 @@ A table of frames holds the findings of each frame. ``findings.parquet`` has tho
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,69 +16,49 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from bevviz.evaluate.evaluation import Evaluation
-from bevviz.evaluate.matching import Matches
+from bevviz.findings.frame_findings import Finding
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D
-from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult
-from bevviz.recording.images import unexplained_detections
 from bevviz.support.files import atomic_write
-from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why import Selection
+from bevviz.why.frame_index import FrameIndex
 from bevviz.why.subject import projected_box, single_box
 
 FINDINGS = "findings"  # name of the table of all bags, and of the column in a table of frames
 
-Finding: TypeAlias = dict[str, Any]
+Row: TypeAlias = dict[str, Any]
 
-# ``outcome`` is one of these:
-#   found, missed, false   objects, where there is ground truth
-#   found, unexplained     where there is none: objects; detections without an object
-#   anomaly, quiet         an anomaly of the frame; a frame without any
-TEXTS = ("outcome", "reason", "text", "class", "object", "camera")
+# ``outcome`` is ``found``, ``quiet`` (a frame without an anomaly), or the kind of a finding. The kind
+# ``unmatched`` has the outcome ``unexplained``.
+OUTCOMES = {"unmatched": "unexplained"}
+TEXTS = ("outcome", "kind", "reason", "text", "class", "object", "camera")
 NUMBERS = (
     *("range_m", "bearing_deg", "length_m", "height_m", "points", "gap_m", "u", "v", "score"),
-    *("brightness", "scan_points", "scan_range_m", "speed_mps", "time_s", "hour"),
+    *("severity", "brightness", "scan_points", "scan_range_m", "speed_mps", "time_s", "hour"),
 )
 FINDING = pa.struct([*((name, pa.string()) for name in TEXTS), *((name, pa.float32()) for name in NUMBERS)])
 _FRAME = ("bag", "recording", "frame", "stamp")
 
 
 class FindingCollector:
-    """Collector of the findings of a drive, frame by frame.
+    """Collector of the findings of a drive and of what they are compared with, frame by frame."""
 
-    Args:
-        evaluation: evaluation of the same run, which observes each frame first; None: no ground truth.
-    """
-
-    def __init__(self, evaluation: Evaluation | None) -> None:
-        self._evaluation = evaluation
+    def __init__(self) -> None:
         self._start: int | None = None
         self._place: tuple[int, F64] | None = None  # stamp and position of the frame before
         self._speed = math.nan
 
-    def of_frame(self, explainer: FrameExplainer) -> list[Finding]:
-        """Return the findings of the next frame. The explainer has the ground truth of the evaluation."""
-        result = explainer.traces.result
-        shared = self._frame_attributes(result)
-        findings: list[Finding] = []
-        if self._evaluation is not None and self._evaluation.last is not None:
-            findings += judged_findings(explainer, self._evaluation.last[2], self._evaluation.causes)
-        elif self._evaluation is None:
-            findings += _unjudged(explainer)
-        findings += [
-            {
-                "outcome": "anomaly",
-                "reason": anomaly.kind.replace("_", " "),
-                "text": anomaly.text,
-                "object": f"{anomaly.subject}, {anomaly.since}",  # A lasting anomaly is one object.
-            }
-            for anomaly in result.anomalies
-        ] or [{"outcome": "quiet"}]
-        return [{**shared, **finding} for finding in findings]
+    def of_frame(self, traces: FrameIndex, findings: Sequence[Finding]) -> list[Row]:
+        """Return the rows of the next frame: its findings, and the objects and frames without any."""
+        shared = self._frame_attributes(traces.result)
+        rows = [*_objects(traces, findings), *_others(traces, findings)]
+        if not traces.result.anomalies:
+            rows.append({"outcome": "quiet"})
+        return [{**shared, **row} for row in rows]
 
-    def _frame_attributes(self, result: FrameResult) -> Finding:
+    def _frame_attributes(self, result: FrameResult) -> Row:
         """Return the attributes that all findings of a frame share."""
         frame = result.frame
         self._start = frame.stamp if self._start is None else self._start
@@ -100,78 +80,79 @@ class FindingCollector:
         }
 
 
-def judged_findings(
-    explainer: FrameExplainer, matches: Matches, causes: Mapping[int, Reason]
-) -> Iterator[Finding]:
-    """Yield the found, missed and false objects of a frame with ground truth.
-
-    Args:
-        explainer: of the frame.
-        matches: objects matched with its ground truth.
-        causes: causes of the false objects, by row.
-    """
-    result, truth = explainer.traces.result, explainer.traces.labels_in_evaluate
-    assert truth is not None
-    wanted = np.flatnonzero(truth.must)
-    rows = {
-        int(row): finding for row, finding in zip(wanted, _boxes(result, truth.boxes, wanted), strict=True)
-    }
-    for row, finding in rows.items():
-        finding |= {"outcome": "found", "class": truth.labels[row].lower()}
-        finding["object"] = truth.ids[row] if truth.ids else ""
-        if matches.missed[row]:
-            finding |= {"outcome": "missed", **_explained(explainer.about(Selection(truth=row)))}
-        yield finding
-    objects, false = result.objects, np.flatnonzero(matches.false)
-    if objects is None:
-        return
-    for row, finding in zip(false.tolist(), _boxes(result, objects.boxes, false), strict=True):
-        cause = causes.get(row)
-        name = objects.names[row].lower()
-        finding |= {"outcome": "false", "class": name, "score": float(objects.score[row])}
-        finding["reason"] = "" if cause is None else cause.kind.value
-        finding["text"] = f"false {name} at {objects.boxes.distance[row]:.1f} m"
-        yield finding
+def _objects(traces: FrameIndex, findings: Sequence[Finding]) -> Iterator[Row]:
+    """Yield the findings that have a box, and the found objects: those to be found, or all."""
+    result, truth = traces.result, traces.labels_in_evaluate
+    about = {finding.selection: finding for finding in findings}
+    if truth is not None:
+        lost = truth.must if traces.matches is None else traces.matches.missed
+        # Without a detector no object is a finding, and none is found.
+        must = np.flatnonzero(truth.must).tolist()
+        wanted = [row for row in must if not lost[row] or Selection(truth=row) in about]
+        for row, values in zip(wanted, _boxes(result, truth.boxes, wanted), strict=True):
+            values |= {"class": truth.labels[row].lower(), "object": truth.ids[row] if truth.ids else ""}
+            yield values | _outcome(about.get(Selection(truth=row)))
+    if (objects := result.objects) is not None:
+        rows = [j for j in range(len(objects)) if truth is None or Selection(object=j) in about]
+        for row, values in zip(rows, _boxes(result, objects.boxes, rows), strict=True):
+            values |= {"class": objects.names[row].lower(), "score": float(objects.score[row])}
+            yield values | _outcome(about.get(Selection(object=row)))
+    unnamed = [f.selection.row for f in findings if f.what == "unnamed" and f.selection is not None]
+    if unnamed and result.clusters is not None:
+        boxes = result.clusters.boxes(result.config.clustering)
+        for row, values in zip(unnamed, _boxes(result, boxes, unnamed), strict=True):
+            yield values | _outcome(about[Selection(cluster=row)])
 
 
-def _unjudged(explainer: FrameExplainer) -> Iterator[Finding]:
-    """Yield the objects of a frame, and the kept detections that no object explains."""
-    result = explainer.traces.result
-    objects = result.objects
-    if objects is not None:
-        rows = np.arange(len(objects))
-        for row, finding in zip(rows.tolist(), _boxes(result, objects.boxes, rows), strict=True):
-            finding |= {"outcome": "found", "class": objects.names[row].lower()}
-            yield finding | {"score": float(objects.score[row])}
-    for camera in result.cameras:
-        detections, image = camera.detections, camera.camera.image
-        if detections is None or camera.fusion is None:
-            continue
-        for row in unexplained_detections(camera).tolist():
-            name = camera.camera.name
-            lost: Finding = {"outcome": "unexplained", "class": detections.names[row].lower()}
-            lost |= {"camera": name, "score": float(detections.score[row])}
-            lost |= _explained(explainer.about(Selection(detection=row, camera=name)))
-            if image is not None:
-                x0, y0, x1, y1 = detections.xyxy[row].tolist()
+def _others(traces: FrameIndex, findings: Sequence[Finding]) -> Iterator[Row]:
+    """Yield the findings that are detections, and the anomalies."""
+    for finding in findings:
+        selection = finding.selection
+        if selection is None:
+            yield {**_outcome(finding), "object": finding.number}  # A lasting anomaly is one object.
+        elif selection.detection is not None:
+            camera = traces.camera(selection.camera)
+            assert camera is not None and camera.detections is not None
+            row, x, y = selection.detection, *_in_points_frame(traces.result, finding)
+            values: Row = {
+                "class": finding.name.lower(),
+                "camera": selection.camera,
+                "score": float(camera.detections.score[row]),
+                "points": float(finding.points),
+                "range_m": finding.distance,
+                "bearing_deg": math.degrees(math.atan2(y, x)),
+            }
+            if (image := camera.camera.image) is not None:
+                x0, y0, x1, y1 = camera.detections.xyxy[row].tolist()
                 height, width = image.bgr.shape[:2]
-                lost |= {"u": (x0 + x1) / 2 / width, "v": (y0 + y1) / 2 / height}
-            yield lost
+                values |= {"u": (x0 + x1) / 2 / width, "v": (y0 + y1) / 2 / height}
+            yield values | _outcome(finding)
 
 
-def _explained(answer: Answer) -> Finding:
-    """Return the reason why a subject was lost, in the words of ``why``, without hints."""
-    explained: Finding = {"reason": answer.verdict.kind.value, "text": answer.verdict.text}
-    if answer.subject.kind == "detection":
-        explained |= {"points": float(answer.evidence.raw), "range_m": answer.distance}
-        if answer.center is not None:
-            explained["bearing_deg"] = math.degrees(math.atan2(answer.center[1], answer.center[0]))
-    return explained
+def _in_points_frame(result: FrameResult, finding: Finding) -> tuple[float, float]:
+    """Return x and y of a finding in the frame of the points, NaN if unknown."""
+    if finding.position is None:
+        return math.nan, math.nan
+    position = np.asarray(finding.position, np.float64)[None]
+    x, y = geometry.apply(geometry.inverse(result.frame.pose), position)[0, :2].tolist()
+    return x, y
 
 
-def _boxes(
-    result: FrameResult, boxes: Boxes3D, rows: Sequence[int] | np.ndarray[Any, Any]
-) -> Iterator[Finding]:
+def _outcome(finding: Finding | None) -> Row:
+    """Return outcome and reason of a finding. None: the object is found."""
+    if finding is None:
+        return {"outcome": "found"}
+    outcome = OUTCOMES.get(finding.what, finding.what)
+    return {
+        "outcome": outcome,
+        "kind": finding.what,
+        "reason": finding.reason,
+        "text": finding.text,
+        "severity": finding.severity,
+    }
+
+
+def _boxes(result: FrameResult, boxes: Boxes3D, rows: Sequence[int]) -> Iterator[Row]:
     """Yield place and size of some of the boxes.
 
     Args:
@@ -181,11 +162,11 @@ def _boxes(
     """
     chosen = boxes.chosen(rows)
     hits = [len(inside) for _, inside in inside_each(result.frame.points, chosen)]
-    for count, row in zip(hits, np.asarray(rows).tolist(), strict=True):
+    for count, row in zip(hits, rows, strict=True):
         x, y = boxes.center[row, :2].tolist()
         gaps = np.linalg.norm(boxes.center[:, :2] - boxes.center[row, :2], axis=1)
         gaps[row] = np.inf
-        finding: Finding = {
+        values: Row = {
             "range_m": math.hypot(x, y),
             "bearing_deg": math.degrees(math.atan2(y, x)),
             "length_m": float(boxes.size[row, :2].max()),
@@ -193,10 +174,10 @@ def _boxes(
             "points": float(count),
             "gap_m": float(gaps.min(initial=np.inf)),
         }
-        yield finding | _place_in_image(result, single_box(boxes, row))
+        yield values | _place_in_image(result, single_box(boxes, row))
 
 
-def _place_in_image(result: FrameResult, box: Boxes3D) -> Finding:
+def _place_in_image(result: FrameResult, box: Boxes3D) -> Row:
     """Return the first camera that shows the middle of a box, and the place there from 0 to 1."""
     for camera in (c.camera for c in result.cameras):
         if camera.intrinsics is None or camera.camera_from_points is None:
@@ -236,8 +217,3 @@ def write_findings(folder: Path, frames: Iterator[pa.Table]) -> None:
     with atomic_write(path, FINDINGS) as file, pq.ParquetWriter(file.path, SCHEMA) as writer:
         for table in frames:
             writer.write_table(flatten(table))
-
-
-def judged_names(findings: Sequence[Mapping[str, Any]], evaluation: Evaluation) -> list[Finding]:
-    """Return the findings without false objects whose name no label of the drive accepts."""
-    return [dict(f) for f in findings if f["outcome"] != "false" or evaluation.judges(f["class"])]

@@ -43,7 +43,7 @@ class Job:
     config: Config
     selection: FrameSelection
     blueprint: str
-    truth: str | None = None  # topic of the ground truth; "": the bag's own; None: no evaluation
+    truth: str | None = None  # topic of the ground truth; "": the bag's own; None: the bag's own, if any
 
     @property
     def recording(self) -> Path:

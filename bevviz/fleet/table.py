@@ -14,12 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
-from bevviz.config import Config
+from bevviz.evaluate import position_text
+from bevviz.findings.frame_findings import Finding
 from bevviz.fleet.findings import FINDING, FINDINGS
 from bevviz.model.counts import count_results
 from bevviz.model.frame import Scene
 from bevviz.model.results import Decision, DetectionState, FrameResult
-from bevviz.recording.decisions import decision_log_lines
+from bevviz.recording.decisions import problem_lines
 from bevviz.support.files import file_hash
 
 # Decisions that are possible for a kept detection.
@@ -32,15 +33,7 @@ STAGES = (
 NAME = "summary"  # of the table and the page of all bags
 RESERVED = {NAME, FINDINGS}  # names of tables that are of all bags
 
-FAILURE, PROBLEM, ANOMALY, WRONG = 10.0, 3.0, 0.5, 1.0
-UNMATCHED = {
-    "no_cluster": 2.0,
-    "too_few_points": 1.5,
-    "low_overlap": 1.0,
-    "misfit": 1.0,
-    "taken": 1.0,
-    "too_far": 0.5,
-}
+FAILURE, PROBLEM = 10.0, 3.0  # severities beside those of the findings
 
 _integers = (
     *("points", "invalid_points", "voxels", "ground_points", "obstacle_points", "clusters", "set_aside"),
@@ -62,7 +55,7 @@ SCHEMA = pa.schema(
         ("badness", pa.float64()),
         ("missed", pa.int64()),
         ("false", pa.int64()),
-        ("false_causes", pa.list_(pa.string())),  # of the judged false objects
+        ("false_causes", pa.list_(pa.string())),
         (FINDINGS, pa.list_(FINDING)),
         # JPEGs, only for the worst frames: the first camera with its detections, and the bird's-eye view.
         ("picture", pa.binary()),
@@ -119,12 +112,17 @@ _ABOUT, _CHECKSUM = b"bevviz", b"bevviz_sha256"  # metadata of a table: the RunI
 _UNREADABLE = (OSError, LookupError, ValueError, MemoryError, pa.ArrowException)
 
 
-def row(result: FrameResult, config: Config) -> dict[str, Any]:
+def row(result: FrameResult, findings: Sequence[Finding], *, evaluated: bool) -> dict[str, Any]:
     """Return the row of a frame, without ``bag`` and ``recording``.
 
     ``sync_error_ms`` and ``tf_age_ms`` are those of the worst sensor. None: no sensor has a value.
+
+    Args:
+        result: result of the frame.
+        findings: its findings.
+        evaluated: whether they were found by ground truth.
     """
-    frame = result.frame
+    frame, config = result.frame, result.config
     counts: Counter[str] = Counter(dict.fromkeys(_integers, 0))
     counts.update(count_results(result))
     if result.ground is not None:
@@ -134,8 +132,6 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
     if result.objects is not None:
         counts["objects"] = len(result.objects)
     counts["anomalies"] = len(result.anomalies)
-    unmatched: list[str] = []
-    weights = 0.0
     for camera in result.cameras:
         if camera.detections is None:
             continue
@@ -145,18 +141,13 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
             elif camera.fusion is None:
                 counts["not_compared"] += 1
             else:
-                decision = Decision(int(camera.fusion.detection_decision[d])).name.lower()
-                counts[decision] += 1
-                if decision in UNMATCHED:
-                    unmatched.append(camera.detections.names[d])
-                    weights += UNMATCHED[decision] * float(camera.detections.score[d])
+                counts[Decision(int(camera.fusion.detection_decision[d])).name.lower()] += 1
     sync = _worst([abs(c.camera.sync_error) for c in result.cameras])
     tf_age = _worst([frame.tf_age, *(c.camera.tf_age for c in result.cameras)])
     badness = (
         FAILURE * counts["failures"]
         + PROBLEM * counts["problems"]
-        + ANOMALY * counts["anomalies"]
-        + weights
+        + sum(finding.severity for finding in findings)
         + (sync or 0) / config.sync.tolerance
         + (tf_age or 0) / max(config.sync.tf_tolerance, 0.001)
     )
@@ -167,33 +158,30 @@ def row(result: FrameResult, config: Config) -> dict[str, Any]:
         "sync_error_ms": None if sync is None else 1e3 * sync,
         "tf_age_ms": None if tf_age is None else 1e3 * tf_age,
         **{f"time_ms_{s}": 1e3 * result.timings[s] for s in STAGES if s in result.timings},
-        "unmatched": unmatched,
-        "remarks": [text for _, text in decision_log_lines(result)]
-        + [anomaly.text for anomaly in result.anomalies],
+        "unmatched": [finding.name for finding in findings if finding.what == "unmatched"],
+        "remarks": [*(text for _, text in problem_lines(result)), *_remarks(findings)],
         "badness": round(badness, 6),
+        "missed": sum(finding.what == "missed" for finding in findings) if evaluated else None,
+        "false": sum(finding.what == "false" for finding in findings) if evaluated else None,
+        "false_causes": [f.reason for f in findings if f.what == "false" and f.reason],
     }
 
 
-def add_judgement(
-    row: Mapping[str, Any], missed: Sequence[str], false: Sequence[str], causes: Sequence[str]
-) -> dict[str, Any]:
-    """Add the results of the evaluation to the row of a frame.
+def _remarks(findings: Sequence[Finding]) -> list[str]:
+    """Return one sentence for each finding, the gravest first, and one for all clusters without a name."""
+    gravest = sorted(findings, key=lambda finding: -finding.severity)
+    remarks = [_remark(finding) for finding in gravest if finding.what != "unnamed"]
+    unnamed = len(findings) - len(remarks)
+    return [*remarks, f"{unnamed} near clusters without a name"] if unnamed else remarks
 
-    Args:
-        row: of the frame.
-        missed: missed objects as text.
-        false: false objects as text.
-        causes: causes of the false objects.
-    """
-    wrong = [*(f"missed {text}" for text in missed), *(f"false {text}" for text in false)]
-    return {
-        **row,
-        "missed": len(missed),
-        "false": len(false),
-        "false_causes": list(causes),
-        "remarks": [*wrong, *row["remarks"]],
-        "badness": row["badness"] + WRONG * len(wrong),
-    }
+
+def _remark(finding: Finding) -> str:
+    """Return a finding as text, as ``missed person at 12.3 m, 4° left: ground``."""
+    if finding.what == "anomaly":
+        return finding.text
+    shape, reason = finding.shape, f": {finding.reason}" if finding.reason else ""
+    place = f"at {finding.distance:.1f} m" if shape is None else position_text(shape, 0)
+    return f"{finding.what} {finding.name} {place}{reason}"
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], info: RunInfo) -> None:

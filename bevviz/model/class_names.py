@@ -54,6 +54,10 @@ NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which
 DATA_SETS = (KITTI, NUSCENES, SEMANTIC_KITTI, VIEW_OF_DELFT)
 ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
 
+_STREET = frozenset(
+    {"person", "bicycle", "car", "motorcycle", "bus", "truck"}
+)  # COCO's own classes of a street
+
 _SYNONYMS = {label.lower(): names for label, names in ACCEPTED_NAMES.items()} | {
     "cyclist": ACCEPTED_NAMES["Cyclist"] | {"rider"}
 }
@@ -76,3 +80,20 @@ def accepted_names(label: str, known: Iterable[str]) -> frozenset[str]:
     if any(name == other.lower() for other in known):
         return frozenset({name})
     return frozenset({name, *_SYNONYMS.get(name, ())})
+
+
+def judged_names(labels: Iterable[str]) -> frozenset[str]:
+    """Return the names, in lower case, of which an object without a label of its own is false.
+
+    A label speaks for the names that it accepts, and for those of its data set, which labels such objects in
+    other frames. A frame without labels speaks for the names of all data sets. An object of another name is
+    neither right nor wrong, since nobody labelled such objects.
+
+    Args:
+        labels: labels of a frame.
+    """
+    labels = frozenset(labels)
+    families = [family for family in DATA_SETS if family.keys() & labels] if labels else DATA_SETS
+    shared = _STREET if any(family is not KITTI for family in families) else frozenset[str]()
+    own = (ACCEPTED_NAMES.get(label, frozenset({label.lower()})) for label in labels)
+    return shared.union(*own, *(names for family in families for names in family.values()))

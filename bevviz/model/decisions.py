@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bevviz.config import Config
+from bevviz.model import geometry
+from bevviz.model.frame import I64
 from bevviz.model.reasons import Reason, ReasonKind, kind_of, limit, limit_of, make_reason, owner_of, scored
 from bevviz.model.results import (
     CameraResult,
@@ -25,7 +27,27 @@ from bevviz.model.results import (
     Splits,
 )
 
+SAME_BOX = 0.5  # IoU from which a detection is the double of another
 MIN_NOISE_SHARE = 0.1  # Least share of noise in the points of a detection that an explanation mentions.
+
+
+def unmatched_detections(result: CameraResult, *, doubles: bool = False) -> I64:
+    """Return the rows of kept detections without an object, except doubles of a detection that has one.
+
+    Of unmatched detections that are doubles of one another, only the best is returned without ``doubles``.
+    """
+    detections, fusion = result.detections, result.fusion
+    if detections is None or fusion is None:
+        return np.zeros(0, np.int64)
+    matched = fusion.detection_decision == Decision.MATCHED
+    rows: I64 = np.flatnonzero(detections.kept & ~matched)
+    if len(rows) and matched.any():
+        rows = rows[geometry.iou(detections.xyxy[rows], detections.xyxy[matched]).max(axis=1) < SAME_BOX]
+    if doubles:
+        return rows
+    overlaps = np.triu(geometry.iou(detections.xyxy[rows], detections.xyxy[rows]) >= SAME_BOX, k=1)
+    singles: I64 = rows[~overlaps.any(axis=0)]  # the best of doubles comes first
+    return singles
 
 
 def explain(

@@ -41,12 +41,18 @@ def decision_page(result: FrameResult) -> str:
     return "\n".join(_lines(result))
 
 
-def decision_log_lines(result: FrameResult) -> list[tuple[str, str]]:
-    """Return log lines (level and text) for failures, problems, unmatched detections and doubtful objects."""
+def problem_lines(result: FrameResult) -> list[tuple[str, str]]:
+    """Return log lines (level and text) for failures of stages and problems of inputs."""
     lines = [("ERROR", f"{failure.stage}: {failure.reason}") for failure in result.failures]
     lines += [("WARN", problem) for problem in result.frame.problems]
     for camera in result.cameras:
         lines += [("WARN", f"{camera.camera.name}: {problem}") for problem in camera.camera.problems]
+    return lines
+
+
+def decision_log_lines(result: FrameResult) -> list[tuple[str, str]]:
+    """Return log lines (level and text) for failures, problems, unmatched detections and doubtful objects."""
+    lines = problem_lines(result)
     lines += [
         ("INFO", f"{explanation.camera}: {explanation.text}")
         for explanation in explanations_of(result.explanations, "detection")

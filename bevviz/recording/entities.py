@@ -126,13 +126,13 @@ PROJECTED = Entity(
 )
 MARKED = Entity(
     "/world/{mark}",
-    "LineStrips3D, AnyValues; Boxes3D in `bevviz open`",
-    "`missed`: dashed red; `false`: crossed out yellow; without ground truth `unexplained`: unmatched "
-    "detections and clusters of a person's size, dotted; `unnamed`: in `bevviz open`",
+    "LineStrips3D, AnyValues",
+    "the [findings](workbench.md#worth-a-look): `missed`: red; `false`: false and doubtful objects, crossed "
+    "out yellow; `unexplained`: detections without one, dotted yellow; `unnamed`: clusters, dotted grey",
 )
 IMAGE_MARK = Entity(
     "/world/{camera}/image/{mark}",
-    "LineStrips2D, AnyValues; Boxes2D in `bevviz open`",
+    "LineStrips2D, AnyValues",
     "the same in an image",
 )
 IMAGE_OPINION = Entity(

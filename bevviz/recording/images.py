@@ -12,6 +12,7 @@ import rerun as rr
 
 from bevviz.config import Config
 from bevviz.model import geometry
+from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, F64, I64, Camera, Frame, Image, Intrinsics
 from bevviz.model.results import (
     Bev,
@@ -44,9 +45,6 @@ from bevviz.support.colors import FAINT, UNNAMED, Color, StateColor, class_color
 
 if TYPE_CHECKING:
     from bevviz.recording.video import VideoEncoder
-
-
-_SAME_BOX = 0.5  # IoU from which a detection is the double of another
 
 
 def camera_pose(frame: Frame, result: CameraResult) -> F64 | None:
@@ -137,32 +135,13 @@ class VideoEncoders:
             to.put(path, rr.VideoStream.from_fields(sample=sample.data))
 
 
-def unexplained_detections(result: CameraResult, *, doubles: bool = False) -> I64:
-    """Return the rows of kept detections without an object, except doubles of a detection that has one.
-
-    Of unexplained detections that are doubles of one another, only the best is returned without ``doubles``.
-    """
-    detections, fusion = result.detections, result.fusion
-    if detections is None or fusion is None:
-        return np.zeros(0, np.int64)
-    matched = fusion.detection_decision == Decision.MATCHED
-    rows: I64 = np.flatnonzero(detections.kept & ~matched)
-    if len(rows) and matched.any():
-        rows = rows[geometry.iou(detections.xyxy[rows], detections.xyxy[matched]).max(axis=1) < _SAME_BOX]
-    if doubles:
-        return rows
-    overlaps = np.triu(geometry.iou(detections.xyxy[rows], detections.xyxy[rows]) >= _SAME_BOX, k=1)
-    singles: I64 = rows[~overlaps.any(axis=0)]  # the best of doubles comes first
-    return singles
-
-
 def log_detections(
     to: Writer, result: CameraResult, explanations: Iterable[Explanation], *, has_truth: bool = False
 ) -> None:
     """Log kept detections in the colour of their class, and the other detections faint.
 
-    Without ground truth, unexplained detections are outlined as doubtful and have names, as long as these do
-    not overlap. The tooltip of each outline explains the decision, see ``bevviz.recording.labels``.
+    Without ground truth, detections without an object are outlined as doubtful. They have names, as long as
+    these do not overlap. The tooltip of each outline explains the decision, see ``bevviz.recording.labels``.
     """
     name, detections = result.camera.name, result.detections
     if detections is None:
@@ -176,9 +155,9 @@ def log_detections(
     boxes = _detection_layer(path, name, detections, kept, Style(labels=False, order=30.0), colors)
     texts = texts_by_row(explanations, "detection", name)
     labels = scored((detections.names[row] for row in kept), detections.score[kept])
-    doubtful = np.isin(kept, unexplained_detections(result)) & (not has_truth)
+    doubtful = np.isin(kept, unmatched_detections(result)) & (not has_truth)
     # The box of a double lies over that of the best, so both have one colour.
-    doubtful_outlines = np.isin(kept, unexplained_detections(result, doubles=True)) & (not has_truth)
+    doubtful_outlines = np.isin(kept, unmatched_detections(result, doubles=True)) & (not has_truth)
     outline_colors = [
         StateColor.DOUBTFUL.value if is_doubtful else color
         for is_doubtful, color in zip(doubtful_outlines, colors, strict=True)

@@ -1,7 +1,7 @@
-"""Mark objects in every view: missed, false, and unexplained where there is no ground truth.
+"""Mark objects in every view: missed, false, and unexplained or unnamed where there is no ground truth.
 
 Each state has a line style besides its colour: missed objects are dashed, false ones are crossed out, and
-unexplained ones are dotted.
+unexplained and unnamed ones are dotted.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 import rerun as rr
 
-from bevviz.model import geometry
 from bevviz.model.frame import F32, Boxes3D, Camera
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
+from bevviz.recording.addresses import Address, Rows
 from bevviz.recording.labels import NameRoom, choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, draw, name_layers, rectangles
 from bevviz.recording.primitives import CORNER, transform
@@ -25,14 +25,20 @@ from bevviz.recording.writer import Writer
 from bevviz.support.colors import Color, StateColor
 
 Lines: TypeAlias = tuple[tuple[int, int], ...]  # pairs of corners
-MarkState: TypeAlias = Literal["missed", "false", "unexplained"]
+MarkState: TypeAlias = Literal["missed", "false", "unexplained", "unnamed"]
 
 MARK_COLORS: Mapping[MarkState, Color] = {
     "missed": StateColor.BAD.value,
     "false": StateColor.DOUBTFUL.value,
     "unexplained": StateColor.DOUBTFUL.value,
+    "unnamed": StateColor.UNKNOWN.value,
 }
-_DASHES: Mapping[MarkState, int] = {"missed": 4, "false": 1, "unexplained": 8}  # dashes of each line
+_DASHES: Mapping[MarkState, int] = {
+    "missed": 4,
+    "false": 1,
+    "unexplained": 8,
+    "unnamed": 8,
+}  # dashes of each line
 _FLAT = Style(width=1.75, order=36.0)  # look over an image and the bird's-eye image
 _GAP = 0.45  # share of a dash that is its gap
 # Lines between the corners of a box: all edges, the cross on its top, the rim seen from above.
@@ -44,6 +50,7 @@ _RIMS: Mapping[MarkState, Lines] = {
     "missed": _SIDES,
     "false": (*_SIDES, *_FLAT_CROSS),
     "unexplained": _SIDES,
+    "unnamed": _SIDES,
 }
 _WEDGE: Lines = ((0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 6), (6, 7), (7, 4))  # of a frustum
 
@@ -53,10 +60,11 @@ class Mark:
     """Marked object.
 
     Attributes:
-        state: missed, false or unexplained.
+        state: missed, false, unexplained or unnamed.
         name: text beside it; empty: no text.
         sentence: text of the tooltip.
         corners: (8, 3) corners of its box or of its frustum, around the robot.
+        address: row of the frame's tables that it marks.
         box: its box, as one row; None: a detection without a position, marked by its frustum.
     """
 
@@ -64,6 +72,7 @@ class Mark:
     name: str
     sentence: str
     corners: F32
+    address: Address
     box: Boxes3D | None = None
 
     @property
@@ -73,84 +82,120 @@ class Mark:
         return np.asarray(points.mean(axis=0), np.float32)
 
 
-def box_mark(state: MarkState, boxes: Boxes3D, row: int, name: str, sentence: str) -> Mark:
-    """Return the mark of one of the boxes around the robot."""
-    box = boxes.chosen([row])
-    return Mark(state, name, sentence, geometry.corners(box)[0], box)
+def log_marks(to: Writer, result: FrameResult, marks: Sequence[Mark], *, dashed: bool = True) -> None:
+    """Log the marks of a frame in space, in the images and over the bird's-eye image.
 
-
-def log_marks(to: Writer, result: FrameResult, marks: Sequence[Mark]) -> None:
-    """Log the marks of a frame in space, in the images and over the bird's-eye image."""
+    Args:
+        to: writer of the recording.
+        result: result of the frame.
+        marks: marks to log.
+        dashed: draw the dashes of each state. Without them a line can be clicked everywhere.
+    """
     if not marks:
         return
     config, pose = result.config.bev, transform(result.frame.pose)
+    drawn = _MarkDrawer(to, marks, dashed)
     centers = np.stack([mark.center for mark in marks])
     has_name = choose_named_in_3d(centers, np.array([bool(mark.name) for mark in marks]))
+    names = shown([mark.name for mark in marks], has_name)
+    places = centers + np.array([0, 0, 0.3], np.float32)
     reach = np.array([config.range_x, config.range_y], np.float32)
     above = np.asarray((np.abs(centers[:, :2]) < reach).all(axis=1), np.bool_)
     pixels = bev_pixels(config, np.eye(4), np.stack([mark.corners for mark in marks]))
     for state in MARK_COLORS:
         rows = [row for row, mark in enumerate(marks) if mark.state == state]
-        chosen = [marks[row] for row in rows]
-        lines = [mark.corners[np.array(_edges(mark))] for mark in chosen]
-        names = shown([mark.name for mark in chosen], has_name[rows])
-        places = centers[rows] + np.array([0, 0, 0.3], np.float32)
-        _draw(to, entities.MARKED.path(state), state, chosen, lines, names, places, Style(width=2.0), pose)
+        lines = [marks[row].corners[np.array(_edges(marks[row]))] for row in rows]
+        style = Style(width=2.0)
+        drawn.draw(entities.MARKED.path(state), state, rows, lines, names, places, style, pose)
         rows = [row for row in rows if above[row]]
-        chosen = [marks[row] for row in rows]
-        lines = [
-            pixels[row][np.array(_WEDGE if mark.box is None else _RIMS[state])]
-            for row, mark in zip(rows, chosen, strict=True)
-        ]
-        _draw(to, entities.OVERLAY.path(state), state, chosen, lines)
+        rims = [_WEDGE if marks[row].box is None else _RIMS[state] for row in rows]
+        lines = [pixels[row][np.array(rim)] for row, rim in zip(rows, rims, strict=True)]
+        drawn.draw(entities.OVERLAY.path(state), state, rows, lines)
     for camera in result.cameras:
-        _log_in_image(to, camera.camera, [mark for mark in marks if mark.box is not None])
+        _log_in_image(drawn, camera.camera, marks)
 
 
-def _log_in_image(to: Writer, camera: Camera, marks: Sequence[Mark]) -> None:
-    """Log the marks over an image, the first with names that do not overlap."""
-    if camera.intrinsics is None or not marks:
+def _log_in_image(drawn: _MarkDrawer, camera: Camera, marks: Sequence[Mark]) -> None:
+    """Log the marks with a box over an image, the first with names that do not overlap."""
+    boxed = [(row, mark.box) for row, mark in enumerate(marks) if mark.box is not None]
+    if camera.intrinsics is None or not boxed:
         return
-    boxes = Boxes3D.joined([mark.box for mark in marks if mark.box is not None])
+    boxes = Boxes3D.joined([box for _, box in boxed])
     strokes = image_outlines(boxes, camera)
-    visible = [row for row, stroke in enumerate(strokes) if len(stroke)]
-    marks, bounds = [marks[row] for row in visible], bounds_of([strokes[row] for row in visible])
+    visible = [i for i, stroke in enumerate(strokes) if len(stroke)]
+    bounds = bounds_of([strokes[i] for i in visible])
     room = NameRoom.in_image(camera.intrinsics.width)
     # Names stand above the objects, because detections have theirs below.
-    names, places = [mark.name for mark in marks], room.over(bounds)
-    is_named = np.array([bool(name) for name in names], np.bool_)
-    names = shown(names, room.choose(places, names, boxes.distance[visible], is_named))
+    rows, places = [boxed[i][0] for i in visible], room.over(bounds)
+    texts = [marks[row].name for row in rows]
+    has_text = np.array([bool(text) for text in texts], np.bool_)
+    texts = shown(texts, room.choose(places, texts, boxes.distance[visible], has_text))
     # All edges of a box would be one blot where the object is small.
-    corners = rectangles(bounds + CORNER)
+    corners = dict(zip(rows, rectangles(bounds + CORNER), strict=True))
+    names, positions = [""] * len(marks), np.zeros((len(marks), 2), np.float32)
+    for row, text, place in zip(rows, texts, places, strict=True):
+        names[row], positions[row] = text, place
     for state in MARK_COLORS:
-        rows = [row for row, mark in enumerate(marks) if mark.state == state]
-        lines = [corners[row][np.array(_RIMS[state])] for row in rows]
-        path, chosen = entities.IMAGE_MARK.path(camera.name, state), [marks[row] for row in rows]
-        _draw(to, path, state, chosen, lines, [names[row] for row in rows], places[rows])
+        chosen = [row for row in rows if marks[row].state == state]
+        lines = [corners[row][np.array(_RIMS[state])] for row in chosen]
+        drawn.draw(entities.IMAGE_MARK.path(camera.name, state), state, chosen, lines, names, positions)
 
 
-def _draw(
-    to: Writer,
-    path: str,
-    state: MarkState,
-    marks: Sequence[Mark],
-    lines: Sequence[F32],
-    names: Sequence[str] = (),
-    places: F32 | None = None,
-    style: Style = _FLAT,
-    frame: rr.AsComponents | None = None,
-) -> None:
-    """Draw marks with the dashes of their state, and the names that are not empty."""
-    if not marks:
-        return
-    dashes = [_styled(state, mark_lines) for mark_lines in lines]
-    says = [mark.sentence for mark, strokes in zip(marks, dashes, strict=True) for _ in strokes]
-    style = replace(style, color=MARK_COLORS[state])
-    draw(to, Layer(path, np.concatenate(dashes), style, says=says, frame=frame))
-    named = [row for row, name in enumerate(names) if name]
-    if places is not None and named:
-        texts, sentences = [names[row] for row in named], [marks[row].sentence for row in named]
-        draw(to, *name_layers(path, places[named], texts, sentences, style.order, frame=frame))
+class _MarkDrawer:
+    """Drawer of the marks of a frame.
+
+    Args:
+        to: writer of the recording.
+        marks: marks of the frame.
+        dashed: whether to draw dashes.
+    """
+
+    def __init__(self, to: Writer, marks: Sequence[Mark], dashed: bool) -> None:
+        self._to, self._marks, self._dashed = to, marks, dashed
+
+    def draw(
+        self,
+        path: str,
+        state: MarkState,
+        rows: Sequence[int],
+        lines: Sequence[F32],
+        names: Sequence[str] = (),
+        places: F32 | None = None,
+        style: Style = _FLAT,
+        frame: rr.AsComponents | None = None,
+    ) -> None:
+        """Draw marks with the dashes of their state, and the names that are not empty.
+
+        Args:
+            path: entity.
+            state: state of these marks.
+            rows: rows of these marks.
+            lines: lines of each of them.
+            names: names of all marks.
+            places: positions of all names.
+            style: look of the lines.
+            frame: pose of the marks.
+        """
+        if not rows:
+            return
+        count = _DASHES[state] if self._dashed else 1
+        dashes = [_dashed(mark_lines, count) for mark_lines in lines]
+        instances = [row for row, strokes in zip(rows, dashes, strict=True) for _ in strokes]
+        says = [self._marks[row].sentence for row in instances]
+        style = replace(style, color=MARK_COLORS[state])
+        addresses = self._addresses(instances)
+        draw(self._to, Layer(path, np.concatenate(dashes), style, says=says, frame=frame, rows=addresses))
+        named = [row for row in rows if names and names[row]]
+        if places is not None and named:
+            texts, sentences = [names[row] for row in named], [self._marks[row].sentence for row in named]
+            addresses, order = self._addresses(named), style.order
+            layers = name_layers(path, places[named], texts, sentences, order, frame=frame, rows=addresses)
+            draw(self._to, *layers)
+
+    def _addresses(self, rows: Sequence[int]) -> Rows:
+        """Return the rows of the frame's tables that marks are of."""
+        tables, table_rows, cameras = zip(*(self._marks[row].address for row in rows), strict=True)
+        return Rows(tables, table_rows, cameras)
 
 
 def _edges(mark: Mark) -> Lines:
@@ -160,9 +205,8 @@ def _edges(mark: Mark) -> Lines:
     return (*_BOX, *_CROSS) if mark.state == "false" else _BOX
 
 
-def _styled(state: MarkState, lines: F32) -> F32:
-    """Cut (L, 2, D) lines into the dashes of a state: (L * dashes, 2, D)."""
-    count = _DASHES[state]
+def _dashed(lines: F32, count: int) -> F32:
+    """Cut (L, 2, D) lines into dashes: (L * count, 2, D)."""
     starts = np.arange(count, dtype=np.float32) / count
     ends = starts + np.float32((1 - _GAP if count > 1 else 1) / count)
     shares = np.stack([starts, ends], axis=1)[None, :, :, None]  # (1, dashes, 2, 1)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bevviz.bags.source import SECOND
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model.results import Explanation, FrameResult
 from bevviz.recording import entities
 from bevviz.report.facts import Facts
@@ -138,11 +139,6 @@ def _verdict(result: FrameResult) -> Iterator[str]:
         counts = Counter(explanation.state.replace("_", " ") for explanation in decisions)
         states = ", ".join(f"{n} {state}" for state, n in counts.most_common())
         yield f"{len(decisions)} detection{'s' * (len(decisions) > 1)}: {states}"
-        yield from (
-            f"{explanation.camera}: {explanation.text}"
-            for explanation in decisions
-            if explanation.state != "matched"
-        )
     elif any(camera.detections is not None for camera in result.cameras):
         yield "nothing was detected"
     yield from (f"{failure.stage} failed: {failure.reason}" for failure in result.failures)
@@ -151,7 +147,8 @@ def _verdict(result: FrameResult) -> Iterator[str]:
     if result.objects is not None:
         names = Counter(result.objects.names)
         yield "objects: " + (", ".join(f"{n} {name}" for name, n in names.items()) or "none")
-        yield from (answer.verdict.text for answer in FrameExplainer(result).false_objects())
+    findings = find_findings(FrameExplainer(result))
+    yield from (f"{finding.what}: {finding.text}" for finding in findings if finding.what != "unnamed")
 
 
 def _pictures(result: FrameResult) -> Iterator[Picture]:

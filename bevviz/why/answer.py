@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bevviz.evaluate import MIN_HITS, RANGE, Truth
+from bevviz.evaluate import Truth
 from bevviz.model.frame import U8
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
@@ -46,6 +46,7 @@ class Answer:
         remark: one sentence about the search for hints: the best one, or what was tried, or why nothing could
             be. Empty: none was searched, or there is nothing to mend.
         outcomes: possible outcomes, the most probable first. Empty: ground truth tells, or they are unknown.
+        near: whether the pipeline had to report it, see ``FrameIndex.must``.
     """
 
     subject: Subject
@@ -59,6 +60,7 @@ class Answer:
     tried: tuple[TriedChange, ...] = ()
     remark: str = ""
     outcomes: tuple[Outcome, ...] = ()
+    near: bool = False
 
     @property
     def confidence(self) -> float | None:
@@ -86,11 +88,6 @@ class Answer:
         return f"{self.verdict.text} ({self.confidence:.0%} sure)"
 
     @property
-    def near(self) -> bool:
-        """Whether the pipeline should report it: it is within 40 m and has 10 points or more."""
-        return self.distance <= RANGE and self.points >= MIN_HITS
-
-    @property
     def center(self) -> tuple[float, float, float] | None:
         """Centre of its 3D box, or of the box of its cluster, in Frame.points_frame. None: it has neither."""
         return self.evidence.center
@@ -116,7 +113,7 @@ class Answer:
     @property
     def folded(self) -> bool:
         """Whether no setting could help: it is hidden, out of view, without points, or a weak detection."""
-        return self.verdict.kind in HOPELESS or self.weak
+        return (self.verdict.kind in HOPELESS and not self.near) or self.weak
 
     def tried_text(self, named: int = NAMED) -> str:
         """Return a clause with the results of the tried changes; empty: one helps, or none was tried.
@@ -239,11 +236,7 @@ class FrameExplainer:
 
     def missed(self) -> list[Answer]:
         """Explain the objects that should have been reported and were not, the nearest first."""
-        answers = [
-            answer
-            for answer in self.ask(Selection())
-            if answer.near and not answer.verdict.reported and not answer.folded
-        ]
+        answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported]
         return sorted(answers, key=_sort_distance)
 
     def false_objects(self) -> list[Answer]:
@@ -283,7 +276,7 @@ class FrameExplainer:
         verdict = make_verdict(subject, reason, reported)
         steps = tuple(steps_of(subject, evidence, self.traces))
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
-        answer = replace(answer, outcomes=outcomes)
+        answer = replace(answer, outcomes=outcomes, near=self.traces.must(subject))
         if subject.asked is None and not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer

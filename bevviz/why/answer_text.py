@@ -10,7 +10,6 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.support.text import markdown
 from bevviz.why.answer import Answer
 from bevviz.why.subject import count
-from bevviz.why.verdict import HOPELESS
 
 LISTED = 5  # other subjects at the place, at most
 
@@ -59,10 +58,8 @@ def summary_line(answers: Sequence[Answer]) -> str:
     things = [answer for answer in answers if not answer.weak and not answer.false]
     reported = [answer for answer in things if answer.verdict.reported]
     flawed = [answer for answer in reported if answer.verdict.kind is not ReasonKind.REPORTED]
-    hopeless = [answer for answer in things if answer.verdict.kind in HOPELESS]
-    missed = [
-        answer for answer in things if not answer.verdict.reported and answer.verdict.kind not in HOPELESS
-    ]
+    hopeless = [answer for answer in things if answer.folded]
+    missed = [answer for answer in things if not answer.verdict.reported and not answer.folded]
     near = [answer for answer in missed if answer.near]
     known = any(answer.subject.kind == "truth" for answer in answers)
     parts = [f"{len(reported)} reported" + (f" ({len(flawed)} with a flaw)" if flawed else "")]

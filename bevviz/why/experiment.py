@@ -114,8 +114,7 @@ class Outcome:
             yield self._row(Selection(truth=row), label, state, boxes, row, reason)
         causes = false_reasons(self.traces) if reasons else {}
         for row in np.flatnonzero(self.matches.false).tolist():
-            if self.objects.names[row].lower() in self.truth.judged_names:
-                yield self._object_row(row, "false", causes)
+            yield self._object_row(row, "false", causes)
 
     def _object_row(self, row: int, state: State, reasons: Mapping[int, Reason]) -> ObjectRow:
         objects = self.objects

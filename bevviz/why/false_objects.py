@@ -52,10 +52,8 @@ def _false_reasons(traces: FrameIndex) -> Iterator[tuple[int, Reason]]:
             if (doubt := _doubt(traces, objects, row)) is not None:
                 yield row, doubt
         return
-    judged = truth.judged_names
     for row in np.flatnonzero(matches.false).tolist():
-        if objects.names[row].lower() in judged:
-            yield row, _cause(traces, objects, row)
+        yield row, _cause(traces, objects, row)
 
 
 def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 
-from bevviz.evaluate import Matches, Truth, judge, truth_of
+from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.class_names import accepted_names
+from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
@@ -273,6 +274,31 @@ class FrameIndex:
         """The judgement of ``evaluate`` about the objects of the frame."""
         objects, truth = self.result.objects, self.labels_in_evaluate
         return None if objects is None or truth is None else judge(objects, truth)
+
+    def must(self, subject: Subject) -> bool:
+        """Return whether a subject had to be reported.
+
+        Ground truth tells. Without it, these are the subjects with 10 points or more whose median is within
+        40 m. Of detections these are the kept ones, without doubles.
+        """
+        truth = self.labels_in_evaluate
+        if truth is not None and not subject.is_place:
+            return subject.kind == "truth" and bool(truth.must[subject.row])
+        if subject.kind == "detection" and subject.row not in self._detections_to_match(subject.camera):
+            return False
+        points = self.result.frame.points[self.place(subject)]
+        return len(points) >= MIN_HITS and bool(np.median(np.hypot(*points[:, :2].T)) <= RANGE)
+
+    def _detections_to_match(self, name: str) -> Collection[int]:
+        """Return the kept detections of a camera, without doubles."""
+        camera = self.camera(name)
+        if camera is None or camera.detections is None:
+            return ()
+        rows, fusion = np.flatnonzero(camera.detections.kept), camera.fusion
+        if fusion is not None:
+            is_matched = fusion.detection_decision[rows] == Decision.MATCHED
+            rows = rows[is_matched | np.isin(rows, unmatched_detections(camera))]
+        return rows.tolist()
 
     @cached_property
     def of_truth(self) -> Bool:

@@ -12,6 +12,7 @@ import rerun_bindings
 
 from bevviz.config import Config
 from bevviz.findings.frame_findings import Finding, find_findings
+from bevviz.findings.marks import log_findings
 from bevviz.model.frame import Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints, entities
@@ -21,7 +22,6 @@ from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import FrameCache, RecordingBuffer
-from bevviz.workbench.findings_layer import log_layer
 from bevviz.workbench.growing_drive import Settings
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
@@ -211,7 +211,7 @@ class DriveRecording(Closable):
         cloud: bool = False,
     ) -> None:
         def log_more() -> None:
-            log_layer(logger, result, findings)
+            log_findings(logger, result, findings, dashed=False)
 
         if self.on_demand and not settings:
             logger.log_frame(result, log_more)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.anomalies import Onsets
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.ground_truth import TruthLookup
-from bevviz.findings.frame_findings import Finding, find_findings
+from bevviz.findings.frame_findings import Finding, find_findings, findings_of
+from bevviz.findings.marks import log_findings
 from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
@@ -30,7 +30,6 @@ from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
-from bevviz.workbench.findings_layer import log_layer
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
@@ -81,7 +80,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self._overview: OverviewFrames | None = None  # while it is made
         self._done, self._error = 0, ""
         self._reached = 0  # newest stamp that the run has reached
-        self._onsets = Onsets()
         self.robot_bag: BagSource | None = None
         self._robot: RobotQuestions | None = None
         self._asking, self._counting = 0, threading.Lock()  # number of questions that are being answered
@@ -182,7 +180,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """List the findings of a frame of the overview. Then wait while a question is being answered."""
         frame = result.frame
         self.findings.add_overview(frame.index, find_findings(self.explainer(result)))
-        self.findings.add_overview_anomalies(frame.index, frame.stamp, result.anomalies)
         self._picture(frame)
         self._done += 1
         self.news.tell()
@@ -206,7 +203,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         if not self._is_listed:
             self.findings.end_overview(frame.index)
             self.findings.add(findings)
-            self.findings.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self._done += 1
         self.news.tell()
         self.wait_for_quiet()
@@ -404,9 +400,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         rows = self.recording.entity_rows(number, settings)
         if rows is None:
             result = self.look(number, settings)
-            findings = find_findings(self.explainer(result))
+            findings = findings_of(self.explainer(result).traces)
             drawn = result if settings else self._with_tracks(result)
-            rows = logged_rows(drawn, lambda writer: log_layer(writer, result, findings))
+            rows = logged_rows(drawn, lambda writer: log_findings(writer, result, findings, dashed=False))
         return rows
 
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:

@@ -20,7 +20,7 @@ import rerun as rr
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth, truth_of
-from bevviz.findings.frame_findings import find_findings
+from bevviz.findings.frame_findings import KINDS, find_findings
 from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live, ObservingSession
 from bevviz.live.status import give_way
@@ -45,7 +45,7 @@ BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame nee
 AFTER = 1_000_000_000  # nanoseconds after a scan in which the robot's last node has made something of it
 BAGS = 2  # bags of held seconds that are kept: a report may be cut from the one before the newest
 LISTED_FRAMES = 64  # frames of the held seconds that are listed
-LISTED = ("missed", "false", "doubtful", "contradicted", "lost", "unmatched", "unnamed")
+LISTED = tuple(KINDS)
 
 
 def robot_session(live: Live) -> WorkbenchSession:

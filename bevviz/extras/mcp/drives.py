@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from bevviz.anomalies import FailureSummary, Onsets
+from bevviz.anomalies import FailureSummary
 from bevviz.config import (
     TUTORIAL_NAMES,
     Config,
@@ -93,14 +93,12 @@ class RunFindings(Observer[FrameResult]):
     """Findings, anomalies and failures of a run."""
 
     def __init__(self, asked: AskedDrive) -> None:
-        self._asked, self._onsets = asked, Onsets()
+        self._asked = asked
         self.list, self.failures, self.frames = FindingList(), FailureSummary(), 0
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
-        frame = result.frame
         self.list.add(find_findings(self._asked.session.source.explainer(result)))
-        self.list.add_anomalies(frame.index, frame.stamp, self._onsets.of(result.anomalies))
         self.failures.observe(result)
         self.frames += 1
 

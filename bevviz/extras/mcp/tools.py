@@ -18,6 +18,7 @@ from bevviz.config.descriptions import describe_parameters
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
 from bevviz.extras.mcp.drives import AskedDrive, agent_config
+from bevviz.findings.frame_findings import KINDS
 from bevviz.fleet.summary import collect
 from bevviz.fleet.table import RunInfo
 from bevviz.pipeline.run import run
@@ -94,8 +95,9 @@ class AgentTools:
     def findings(self, drive: str = "", kind: str = "", limit: int = 25) -> str:
         """Run a drive and list what went wrong, each thing once for all its frames, and the counts by cause.
 
-        Kinds are missed and false (with ground truth), doubtful, unmatched, unnamed (without), and anomaly
-        (sensors, clocks, transforms, tracks). `frame` is the nearest one. Give `about` to `why`.
+        Kinds are missed and false (with ground truth), contradicted, lost, unmatched, doubtful, unnamed
+        (without), and anomaly (sensors, clocks, transforms, tracks). `frame` is the nearest one. Give `about`
+        to `why`.
         """
         asked = self._drive(drive)
         found = asked.findings
@@ -115,8 +117,7 @@ class AgentTools:
                     "command": asked.command("why", *_where(nearest.frame, nearest.pick)),
                 }
             )
-        order = ("anomaly", "missed", "false", "doubtful")
-        rows.sort(key=lambda row: (order.index(row["kind"]) if row["kind"] in order else 9, -row["frames"]))
+        rows.sort(key=lambda row: (-KINDS[row["kind"]], -row["frames"]))
         causes: Counter[str] = Counter()
         for row in rows:
             causes[f"{row['kind']}: {row['name' if row['kind'] == 'anomaly' else 'cause']}"] += row["frames"]
