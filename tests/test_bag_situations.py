@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
-from tests.support import bags
+from tests.support import bags, foxglove_bags, kept_drives
+from tests.support.single_frames import assert_as_in_the_run
 
 
 @pytest.mark.parametrize("row_step", [16 * 200, 16 * 53, 0])
@@ -32,3 +34,101 @@ def test_points_that_the_data_lack_are_said(tmp_path: Path) -> None:
         (said,) = source.doubts
     assert said.startswith(f"{bags.CLOUD}: a cloud states 60 x 4 points of 16 bytes and a row_step of 960")
     assert said.endswith("40 of 240 points are missing")
+
+
+# --- time --------------------------------------------------------------------------------------
+
+SECOND = 1_000_000_000
+PIXELS = f"source.camera_topics=[{bags.IMAGE}]"
+
+
+def late(items: list[bags.Item], seconds: float, *topics: str) -> list[bags.Item]:
+    """Return the messages with some topics received later."""
+    return [
+        item._replace(received=item.received + round(seconds * SECOND)) if item.topic in topics else item
+        for item in items
+    ]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.45, 0.55, 0.65, 1.5, 2.4])
+def test_a_late_lidar_has_its_images_in_a_run_and_alone(tmp_path: Path, seconds: float) -> None:
+    bag = bags.write(tmp_path / "drive", late(bags.small_items(scans=40), seconds, bags.CLOUD))
+    run = assert_as_in_the_run([bag])
+    assert [f.cameras[0].image and f.cameras[0].image.stamp for f in run] == [f.stamp for f in run]
+    with BagSource([bag], load()) as source:
+        list(source)
+        assert not source.doubts
+
+
+LATE = [(bags.IMAGE, 0.3), (bags.IMAGE, 1.2), ("/tf", 0.4), ("/tf", 1.0), (bags.CLOUD, 0.6), (bags.CLOUD, 3)]
+
+
+@pytest.mark.parametrize("settings", [[], ["sync.max_wait=0.1"], ["sync.queue=2"], ["sync.tolerance=0.04"]])
+@pytest.mark.parametrize(("topic", "seconds"), LATE)
+def test_single_frames_pair_as_the_run_does(
+    tmp_path: Path, topic: str, seconds: float, settings: list[str]
+) -> None:
+    bag = bags.write(tmp_path / "drive", late(bags.small_items(scans=30, points=20), seconds, topic))
+    assert_as_in_the_run([bag], *settings)
+
+
+@pytest.mark.parametrize("seconds", [0.7, 2.5, 5.0])
+def test_the_remedy_for_late_images_is_tried_and_pairs_all(tmp_path: Path, seconds: float) -> None:
+    items = late(bags.small_items(scans=80, points=20), seconds, bags.IMAGE)
+    bag = bags.write(tmp_path / "drive", items)
+    with BagSource([bag], load()) as source:
+        list(source)
+        (doubt,) = source.doubts
+        source.frame(20)
+        assert seconds > 2 or source.doubts
+    assert f"{bags.IMAGE}: its messages come {seconds:.2f} s later than those of /tf, at the same" in doubt
+    assert "sync.offsets" not in doubt and "sync.by" not in doubt
+    settings = re.findall(r"--set (\S+)", doubt)
+    assert [setting.partition("=")[0] for setting in settings] == ["sync.max_wait", "sync.queue"]
+    run = assert_as_in_the_run([bag], *settings)
+    assert [f.cameras[0].image and f.cameras[0].image.stamp for f in run] == [f.stamp for f in run]
+    assert not [problem for frame in run for problem in frame.cameras[0].problems]
+
+
+def numbered(log_times: list[int]) -> list[bags.Item]:
+    """Return clouds with right stamps and these log times. The first point of cloud i has x = i."""
+    clouds = [item for item in bags.small_items(scans=len(log_times)) if item.topic == bags.CLOUD]
+    return [item._replace(received=time) for item, time in zip(clouds, log_times, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "log_times",
+    [
+        [bags.START + i // 2 * 200_000_000 for i in range(6)],
+        [0] * 6,
+        [0, 0, 0, 5 * SECOND, 5 * SECOND, 6 * SECOND],
+    ],
+)
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
+def test_scans_of_equal_log_time_are_told_apart(tmp_path: Path, log_times: list[int], form: str) -> None:
+    messages = bags.Messages(form == "ros1")
+    items = [i for i in bags.small_items(messages, scans=6) if i.topic == bags.CLOUD]
+    items = [item._replace(received=time) for item, time in zip(items, log_times, strict=True)]
+    bag = bags.write(tmp_path / "drive.bag", items, messages, form=form)
+    run = assert_as_in_the_run([bag])
+    assert [frame.points[0, 0] for frame in run] == [frame.index for frame in run] == list(range(6))
+
+
+def test_equal_log_times_and_stamps_keep_the_numbers(tmp_path: Path) -> None:
+    items = numbered([bags.START + i // 3 * SECOND for i in range(9)])
+    items[4].message.header.stamp = items[3].message.header.stamp
+    bag = bags.write(tmp_path / "drive", items)
+    with BagSource([bag], load()) as source:
+        assert [(f.index, f.points[0, 0]) for f in source] == [(i, i) for i in range(9) if i != 4]
+        assert [f.points[0, 0] for i in range(9) if (f := source.frame(i)) is not None] == list(range(9))
+    with BagSource([bag], load(), at="1.0") as source:
+        assert [(f.index, f.points[0, 0]) for f in source] == [(3, 3)]
+    with BagSource([bag], load(), start="1.0", every=2) as source:
+        assert [(f.index, f.points[0, 0]) for f in source] == [(0, 3), (2, 5), (4, 7)]
+
+
+def test_single_frames_of_other_bags_are_those_of_the_run(tmp_path: Path, shared: Path) -> None:
+    """The drive that ships with bevviz, one of Foxglove's messages, and one of KITTI."""
+    assert_as_in_the_run([kept_drives.BAG])
+    assert_as_in_the_run([foxglove_bags.write(tmp_path / "foxglove.mcap")])
+    assert_as_in_the_run([bags.write(tmp_path / "kitti", bags.kitti_items(shared, scans=4, step=20))])

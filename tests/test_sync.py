@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bevviz.config import Config, load
+from bevviz.config import Config, SyncConfig, load
 from bevviz.errors import UserError
 from bevviz.messages.decoders import MessageError
 from bevviz.messages.roles import Roles
@@ -754,7 +754,7 @@ def test_a_slow_connection_is_no_wrong_clock() -> None:
     ],
 )
 def test_other_epochs_are_named(offset: float, words: str) -> None:
-    clocks = Clocks({}, "stamp")
+    clocks = Clocks(SyncConfig(), "/rslidar_points")
     for i in range(5):
         clocks.stamp("/rslidar_points", ns(i), ns(i + 0.1))
         clocks.stamp("/zed/image", ns(i - offset), ns(i + 0.03))
@@ -763,7 +763,7 @@ def test_other_epochs_are_named(offset: float, words: str) -> None:
 
 
 def test_too_few_messages_tell_nothing() -> None:
-    clocks = Clocks({}, "stamp")
+    clocks = Clocks(SyncConfig(), "/rslidar_points")
     clocks.stamp("/a", ns(0), ns(9))
     clocks.stamp("/b", ns(0), ns(0))
     assert clocks.lag("/a") is None and not list(clocks.doubts(["/a", "/b"]))

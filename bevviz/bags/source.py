@@ -27,6 +27,7 @@ from bevviz.messages.transforms import StampedTransform, decode_transforms
 from bevviz.model.frame import F64, I64, Frame, LabelledBoxes3D, Scene
 from bevviz.support.contexts import Closable
 from bevviz.support.limits import MAX_LATCHED
+from bevviz.sync.clocks import LATENCY
 from bevviz.sync.feed import Handler, make_handlers
 from bevviz.sync.report import LARGE_LOSS, UnusableMessages, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
@@ -35,9 +36,10 @@ if TYPE_CHECKING:
     from bevviz.datasets.result_files import ResultFile
 
 SECOND = 1_000_000_000
-MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud
-NEAR = SECOND // 2  # the same for clouds and images before a single cloud, at least
+MARGIN = 2 * SECOND  # search range in nanoseconds for data of the first and the last cloud, at least
+NEAR = SECOND // 2  # the same for clouds and images before a single cloud
 WHOLE_IMAGES = ("Image", "CompressedImage")  # kinds that are decoded without the images before
+HISTORY = 30 * SECOND  # nanoseconds of transforms that a run has
 EPOCH = 1e8  # seconds; a larger number is a date since 1970
 
 
@@ -61,12 +63,12 @@ class ReadingState:
 
     Attributes:
         sync: synchroniser with its queues.
-        numbers: numbers of the scans not delivered yet, by time of receipt.
+        numbers: number of each message of the driver that has been queued, in this order.
         damage: unusable messages.
     """
 
     sync: Synchronizer
-    numbers: dict[int, list[int]] = field(default_factory=dict)
+    numbers: list[int] = field(default_factory=list)
     damage: UnusableMessages = field(default_factory=UnusableMessages)
 
 
@@ -106,10 +108,8 @@ class BagSource(Closable):
             self._driver = self._find_driver()
             self._low = self._time(start, self.recording.start)
             self._high = self._time(end, self.recording.end + 1)
-            self._first = 0  # number of the first scan in the selected part
-            if at is not None:
-                self._narrow(self._time(at, 0))
-            self._chosen = self._choose(every, frames or (None, None))
+            self._skipped = 0  # scans before that with the number zero
+            self._chosen = self._choose(at, every, frames or (None, None))
         except BaseException:
             self.close()
             raise
@@ -220,68 +220,121 @@ class BagSource(Closable):
     def frame(self, number: int) -> Frame | None:
         """Read the frame of one scan of the recording, selected or not; None if it cannot be read.
 
+        It is the frame that a run over all scans makes of the scan.
+
         Raises:
             UserError: there is no scan with this number.
         """
-        low = int(self.scans[self.checked(number)])
-        return next(self._frames(low, low + 1, number, range(1), self._checked), None)
+        only = range(self.checked(number), number + 1)
+        return next(self._frames(only, self._checked), None)
 
     @property
     def numbers(self) -> range:
         """Numbers of the selected frames."""
         chosen = self._chosen
-        return range(self._first + chosen.start, self._first + chosen.stop, chosen.step)
+        return range(chosen.start - self._skipped, chosen.stop - self._skipped, chosen.step)
 
     def __iter__(self) -> Iterator[Frame]:
-        return self._frames(self._low, self._high, self._first, self._chosen)
+        return (
+            replace(frame, index=frame.index - self._skipped) if self._skipped else frame
+            for frame in self._frames(self._chosen)
+        )
 
-    def _frames(
-        self, low: int, high: int, first: int, chosen: range, checked: set[str] | None = None
-    ) -> Iterator[Frame]:
-        """Yield the chosen frames of the scans with low <= log time < high, numbered from ``first``."""
-        sync = Synchronizer(self.roles, self.config)
-        sync.upright.checked = checked
-        sync.absent = frozenset(file.topic for file in self.results)  # No message comes on these topics.
-        state = self._state = ReadingState(sync)
-        handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
-        self._feed_latched(state, handlers, low)
-        frames = self._deliver(state, handlers, low, high, first, chosen)
-        if not self.results:
-            return frames
-        skipped = int(np.searchsorted(self.scans, low)) - first  # Result files number the whole recording.
-        return (self._with_results(frame, frame.index + skipped) for frame in frames)
+    def _frames(self, chosen: range, checked: set[str] | None = None) -> Iterator[Frame]:
+        """Yield the frames of some scans. Their numbers are those of the whole recording.
 
-    def _deliver(
-        self,
-        state: ReadingState,
-        handlers: Mapping[str, Handler[RawMessage]],
-        low: int,
-        high: int,
-        first: int,
-        chosen: range,
-    ) -> Iterator[Frame]:
-        """Yield the frames and update ``state``."""
-        sync, number, stop = state.sync, -1, high + MARGIN
-        near = low - (self._near if chosen == range(1) else MARGIN)
-        # A single frame needs no old clouds and images, which are most of a drive.
-        before = self.recording.messages(handlers.keys() - self._heavy, low - MARGIN, near, few=True)
-        for message in chain(before, self.recording.scans(handlers.keys(), near, high + MARGIN)):
-            if message.received > stop:
+        A single frame reads few old images, which are most of a drive. If its images are older, as with a
+        LiDAR that is received late, more of them are read.
+        """
+        reach, alone = self._near if len(chosen) == 1 else self._reach, False
+        late = 0
+        while True:
+            sync = Synchronizer(self.roles, self.config)
+            sync.upright.checked = checked
+            sync.absent = frozenset(file.topic for file in self.results)  # No message comes on these topics.
+            state = self._state = ReadingState(sync)
+            frames = self._read(state, chosen, reach, late, alone)
+            if len(chosen) > 1 or alone:
                 break
+            single = next(frames, None)
+            frames = iter(() if single is None else (single,))
+            if single is None:  # A run drops it, since another scan has its stamp or a later one.
+                alone = True
+                continue
+            late_now = self._lateness(sync, single)
+            if late >= late_now and (reach == self._reach or sync.reaches(single.stamp, self._silent)):
+                break
+            reach, late = min(4 * reach, self._reach), max(late, late_now)
+        # Result files number the scans of the whole recording.
+        yield from map(self._with_results, frames) if self.results else frames
+
+    def _read(
+        self, state: ReadingState, chosen: range, reach: int, late: int, alone: bool
+    ) -> Iterator[Frame]:
+        """Yield the frames of some scans and update ``state``.
+
+        Args:
+            state: state of a new synchroniser.
+            chosen: numbers of the scans.
+            reach: nanoseconds before the first scan from which on images and clouds are read.
+            late: nanoseconds by which clouds are received later than transforms.
+            alone: whether a single scan is read as if there were no others.
+        """
+        sync, stop = state.sync, int(self.scans[chosen[-1]]) + self._after + 1
+        handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
+        low = int(self.scans[chosen[0]])
+        if len(chosen) > 1 and chosen[0] == 0:
+            reach = max(reach, low - self.recording.start)
+        self._feed_latched(state, handlers, low)
+        light = handlers.keys() - self._heavy
+        before = self.recording.messages(light, low - max(MARGIN, reach) - late, low - reach, few=True)
+        buffered = self._buffered(low, reach) if reach >= self._reach else ()
+        number, received = -1, -1
+        for message in chain(buffered, before, self.recording.scans(handlers.keys(), low - reach, stop)):
             if message.topic == self._driver:
-                if not low <= message.received < high:
-                    continue
-                number += 1
+                # Scans may have equal log times: they count on from the first of them.
+                again = message.received == received
+                number = number + 1 if again else int(np.searchsorted(self.scans, message.received))
+                received = message.received
                 if number not in chosen:
+                    if len(chosen) == 1 and not alone:
+                        self._feed_neighbour(message, number, state)
+                        yield from self._numbered(sync.ready(message.received), state)
                     continue
-                if number == chosen[-1]:
-                    stop = message.received + MARGIN
-                state.numbers.setdefault(message.received, []).append(first + number)
+                state.numbers.append(number)
             elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
+            queued = sync.report.queued
             self._handle(handlers[message.topic], message, state)
+            if message.topic == self._driver and sync.report.queued == queued:
+                state.numbers.pop()  # The message cannot be used.
             yield from self._numbered(sync.ready(message.received), state)
         yield from self._numbered(sync.flush(), state)
+
+    def _lateness(self, sync: Synchronizer, frame: Frame) -> int:
+        """Return how much later than transforms a scan was received, nanoseconds; 0 if that is usual."""
+        usual = [lag for topic in self.roles.tf if (lag := sync.clocks.lag(topic)) is not None]
+        late = frame.received - frame.stamp - round(min(usual, default=0.0) * SECOND)
+        return late if MARGIN // 2 < late < HISTORY else 0
+
+    def _buffered(self, low: int, reach: int) -> Iterator[RawMessage]:
+        """Yield the older images and clouds that a run still has when a scan is received.
+
+        A buffer keeps messages that are not older than the newest one by ``reach``, and one more.
+        """
+        for topic in sorted(self._heavy - {self._driver}):
+            times = self.recording.scan_times(topic)
+            times = times[: np.searchsorted(times, low, "right")]
+            if len(times):
+                first = max(0, int(np.searchsorted(times, times[-1] - reach)) - 1)
+                yield from self.recording.scans([topic], int(times[first]), low - reach)
+
+    def _feed_neighbour(self, message: RawMessage, number: int, state: ReadingState) -> None:
+        """Feed the stamp of a scan next to a single one. So the single frame takes what it takes in a run."""
+        with suppress(MessageError):  # A data set and single packets have no header: their stamps agree.
+            stamp, frame_id = message.header()
+            state.sync.add_neighbour(message.topic, stamp, frame_id, message.received)
+            state.numbers.append(number)
 
     @cached_property
     def _heavy(self) -> set[str]:
@@ -293,21 +346,32 @@ class BagSource(Closable):
         }
 
     @cached_property
+    def _silent(self) -> set[str]:
+        """Topics without messages."""
+        return {topic.name for topic in self.recording.topics if not topic.count}
+
+    @cached_property
     def _near(self) -> int:
-        """Nanoseconds before a cloud in which the cloud before it and an image of each camera are."""
+        """Nanoseconds before a cloud in which the cloud before it and an image of each camera are, mostly."""
         rates = [topic.rate or 0.0 for topic in self.recording.topics if topic.name in self._heavy]
         slowest = min(rates, default=0.0)
         nearest = max(NEAR, 2 * round(self.config.sync.tolerance * SECOND))
-        return min(MARGIN, max(nearest, round(3 * SECOND / slowest))) if slowest else MARGIN
+        return min(self._reach, max(nearest, round(3 * SECOND / slowest))) if slowest else self._reach
+
+    @cached_property
+    def _reach(self) -> int:
+        """Nanoseconds before a cloud in which all messages are that its frame may take."""
+        sync = self.config.sync
+        return max(MARGIN, round((sync.max_wait + sync.tolerance + LATENCY) * SECOND))
+
+    @cached_property
+    def _after(self) -> int:
+        """Nanoseconds after a cloud in which all messages are that its frame may take."""
+        return max(MARGIN, round(self.config.sync.max_wait * SECOND))
 
     def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
         """Yield the frames with the numbers of their scans."""
-        numbers = state.numbers
-        for frame in frames:
-            waiting = numbers.get(frame.received, ())
-            yield replace(frame, index=waiting.pop(0) if waiting else frame.index)
-            for received in [t for t in numbers if t < frame.received - 10 * MARGIN]:
-                del numbers[received]  # dropped scans
+        return (replace(frame, index=state.numbers[frame.clouds[0].number]) for frame in frames)
 
     def _handle(self, handler: Handler[RawMessage], message: RawMessage, state: ReadingState) -> None:
         try:
@@ -382,12 +446,12 @@ class BagSource(Closable):
         scans = len(self.recording.scan_times(driver)) if driver else 0
         return open_results(results, self.recording.folder, scans, self.recording.sample_stamps)
 
-    def _with_results(self, frame: Frame, number: int) -> Frame:
-        """Return a frame with the boxes of the result files. ``number``: that of its scan."""
+    def _with_results(self, frame: Frame) -> Frame:
+        """Return a frame with the boxes of the result files."""
         boxes, detections, problems = [*frame.robot_boxes], [*frame.robot_detections], [*frame.problems]
         for file in self.results:
             try:
-                labelled = file.of(replace(frame, index=number))
+                labelled = file.of(frame)
             except UserError as error:
                 problems.append(str(error))
                 continue
@@ -434,23 +498,21 @@ class BagSource(Closable):
             )
         return time
 
-    def _narrow(self, time: int) -> None:
-        """Select only the scan nearest to ``time``."""
-        if not len(self.scans):
-            return
-        self._first = int(np.abs(self.scans - time).argmin())
-        self._low = int(self.scans[self._first])
-        self._high = self._low + 1
-
-    def _choose(self, every: int, frames: tuple[int | None, int | None]) -> range:
-        first, last = np.searchsorted(self.scans, [self._low, self._high])
-        scans = range(int(last - first))
-        chosen = scans[slice(*frames)][:: max(every, 1)]
+    def _choose(self, at: str | None, every: int, frames: tuple[int | None, int | None]) -> range:
+        """Return the numbers of the selected scans in the whole recording."""
+        if at is not None and len(self.scans):
+            number = self.number_at(at)
+            self._low = int(self.scans[number])
+            self._high = self._low + 1
+            return range(number, number + 1)
+        first, last = map(int, np.searchsorted(self.scans, [self._low, self._high]))
+        self._skipped = first
+        chosen = range(first, last)[slice(*frames)][:: max(every, 1)]
         if not chosen:
             raise UserError(
-                f"{self.recording.name}: {self._driver} has {len(scans)} {self.noun}s in the time asked for, "
-                "and none of them is among --frames"
-                if scans
+                f"{self.recording.name}: {self._driver} has {last - first} {self.noun}s in the time asked "
+                "for, and none of them is among --frames"
+                if last > first
                 else f"{self.recording.name}: {self._driver} has no {self.noun} in the time asked for"
             )
         return chosen

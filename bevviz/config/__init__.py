@@ -37,6 +37,7 @@ from bevviz.config.sections import (
     Preset,
     Section,
     SourceConfig,
+    SyncConfig,
     TrackingConfig,
     VoxelConfig,
 )
@@ -66,6 +67,7 @@ __all__ = [
     "Preset",
     "Section",
     "SourceConfig",
+    "SyncConfig",
     "TrackingConfig",
     "VoxelConfig",
     "changed_config",

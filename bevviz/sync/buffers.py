@@ -34,6 +34,11 @@ class TopicBuffer(Generic[T]):
         """Newest stamp; None: the buffer is empty."""
         return self._stamps[-1] if self._stamps else None
 
+    @property
+    def oldest(self) -> int | None:
+        """Oldest stamp; None: the buffer is empty."""
+        return self._stamps[0] if self._stamps else None
+
     def add(self, stamp: int, item: T) -> bool:
         """Add a message. Return whether it replaces one with the same stamp."""
         if self._stamps and stamp < self._stamps[-1] - JUMP:

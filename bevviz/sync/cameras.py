@@ -109,8 +109,7 @@ class Cameras:
         camera = Camera(role.name, image, intrinsics, None, None, problems=tuple(problems))
         if image is not None:
             camera = replace(camera, sync_error=(stamp - reference.stamp) * 1e-9)
-            offset = self._report.clocks.apart(role.topic, self._driver)
-            if offset:
+            if offset := self._report.clocks.wrong(role.topic, self._driver):
                 self._report.complain(
                     problems,
                     f"the clocks of camera '{role.name}' and the LiDAR are {abs(offset):.2f} s apart: "

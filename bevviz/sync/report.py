@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from bevviz.config import Config
+from bevviz.config import Config, SyncConfig
 from bevviz.config.plugins import TOPIC
 from bevviz.messages.roles import Roles
 from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
@@ -116,7 +116,7 @@ class SyncReport:
     problems: Counter[str] = field(default_factory=Counter)
     tf: TransformBuffer = field(default_factory=TransformBuffer)
     upright: Mapping[str, str] = field(default_factory=dict)
-    clocks: Clocks = field(default_factory=lambda: Clocks({}, "stamp"))
+    clocks: Clocks = field(default_factory=lambda: Clocks(SyncConfig(), ""))
     clocked: tuple[str, ...] = ()
     oddities: dict[str, str] = field(default_factory=dict)
     overtaken: Counter[str] = field(default_factory=Counter)

@@ -32,15 +32,13 @@ from bevviz.model.frame import (
 )
 from bevviz.sync.buffers import JUMP, SurroundingsBuffer, TopicBuffer, describe_distance
 from bevviz.sync.cameras import Cameras
-from bevviz.sync.clocks import Clocks
+from bevviz.sync.clocks import LATENCY, Clocks
 from bevviz.sync.gravity import VerticalEstimate
 from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
 from bevviz.sync.transform_tree import Origin, TransformError
 from bevviz.sync.video import Video
 
-SECOND = 1_000_000_000
-LATENCY = 2 * SECOND  # longest delay of a cloud after an image of the same stamp
 FAR = 500.0  # metres; no LiDAR has half of its points farther away
 OVERTAKEN = 64  # late results, and frames to compare them with, that are kept
 
@@ -95,14 +93,14 @@ class Synchronizer:
         self.upright = VerticalEstimate(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
         self.around = SurroundingsBuffer()
-        self.clocks = self.report.clocks = Clocks(config.sync.offsets, config.sync.by)
+        self.clocks = self.report.clocks = Clocks(config.sync, roles.driver)
         self.report.driver, self.report.noun = roles.driver, "cloud" if roles.lidars else "image"
         self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
         self._config = config
         self._tolerance = round(config.sync.tolerance * 1e9)
         self._wait = round(config.sync.max_wait * 1e9)
-        self._horizon = self._wait + self._tolerance + LATENCY
+        self._horizon = self._wait + self._tolerance + round(LATENCY * 1e9)
         self._now = 0
         self._clouds: list[Cloud] = []  # clouds of the driving LiDAR, in order of stamp
         self._done: deque[Frame] = deque()
@@ -191,8 +189,14 @@ class Synchronizer:
             return
         self._queue(cloud)
 
+    def add_neighbour(self, topic: str, stamp: int, frame_id: str, received: int) -> None:
+        """Add a message of the driver whose frame is not wanted. It takes what is nearest to it."""
+        stamp = self._arrived(topic, stamp, received)
+        self._queue(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), received=received))
+
     def _queue(self, cloud: Cloud) -> None:
         """Queue a cloud of the driving LiDAR for a frame."""
+        cloud = replace(cloud, number=self.report.queued)
         self.report.queued += 1
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
@@ -416,7 +420,7 @@ class Synchronizer:
                 if len(self._clouds) <= self._config.sync.queue:
                     return
                 self.report.unwaited += 1
-            yield self._build()
+            yield from self._build()
 
     def flush(self) -> Iterator[Frame]:
         """Yield the remaining frames at the end of the stream."""
@@ -428,7 +432,18 @@ class Synchronizer:
 
     def _build_all(self) -> Iterator[Frame]:
         while self._clouds:
-            yield self._build()
+            yield from self._build()
+
+    def reaches(self, stamp: int, silent: Collection[str]) -> bool:
+        """Return whether the images and the clouds of further LiDARs begin before a stamp.
+
+        Args:
+            stamp: stamp of a frame.
+            silent: topics without messages, which do not count.
+        """
+        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (self._partners, self.cameras.images)
+        oldest = [buffer.oldest for group in groups for topic, buffer in group.items() if topic not in silent]
+        return all(first is not None and first <= stamp for first in oldest)
 
     def _complete(self) -> bool:
         """Return whether no further message can change the frame of the oldest cloud."""
@@ -488,8 +503,12 @@ class Synchronizer:
 
     # --- one frame -----------------------------------------------------------------------------
 
-    def _build(self) -> Frame:
+    def _build(self) -> Iterator[Frame]:
+        """Yield the frame of the oldest cloud, if it is wanted."""
         cloud = self._clouds.pop(0)
+        if not cloud.topic:
+            self._pass_over(cloud.stamp)
+            return
         problems: list[str] = []
         reference = self.placing.of(cloud, problems)
         clouds, poses = self._gather(cloud, reference, problems)
@@ -524,7 +543,24 @@ class Synchronizer:
             problems=tuple(problems),
             around=self.around.take(lambda name: self.placing.world_from(reference, name)),
         )
-        return self._finish(reference, frame)
+        yield self._finish(reference, frame)
+
+    def _pass_over(self, stamp: int) -> None:
+        """Drop what the frame of a neighbour takes."""
+        first, last = self._window(stamp)
+        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
+            self._boxes,
+            self._detections,
+            self._robot_clouds,
+            self._truth,
+        )
+        for group in groups:
+            for buffer in group.values():
+                buffer.take(stamp, first, last)
+        self.around.take(lambda name: None)
+        self._last = stamp
+        for _, buffer in self._buffers():
+            buffer.forget(stamp - self._tolerance)
 
     def _finish(self, reference: ReferenceFrames, frame: Frame) -> Frame:
         """Note that the frame is delivered. Return it."""
