@@ -39,13 +39,14 @@ from bevviz.why import FrameExplainer, Selection
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 SEEDS = range(7000, 7006)
 HEADING = "## Answers of `bevviz why`"
+SIMULATED = ("drives", "demo")  # of the other data sets each frame is another place
 DRAWS = 2000  # of whole drives, for the intervals
 
 PRESETS = ("default", "reference")
 PLANTED = {  # settings of mis-tuned configurations
     "min_iou": ("fusion.min_iou=0.35",),
-    "eps": ("clustering.eps=0.9",),
-    "conf": ("detector.conf_threshold=0.5",),
+    "points": ("clustering.min_points=25",),
+    "conf": ("detector.conf_threshold=0.6",),
     "ground+size": ("ground.distance_threshold=0.5", "clustering.min_cluster_points=25"),
     "depth+nms": ("fusion.max_depth=15", "detector.iou_threshold=0.1"),
 }
@@ -256,7 +257,7 @@ class FrameBenchmark:
                 named=alternatives(getattr(answer, "restored_by", None)),
                 planted=[setting.partition("=")[0] for setting in PLANTED.get(self.name, ())],
                 cured=cured[row],
-                hints=[self._tried(list(hint.settings), row) for hint in answer.hints],
+                hints=[self.tried(list(hint.settings), row) for hint in answer.hints],
                 question=None if number else question,
                 search=None if number else search,
             )
@@ -289,7 +290,7 @@ class FrameBenchmark:
         stages = self.data.loader.load(config)
         return row not in missed_rows(perceive(self.labelled.frame, config, stages, self.memo), self.labelled)
 
-    def _tried(self, settings: list[str], row: int) -> TriedHint:
+    def tried(self, settings: list[str], row: int) -> TriedHint:
         """Run a hint on the frame and on its neighbours."""
         config = changed_config(self.config, settings)
         stages = self.data.loader.load(config)
@@ -367,9 +368,7 @@ def share(misses: Sequence[Miss], values: Share) -> tuple[int, int, float, float
     """Return how many cases hold, of how many, and the 95 % interval by drawing whole drives."""
     by_drive: dict[str, list[bool]] = defaultdict(list)
     for miss in misses:
-        by_drive[f"{miss.data}/{miss.drive if miss.data in ('small', 'demo') else miss.frame}"] += values(
-            miss
-        )
+        by_drive[f"{miss.data}/{miss.drive if miss.data in SIMULATED else miss.frame}"] += values(miss)
     held = np.array([sum(cases) for cases in by_drive.values()], float)
     total = np.array([len(cases) for cases in by_drive.values()], float)
     if not total.sum():
@@ -482,7 +481,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     frames, most = 12, options.most
     if options.quick:
-        options.seeds, frames, most = options.seeds[:3], 6, min(most, 2)
+        options.seeds, frames, most = options.seeds[:6], 12, min(most, 2)
         options.data = [name for name in options.data if name in ("drives", "kitti")]
     misses: list[Miss] = []
     for name, make in data_sets(options.folder, options.seeds, frames).items():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from benchmarks import ideal, ideal_data
 from benchmarks.ideal_stages import STAGES, MissedObject, missed_rows
 from bevviz.config import changed_config
+from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import ClusterState
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_log import Memo
@@ -107,9 +110,77 @@ def test_alternatives_of_an_answer_are_read_from_words_and_lists() -> None:
     ]
 
 
-def test_every_reason_of_a_loss_has_a_stage() -> None:
-    from bevviz.model.reasons import ReasonKind
+def test_a_planted_value_that_is_set_back_cures_an_object_and_its_neighbours() -> None:
+    data, memo = drive(), Memo()
+    frame = ideal.FrameBenchmark(data, ASKED, "depth+nms", memo)
+    cured = [miss for miss in frame.misses(3) if miss.cured]
+    assert len(cured) == 2
+    for miss in cured:
+        assert miss.planted == ["fusion.max_depth", "detector.iou_threshold"]
+        hint = frame.tried(["fusion.max_depth=120", "detector.iou_threshold=0.45"], miss.row)
+        assert hint.restores and hint.gain >= 2 and len(hint.beside) == 2 and min(hint.beside) >= 1
+        same = frame.tried(["fusion.max_depth=14"], miss.row)
+        assert not same.restores and same.gain <= 0
 
+
+def answered(**values: Any) -> ideal.Miss:
+    """Return an answer about a missed object."""
+    verdict: dict[str, Any] = {
+        "reason": "noise",
+        "blamed": "clustering",
+        "text": "",
+        "named": [],
+        "planted": ["a.b"],
+    }
+    about: dict[str, Any] = {
+        "data": "drives",
+        "drive": "1",
+        "frame": 1,
+        "half": "seen",
+        "configuration": "conf",
+        "row": 0,
+    }
+    known = {**about, **verdict, "label": "car", "alone": [], "pairs": [], "cured": True}
+    return ideal.Miss(**(known | values))
+
+
+def test_a_cause_holds_if_one_named_alternative_does() -> None:
+    assert answered(alone=["clustering"]).cause_holds
+    assert not answered(alone=["fusion"]).cause_holds
+    assert answered(alone=["fusion"], named=[["detection"], ["fusion"]]).named_hold == [False, True]
+    pair = answered(pairs=[("clustering", "fusion")])
+    assert pair.curable and not pair.cause_holds
+    assert replace(pair, named=[["fusion", "clustering"]]).cause_holds
+    assert not replace(pair, named=[["fusion"]]).cause_holds
+    assert not answered().curable
+
+
+def test_shares_count_cases_and_draw_whole_drives() -> None:
+    right = ideal.TriedHint(["a.b=1"], True, 1, [1, -2])
+    misses = [
+        answered(alone=["clustering"], hints=[right]),
+        answered(drive="2"),
+        answered(drive="2", cured=False),
+    ]
+    found = ideal.figures(misses)["all"]
+    assert (found["misses"], found["restorable"]) == (3, 1)
+    assert {name: found[name][:2] for name in ideal.SHARES} == {
+        "cause": (1, 3),
+        "cause, restorable": (1, 1),
+        "reason": (1, 3),
+        "named": (0, 0),
+        "planted": (1, 2),
+        "planted, hinted": (1, 1),
+        "hint": (1, 3),
+        "first hint": (1, 3),
+        "beside": (0, 1),
+        "beside, no loss": (0, 1),
+    }
+    assert found["cause"][2:] == (0.0, 1.0)  # A draw may have one drive twice.
+    assert "| all | 3 | 1 | 33 % of 3 (0-100) |" in ideal.table(misses)
+
+
+def test_every_reason_of_a_loss_has_a_stage() -> None:
     stageless = {"reported", "failed", "out of view", "hidden", "no points"}
     others = {"contradicted", "detector's own error", "not among the objects", "lost in the fusion"}
     losses = {kind.value for kind in list(ReasonKind)[: list(ReasonKind).index(ReasonKind.KEPT)]}
