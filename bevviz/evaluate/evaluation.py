@@ -16,7 +16,7 @@ from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
 from bevviz.evaluate.metrics import LimitResult, base_of, ranges
 from bevviz.evaluate.tracking_score import HINT, TrackScore
-from bevviz.model.frame import Boxes3D, Frame
+from bevviz.model.frame import Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.reasons import Reason
 from bevviz.model.results import FrameResult, Objects
@@ -114,7 +114,7 @@ class Evaluation(Observer[FrameResult], Tabular):
             self.without += 1
             return
         self.unusable += [f"frame {result.frame.index}: {reason}" for reason in truth.unusable]
-        objects = result.objects if result.objects is not None else _no_objects()
+        objects = result.objects or Objects.empty()
         matches = self._score.add(objects, truth)
         self.last = result, truth, matches
         asked = self._causes is not None and matches.false.any()
@@ -308,11 +308,6 @@ def _outcome(
         tuple(map(label_text, np.flatnonzero(matches.missed).tolist())),
         tuple(map(false_text, np.flatnonzero(matches.false).tolist())),
     )
-
-
-def _no_objects() -> Objects:
-    none = np.zeros(0, np.int32)
-    return Objects(Boxes3D.empty(), (), np.zeros(0, np.float32), none, (), none)
 
 
 # --- tables ------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ class Job:
     Attributes:
         number: number of the job among those of its kind, from 0.
         settings: settings that it is about.
+        asked_by: name of the overlay of the page that asked for it. Empty: a page without one.
         total: number of steps.
         state: waiting, running, over, cancelled or failed.
         error: reason of the failure.
@@ -26,6 +27,7 @@ class Job:
 
     number: int
     settings: tuple[str, ...] = ()
+    asked_by: str = ""
     total: int = 0
     state: str = "running"
     error: str = ""
@@ -51,6 +53,7 @@ class Job:
         return {
             "number": self.number,
             "settings": list(self.settings),
+            "asked_by": self.asked_by,
             "state": self.state,
             "error": self.error,
             "done": self.done,

@@ -52,6 +52,7 @@ class PageConnection:
         self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
         self._remarking = False
         self._overlay = self._source.open_overlay()
+        self._name = "" if self._overlay is None else self._overlay.lane
         self._tries = ThreadPoolExecutor(1, "tries")  # A slow try keeps no other question waiting.
         self._trying = 0  # number of the try in progress
         self._handlers = {
@@ -101,7 +102,7 @@ class PageConnection:
         return {
             "type": "welcome",
             "run": self._run,
-            "overlay": "" if self._overlay is None else self._overlay.lane,
+            "overlay": self._name,
             "bag": source.title,
             "scans": source.scans,
             "truth": source.truth_of is not None,
@@ -362,11 +363,11 @@ class PageConnection:
     async def _drive(self, number: int, message: Message) -> None:
         """Run the drive with other values."""
         settings = _settings(message)
-        await asyncio.to_thread(self._workbench.tools.trials.begin, settings)
+        await asyncio.to_thread(self._workbench.tools.trials.begin, settings, self._name)
 
     async def _fix(self, number: int, message: Message) -> None:
         """Search values that repair the drive."""
-        self._workbench.tools.fix.begin()
+        self._workbench.tools.fix.begin(self._name)
 
     async def _cancel(self, number: int, message: Message) -> None:
         if message["what"] == "try":
@@ -383,7 +384,8 @@ class PageConnection:
         reports = self._workbench.reports
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        await self._in_turn(number, lambda: reports.begin(frame, settings, before, after, text), settings)
+        asked = frame, settings, before, after, text, self._name
+        await self._in_turn(number, lambda: reports.begin(*asked), settings)
 
     async def _note(self, number: int, message: Message) -> None:
         file = self._workbench.tools.notes.path.name

@@ -107,7 +107,9 @@ class ReportMaker(Jobs[ReportJob]):
         super().__init__("report", session.source.news.tell)
         self._session, self._bag_of, self._folder = session, bag_of, folder
 
-    def begin(self, number: int, settings: Settings, before: float, after: float, note: str) -> ReportJob:
+    def begin(
+        self, number: int, settings: Settings, before: float, after: float, note: str, asked_by: str = ""
+    ) -> ReportJob:
         """Start to make a report.
 
         Args:
@@ -116,6 +118,7 @@ class ReportMaker(Jobs[ReportJob]):
             before: seconds before the frame.
             after: seconds after the frame.
             note: what went wrong, in the user's words.
+            asked_by: name of the overlay of the page that asks.
 
         Raises:
             UserError: a report is in progress, there is no such frame, the range is too long, or a value is
@@ -148,7 +151,7 @@ class ReportMaker(Jobs[ReportJob]):
             tried=session.tried_on(number, settings, about[0] if about else None) if settings else None,
             notes=session.notes(),
         )
-        report = ReportJob(len(self.jobs), settings, name=output.stem)
+        report = ReportJob(len(self.jobs), settings, asked_by, name=output.stem)
         self.start(report, partial(self._make, request))
         return report
 

@@ -89,8 +89,12 @@ class TrialRunner(Jobs[Trial]):
         self._drive = drive
         self._begun = 0  # number of trials until now
 
-    def begin(self, settings: Settings) -> None:
+    def begin(self, settings: Settings, asked_by: str = "") -> None:
         """Run the drive with these settings. A trial that is running is cancelled.
+
+        Args:
+            settings: the settings.
+            asked_by: name of the overlay of the page that asks.
 
         Raises:
             UserError: nothing is changed, a parameter is unknown, or a value is wrong.
@@ -102,7 +106,8 @@ class TrialRunner(Jobs[Trial]):
             raise UserError("nothing is changed: press a hint, or change a parameter first")
         session = Session(config, loader=drive.pipeline.loader)
         self.end()
-        trial = Trial(self._begun, settings, drive.again.total, known=drive.truth_of is not None)
+        total, known = drive.again.total, drive.truth_of is not None
+        trial = Trial(self._begun, settings, asked_by, total, known=known)
         self._begun += 1
         drive.lanes[trial.lane] = trial.buffer
         drive.findings.replace(tuple(DIFFERENCES))

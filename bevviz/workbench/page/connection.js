@@ -110,6 +110,8 @@ export function send(message, failed) {
   return number;
 }
 
+// Whether another page asked for a job.
+export const isOthers = (job) => Boolean(overlay) && job.asked_by !== overlay;
 
 // Call a function once the viewer has so many pieces of the overlay.
 let awaited = [];

@@ -2,7 +2,9 @@
 
 import { $, element, seconds, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
-import { follow, send } from "./connection.js";
+import { follow, isOthers, send } from "./connection.js";
+
+const OTHERS = "asked for on another page";
 
 let trials = []; // runs with other values, from the server, the newest last
 let use = () => {}; // shows the settings of a run
@@ -101,6 +103,7 @@ function summary(message) {
   parts.push(message.f1 ? `${frames}: ${message.better} better, ${message.worse} worse` : frames);
   for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
   if (message.state === "cancelled") parts.push("cancelled");
+  if (isOthers(message)) parts.push(OTHERS);
   return parts.join("; ");
 }
 
@@ -131,7 +134,8 @@ function strip(frames) {
 
 function showFix(fix) {
   const going = fix.state === "running";
-  const steps = fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...";
+  const by = isOthers(fix) ? ` (${OTHERS})` : "";
+  const steps = (fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...") + by;
   $("fix").disabled = going;
   for (const id of ["fix-bar", "fix-cancel"]) $(id).hidden = !going;
   $("fix-bar").max = fix.total || 1;
@@ -161,7 +165,7 @@ function report(one) {
     });
     item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
       element("span", "faint", [` in ${one.folder}`, one.settings.join(", "),
-        one.state === "cancelled" ? "cancelled" : ""].filter(Boolean).join("; ")));
+        one.state === "cancelled" ? "cancelled" : "", isOthers(one) ? OTHERS : ""].filter(Boolean).join("; ")));
   }
   return item;
 }
