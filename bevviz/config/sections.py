@@ -213,7 +213,7 @@ class FusionConfig(Section):
     min_points: int = Field(3, ge=1, description="frustum: fewest points of a cluster inside")
     min_iou: float = Field(0.1, ge=0, le=1, description="frustum: least IoU of 2D box and projected cluster")
     min_rating: float = Field(
-        0.05, ge=0, le=1, description="frustum: least score of a detection times how well points fit it"
+        0.06, ge=0, le=1, description="frustum: least score of a detection times how well points fit it"
     )
     max_gap: Metres = Field(
         0.5, gt=0, le=20, description="frustum: points nearer to each other on the ground stay together"

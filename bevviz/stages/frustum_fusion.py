@@ -20,7 +20,7 @@ from bevviz.model.results import (
     DetectionState,
     Splits,
 )
-from bevviz.stages.box_fit import NO_EDGE
+from bevviz.stages.box_fit import MAX_SPREAD, NO_EDGE, STRAY_SHARE
 from bevviz.stages.cells import sort_by
 from bevviz.stages.cluster_relabel import ClaimedPoints, relabel_claimed
 from bevviz.stages.clustering import MIN_SIZE
@@ -43,14 +43,18 @@ HIDDEN_SIGMAS = 2.0  # sigmas: a lower height costs no more than this, because t
 HIDDEN_SIGMAS_CUT = 1.0  # the same for a box that the image border cuts
 REACH_SPREAD = 2.0  # sigmas of its size by which an object may be deeper than its class
 
-DOUBT = 0.4  # factor of the rating of a candidate that only a further size of the class explains
 RARER = 2.5  # cost of each further size of a class; the first one is the most frequent
 NO_SIDES = 1.0  # metres, mean length of a class below which objects have no flat sides: people
+UNSEEN_WIDTH = 0.12  # metres by which such an object is wider than its points: no beam hits its very edge
+WIDTH_SIGMA = 0.12  # metres, one sigma of the width that the points show
 BEHIND = 0.05  # metres from the median of such an object's points to its centre
 BORDER = 2.0  # pixels: a box nearer to the image border than this is cut off by it
 SAME_OBJECT_IOU = 0.7  # above it boxes of two classes show one object, because NMS works by class
 MIN_CLUSTER_SHARE = 0.1  # share of an object's points above which a cluster counts as a part of the object
 WHOLE_SHARE = 0.95  # share of an object's clusters in one box of its class above which they are the object
+SIMILAR = 2.5  # ratio of the mean lengths of two classes up to which their objects stand side by side
+SHORT = 3.0  # metres; depth separates longer objects
+DIVIDE_ROUNDS = 3  # rounds in which points are divided by place, with better places each time
 UNAVAILABLE = -2  # value of ``taker`` for a point that no detection may claim
 
 
@@ -69,17 +73,19 @@ def claim_clusters(
     connected seen from above (gaps below ``fusion.max_gap``) and not deeper than its class can be. Its rating
     is ::
 
-        score * overlap * t(height) * share
+        score * overlap * t(height) * t(foot) * share
 
     ``overlap`` is the part of the image box that the candidate's outline covers. ``t(height)`` is the
     agreement of the box's height in metres at the candidate's distance with that of the class. It is
-    Student's t, lenient with lower heights because the object may be partly hidden. ``share`` is the share of
-    the connected points, beside and above the box too, that are in the box. The best rated detection of all
-    claims its points. Other detections that wanted these points search again. This is repeated until none is
-    left. Then ``box_fit.fit`` fits a box of the class's size to the candidate, and the detection claims the
-    points in it. This joins parts that an occluder separated, and drops points that stand too near. If a box
-    of the class holds the candidate's clusters whole, the detection claims them even where its image box is
-    too narrow. Otherwise one face of a car, seen alone, would not tell its heading.
+    Student's t, lenient with lower heights because the object may be partly hidden. ``t(foot)`` is the
+    agreement of the lower edge of the image box with the ground below the candidate, whatever its class.
+    ``share`` is the share of the connected points, beside and above the box too, that are in the box. Two
+    detections of similar size that want the same points divide them by their boxes in the image. The best
+    rated detection of all claims its points. Other detections that wanted these points search again. This is
+    repeated until none is left. Then ``box_fit.fit`` fits a box of the class's size to the candidate, and the
+    detection claims the points in it. This joins parts that an occluder separated, and drops points that
+    stand too near. If a box of the class holds the candidate's clusters whole, the detection claims them even
+    where its image box is too narrow. Otherwise one face of a car, seen alone, would not tell its heading.
 
     For a detection with a mask (``fusion.masks``) only points under the mask are in the frustum. The other
     points in the box are ignored. A mask with too few points is ignored.
@@ -151,6 +157,7 @@ class _FrameClaims:
     ) -> None:
         self.points, self.height, self.clusters, self.config = points, height, clusters, config
         self.sizes, self.smallest = sizes, smallest
+        self.ground = np.zeros(0, np.float32) if height is None else points[:, 2] - height
         self.fewest = max(config.min_points, smallest)
         self.parts: list[ClaimedPoints] = []
         kept = np.append(clusters.state == ClusterState.KEPT, True)  # noise has label -1, the last element
@@ -178,8 +185,8 @@ class _FrameClaims:
         detections = result.detections
         claims = Claims.none(len(detections))
         kept = np.flatnonzero(detections.state == DetectionState.KEPT).tolist()
-        waiting = {d: view.best(d) for d in kept}
         scores = detections.score.tolist()
+        waiting = view.divided({d: view.best(d) for d in kept})
         while waiting:
             d = max(waiting, key=lambda d: waiting[d].fit * scores[d])
             candidate = waiting.pop(d)
@@ -241,7 +248,7 @@ class _CameraFrustums:
     ) -> None:
         self._work, self._uv, self._detections = work, uv, detections
         points_from_camera = geometry.inverse(camera_from_points)
-        self._place = points_from_camera[:2, 3].copy()
+        self._place, self._eye = points_from_camera[:2, 3].copy(), float(points_from_camera[2, 3])
         self.taker = np.where(work.usable, np.int32(-1), np.int32(UNAVAILABLE))  # detection
         self._seen = np.flatnonzero((depth > 0) & (depth <= work.config.max_depth) & ~np.isnan(uv[:, 0]))
         # Rays go through the middles of the left, upper, right and lower edge of each box.
@@ -253,6 +260,8 @@ class _CameraFrustums:
         flat = np.hypot(middle[:, 0], 1)  # horizontal length of a ray of depth 1
         self._tall = (rays[:, 3, 1] - rays[:, 1, 1]) / flat  # metres of height for each metre of distance
         self._wide = (rays[:, 2, 0] - rays[:, 0, 0]) / flat
+        lower = rays[:, 3] @ points_from_camera[:3, :3].T
+        self._drop = lower[:, 2] / np.maximum(np.hypot(lower[:, 0], lower[:, 1]), 1e-9)
         across = rays[:, [0, 2]] @ points_from_camera[:2, :3].T  # (D, 2, 2) directions on the ground
         across /= np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-9)
         self._normals = np.stack([-across[..., 1], across[..., 0]], axis=2)
@@ -267,12 +276,11 @@ class _CameraFrustums:
             axis=1,
         )
 
-        with_sigma = (
-            np.maximum(
-                EDGE_PIXELS / np.maximum(x1 - x0, 1.0), EDGE_SHARE * (1 + EDGE_DOUBT * (1 - detections.score))
-            )
-            * self._wide
-        )
+        share = EDGE_SHARE * (1 + EDGE_DOUBT * (1 - detections.score))
+        with_sigma = np.maximum(EDGE_PIXELS / np.maximum(x1 - x0, 1.0), share) * self._wide
+        low_sigma = np.maximum(EDGE_PIXELS / np.maximum(y1 - y0, 1.0), share) * self._tall
+        # (D,) sigma of the lower edge for each metre of distance
+        self._footing = np.where(self._cut[:, 3], np.inf, low_sigma)
         # (D, 2) sigma of the left and right edge for each metre of distance
         self._edge = np.where(self._cut[:, [0, 2]], NO_EDGE, np.maximum(with_sigma, 1e-6)[:, None])
         self._boxes = detections.xyxy.astype(np.float64)
@@ -290,13 +298,66 @@ class _CameraFrustums:
 
     def best(self, d: int) -> _Candidate:
         """Return the best rated candidate among the free points in a detection's frustum, for any size."""
-        best = self._best_of_size(d, self._sizes[d][0].tolist())
-        for size in self._sizes[d][1:].tolist():
-            candidate = self._best_of_size(d, size)
-            candidate = replace(candidate, fit=DOUBT * candidate.fit)
-            if candidate.fit > best.fit:
-                best = candidate
-        return best
+        candidates = [self._best_of_size(d, size) for size in self._sizes[d].tolist()]
+        return max(candidates, key=lambda candidate: candidate.fit)
+
+    def divided(self, candidates: dict[int, _Candidate]) -> dict[int, _Candidate]:
+        """Divide points that two detections of similar size want, and return the new candidates.
+
+        Depth does not separate such objects, for example two people side by side.
+        """
+        likely = [
+            d
+            for d, c in candidates.items()
+            if c.fit * self._detections.score[d] >= self._work.config.min_rating
+        ]
+        divided = set[int]()
+        for i, d in enumerate(likely):
+            for e in likely[i + 1 :]:
+                if self._divide(d, e, candidates[d].rows, candidates[e].rows):
+                    divided |= {d, e}
+        return candidates | {d: self.best(d) for d in divided}
+
+    def _divide(self, d: int, e: int, rows_d: I64, rows_e: I64) -> bool:
+        """Divide the points that two detections want by their boxes in the image and by place.
+
+        Each point goes to the detection that is more likely to have it. A point is most likely in the middle
+        of an image box and at the mean place of the points that the detection has so far.
+
+        Returns:
+            Whether both detections keep enough points.
+        """
+        lengths = self._sizes[d][0, 0], self._sizes[e][0, 0]
+        overlap = geometry.iou(self._detections.xyxy[[d]], self._detections.xyxy[[e]])[0, 0]
+        is_similar = bool(np.max(lengths) <= min(SIMILAR * np.min(lengths), SHORT))
+        if not is_similar or not 0 < overlap < SAME_OBJECT_IOU:
+            return False
+        shared = np.intersect1d(rows_d, rows_e)
+        if len(shared) < self._work.fewest:
+            return False
+        rows = np.union1d(rows_d, rows_e)
+        only_d, only_e = ~np.isin(rows, rows_e), ~np.isin(rows, rows_d)
+        xy, spread = self._work.points[rows, :2], self._sizes[d][0, 1] / 2
+        by_image = self._log_density(d, rows) - self._log_density(e, rows)
+        is_d = only_d | (~only_e & (by_image >= 0))
+        for _ in range(DIVIDE_ROUNDS):
+            if min(np.count_nonzero(is_d), np.count_nonzero(~is_d)) < self._work.fewest:
+                return False
+            off_d, off_e = (((xy - xy[side].mean(axis=0)) ** 2).sum(axis=1) for side in (is_d, ~is_d))
+            is_d = only_d | (~only_e & (by_image + (off_e - off_d) / (2 * spread**2) >= 0))
+        if min(np.count_nonzero(is_d), np.count_nonzero(~is_d)) < self._work.fewest:
+            return False
+        for number, lost in ((d, rows[~is_d]), (e, rows[is_d])):
+            barred = self._beside_masks.setdefault(number, np.zeros(len(self._uv), np.bool_))
+            barred[lost] = True
+        return True
+
+    def _log_density(self, d: int, rows: I64) -> F64:
+        """Return the log-likelihood of points in a detection's image box. It is highest in the middle."""
+        low, high = self._boxes[d, :2], self._boxes[d, 2:]
+        middle, half = (low + high) / 2, (high - low) / 2
+        off = np.abs(self._uv[rows] - middle) / half
+        return np.asarray(np.log(np.maximum(1 - off, 0.01) / half).sum(axis=1), np.float64)
 
     def _best_of_size(self, d: int, size: Sequence[float]) -> _Candidate:
         """Return the best rated candidate for one size of a detection's class."""
@@ -315,6 +376,10 @@ class _CameraFrustums:
             height,
             math.hypot(spread[2], TALL_SHARE * height),
             self._lowest(d),
+            self._work.ground,
+            self._eye,
+            self._drop[d],
+            self._footing[d],
             self._work.fewest,
             config.min_iou,
         )
@@ -416,15 +481,16 @@ class _CameraFrustums:
         work, facing, (x, y, length, width, heading) = self._work, fitted.facing, fitted.flat.tolist()
         has_size = not math.isnan(fitted.size[0])
         seen = [facing[0] > 0, facing[0] < 0, facing[1] > 0, facing[1] < 0]
-        if not has_size and width > length:
+        is_round = bool(fitted.size[0] < NO_SIDES)
+        if is_round:
+            x, y, length, width, heading = self._round_box(rows, fitted.size)
+            seen = [False, True, False, False]
+        if (is_round or not has_size) and width > length:
             length, width, heading = width, length, heading - math.pi / 2
             seen = [seen[3], seen[2], seen[0], seen[1]]
         if not -math.pi / 2 < heading <= math.pi / 2:
             heading += math.pi if heading < 0 else -math.pi
             seen = [seen[1], seen[0], seen[3], seen[2]]
-        if fitted.size[0] < NO_SIDES:
-            x, y = self._middle(rows)
-            length, width = fitted.size[0], fitted.size[1]
         z = work.points[rows, 2]
         low, high = float(z.min()), float(z.max())
         if has_size and work.height is not None:
@@ -433,11 +499,22 @@ class _CameraFrustums:
         length, width, tall = (max(side, MIN_SIZE) for side in (length, width, high - low))
         return np.array([x, y, (low + high) / 2, length, width, tall, heading]), np.array(seen)
 
-    def _middle(self, rows: I64) -> F64:
-        """Return the (2,) centre of an object without flat sides. Its points lie on the half that is seen."""
-        seen = np.median(self._work.points[rows, :2], axis=0).astype(np.float64)
-        away = seen - self._place
-        return seen + BEHIND * away / max(float(np.hypot(*away)), 1e-6)
+    def _round_box(self, rows: I64, size: F64) -> tuple[float, float, float, float, float]:
+        """Return centre, length, width and heading of an object without flat sides, seen along its length.
+
+        The points lie on the half that is seen. They show its width, which is weighed with the size of the
+        class by the variances.
+        """
+        place = np.median(self._work.points[rows, :2], axis=0).astype(np.float64)
+        away = (place - self._place) / max(float(np.hypot(*(place - self._place))), 1e-6)
+        x, y = place + BEHIND * away
+        across = (self._work.points[rows, :2] - self._place) @ np.array([-away[1], away[0]])
+        low, high = np.percentile(across, (100 * STRAY_SHARE, 100 - 100 * STRAY_SHARE))
+        mean = math.sqrt(size[0] * size[1])
+        spread = mean * (size[3] / size[0] + size[4] / size[1]) / 2
+        trust = spread**2 / (spread**2 + WIDTH_SIGMA**2)
+        wide = mean + trust * (float(high - low) + UNSEEN_WIDTH - mean)
+        return x, y, mean, min(wide, size[0] + MAX_SPREAD * size[3]), math.atan2(away[1], away[0])
 
 
 def _points_beside_mask(

@@ -15,6 +15,8 @@ TIGHT_SHARE = 0.15  # share of a box's sides by which the box may be too tight
 AROUND_SHARE = 0.5  # share of a box's width on either side in which points show that an object continues
 ABOVE_SHARE = 1.0  # the same of its height above it: a post or a hedge is taller than the object in the box
 STUDENT_FREEDOM = 4.0  # degrees of freedom of Student's t for the deviation of a height from its class
+FOOTING = 0.2  # metres, one sigma of the ground below an object
+HIDDEN_FOOT = 4.0  # sigmas: a lower edge above the ground costs no more, because the foot may be hidden
 DEPTH_STEPS = 8  # a window in depth moves by its length divided by this
 OWN_MARGIN = 0.1  # metres around a fitted box in which a point still belongs to it
 REMAINDER_MARGIN = 0.5  # metres around a box in which the small remainder of a cluster belongs to it
@@ -35,6 +37,10 @@ def choose_candidate(
     height: float,
     sigma: float,
     lowest: float,
+    ground: F32,
+    eye: float,
+    drop: float,
+    footing: float,
     fewest: int,
     least: float,
 ) -> tuple[I64, float, float]:
@@ -54,6 +60,10 @@ def choose_candidate(
         height: metres, height of the class, NaN if unknown.
         sigma: metres, sigma of that height.
         lowest: sigmas; a lower height costs no more than this.
+        ground: (P,) z of the ground below each point, empty if it is unknown.
+        eye: z of the camera.
+        drop: rise of the ray through the lower edge of the image box for each metre of distance.
+        footing: one sigma of the lower edge for each metre of distance, inf if the edge tells nothing.
         fewest: smallest number of points of a candidate.
         least: smallest part of the image box that a candidate covers.
 
@@ -135,11 +145,13 @@ def choose_candidate(
             deep = ratio * begin if np.isnan(reach) else reach
             u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
             count = 0
+            below = 0.0
             last = first
             while last < start[k + 1] and far[by_body[last]] <= begin + deep:
                 i = by_body[last]
                 if inside[i]:
                     count += 1
+                    below += ground[near[i]] if len(ground) else 0.0
                     u, v = uv[near[i], 0], uv[near[i], 1]
                     u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
                 last += 1
@@ -153,6 +165,9 @@ def choose_candidate(
                 if not np.isnan(height):
                     z = max((tall * front - height) / sigma, -lowest)
                     rating /= 1 + z * z / STUDENT_FREEDOM
+                if len(ground) and footing < np.inf:
+                    z = (eye + drop * front - below / count) / math.hypot(FOOTING, footing * front)
+                    rating /= 1 + min(z * z, HIDDEN_FOOT**2) / STUDENT_FREEDOM
                 if overlap >= least and rating > best:
                     best, best_first, best_last, best_far = rating, first, last, front
             if last == start[k + 1]:
