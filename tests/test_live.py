@@ -310,7 +310,7 @@ def test_a_slow_viewer_gets_the_newest_and_its_lag_is_known(
     assert len(taken) == 25 - screen.dropped <= 6 and program.got
 
 
-class Stalled:
+class Stalled(Replay):
     """Plays a replay, then only says how its topics do."""
 
     def __init__(self, replay: Replay) -> None:

@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from bevviz.live.requests import Control
     from bevviz.live.runtime import Live, Status
     from bevviz.live.source import LiveSource
+    from bevviz.live.source_wrappers import RobotFrames
     from bevviz.live.status import Notes
-    from bevviz.model.frame import Frame
-    from bevviz.model.protocols import Items
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -261,7 +260,7 @@ def _watch_robot(
 
 
 def _watch(
-    source: Items[Frame],
+    source: RobotFrames,
     settings: ReloadableConfig,
     options: LiveOptions,
     notes: Notes,

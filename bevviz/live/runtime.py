@@ -25,7 +25,7 @@ from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.robot_comparison import RobotComparison
-from bevviz.live.source_wrappers import ThinnedSource, warm_up
+from bevviz.live.source_wrappers import RobotFrames, ThinnedSource, warm_up
 from bevviz.live.status import Health, Notes, set_nice
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
@@ -87,7 +87,7 @@ class Live:
 
     def __init__(
         self,
-        source: Items[Frame],
+        source: RobotFrames,
         settings: ReloadableConfig,
         outputs: Outputs,
         notes: Notes,
@@ -104,7 +104,8 @@ class Live:
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.urls: list[str] = []
         self.frames = 0  # frames logged so far
-        self._source, self._settings = ThinnedSource(source, lambda: self.config), settings
+        self._source, self._settings = source, settings
+        self._thinned = ThinnedSource(source, lambda: self.config)
         self._on_result = on_result
         self.checks = InputChecks(source, settings.config)
         self._shown = settings.config  # the configuration last passed to ``on_change``
@@ -215,9 +216,9 @@ class Live:
         """Save the last seconds, see ``FlightRecorder.save``. Any thread may call it."""
         return self.flight.save(path)
 
-    def mark(self, text: str) -> bool:
-        """Mark the next frame, as a message on the topic of marks does. Return whether the source can."""
-        return self._source.mark(text)
+    def mark(self, text: str) -> None:
+        """Mark the next frame, as a message on the topic of marks does."""
+        self._source.mark(text)
 
     def stop(self) -> None:
         """End ``run``. Any thread may call it."""
@@ -260,7 +261,7 @@ class Live:
             stack.callback(_handle, dict.fromkeys(ENDING[2:], signal.SIG_IGN))
             try:
                 drops, stop = self._dropping, self._over
-                run(self._source, self.session, observers, dropping=drops, stop=stop, tick=tick)
+                run(self._thinned, self.session, observers, dropping=drops, stop=stop, tick=tick)
             except UserError:
                 raise
             except Exception as error:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,17 +24,41 @@ PERIOD = 100_000_000  # nanoseconds
 CAMERA_FROM_LIDAR: F64 = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
+class RobotFrames(Items[Frame], Protocol):
+    """Frames of a robot as they come, and what is known beside them."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames that the source itself has dropped."""
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """State of each topic."""
+
+    def overtaken(self) -> tuple[LateBoxes, ...]:
+        """Return the robot's results that came too late for their frames, since the last call."""
+
+    def marks(self, index: int) -> tuple[UserMark, ...]:
+        """Return the users' marks up to the frame of this index, since the last call."""
+
+    def mark(self, text: str) -> None:
+        """Take in a user's mark."""
+
+    def stop(self) -> None:
+        """End the iteration. Any thread may call it."""
+
+
 class ThinnedSource:
     """Source that leaves out frames and points as the configuration asks.
 
     Args:
-        source: source of the frames. If it has a method ``stop``, that ends it.
+        source: source of the frames.
         config: returns the current configuration.
         clock: returns seconds, for tests.
     """
 
     def __init__(
-        self, source: Items[Frame], config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
+        self, source: RobotFrames, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.thinned = 0
         self._source, self._config, self._clock = source, config, clock
@@ -54,38 +78,9 @@ class ThinnedSource:
         """Warnings of the source."""
         return self._source.warnings
 
-    @property
-    def dropped(self) -> int:
-        """Frames that the source itself has dropped."""
-        return int(getattr(self._source, "dropped", 0))
-
-    @property
-    def states(self) -> Mapping[str, str]:
-        """State of each topic, if the source has topics."""
-        return getattr(self._source, "states", {})
-
-    def overtaken(self) -> tuple[LateBoxes, ...]:
-        """Return the robot's results that came too late for their frames, since the last call."""
-        overtaken = getattr(self._source, "overtaken", None)
-        return () if overtaken is None else tuple(overtaken())
-
-    def marks(self, index: int) -> tuple[UserMark, ...]:
-        """Return the users' marks up to the frame of this index, since the last call."""
-        marks = getattr(self._source, "marks", None)
-        return () if marks is None else tuple(marks(index))
-
-    def mark(self, text: str) -> bool:
-        """Pass a user's mark to the source. Return whether it takes marks."""
-        mark = getattr(self._source, "mark", None)
-        if mark is not None:
-            mark(text)
-        return mark is not None
-
     def stop(self) -> None:
         """End the iteration of the source."""
-        stop = getattr(self._source, "stop", None)
-        if stop is not None:
-            stop()
+        self._source.stop()
 
     def __iter__(self) -> Iterator[Frame]:
         earliest = 0.0

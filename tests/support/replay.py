@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from bevviz.model.frame import Frame, Scene
+from bevviz.model.frame import Frame, LateBoxes, Scene, UserMark
 
 if TYPE_CHECKING:
     from bevviz.cli.live import LiveOptions
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 class Replay:
     """Endless source that plays frames forward and backward at a steady rate, so that nothing jumps.
 
-    Stamps and times of receipt are shifted to the current time.
+    Stamps and times of receipt are shifted to the current time. It has no topics and takes no marks.
 
     Args:
         frames: frames in order of time.
@@ -30,6 +31,9 @@ class Replay:
         rate: frames a second.
         total: frames until it ends. None: it does not end.
     """
+
+    dropped = 0
+    states: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
         self, frames: Sequence[Frame], scene: Scene, *, rate: float = 10.0, total: int | None = None
@@ -40,6 +44,17 @@ class Replay:
         self._frames = [*frames, *frames[-2:0:-1]]
         self._period = 1 / rate
         self._stopped = threading.Event()
+
+    def overtaken(self) -> tuple[LateBoxes, ...]:
+        """Return no results that came too late."""
+        return ()
+
+    def marks(self, index: int) -> tuple[UserMark, ...]:
+        """Return no marks."""
+        return ()
+
+    def mark(self, text: str) -> None:
+        """Leave a mark out."""
 
     def stop(self) -> None:
         """End the iteration. Any thread may call it."""
