@@ -219,6 +219,14 @@ class GrowingDrive(Closable):
         """Return the results as shown that are in memory, by number."""
         return {result.frame.index: result for result in (*self._held.values(), *self._newest)}
 
+    def configured(self, settings: Settings) -> Config:
+        """Return the configuration that ``try_values`` puts in force.
+
+        Raises:
+            UserError: a parameter is unknown, or a value is wrong.
+        """
+        return changed_config(self.pipeline.config, settings) if settings else self.pipeline.config
+
     def _config_of(self, number: int, settings: Settings) -> Config:
         """Return the configuration of a frame as shown, or with other values.
 
@@ -398,12 +406,4 @@ class GrowingDrive(Closable):
 
         Raises:
             UserError: as ``look``, or the attempt was stopped.
-        """
-
-    @abstractmethod
-    def configured(self, settings: Settings) -> Config:
-        """Return the configuration that ``try_values`` puts in force.
-
-        Raises:
-            UserError: a parameter is unknown, or a value is wrong.
         """

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bevviz.bags.source import BagSource
-from bevviz.config import Config, changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.ground_truth import TruthLookup
@@ -265,8 +264,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """Return a small image of the camera near a frame as JPEG. None: there is none yet."""
         return self._thumbnails.near(number)
 
-    @contextmanager
-    def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
+    def reader(self, lane: str, first: int, state: PageState) -> AbstractContextManager[Reader]:
         """Return a context in which a page reads the recording, its overlay, or a run with other values.
 
         Raises:
@@ -276,9 +274,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         if buffer is None:
             raise UserError(f"there is no recording '{lane}'")
         if lane == "recording":
-            yield DriveReader(buffer, first, state, self)
-        else:
-            yield BufferReader(buffer, first, state, None if lane.startswith("overlay") else lambda _: None)
+            return nullcontext(DriveReader(buffer, first, state, self))
+        row_of = None if lane.startswith("overlay") else lambda _: None
+        return nullcontext(BufferReader(buffer, first, state, row_of))
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
@@ -323,11 +321,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         columns = [tracks.boxes.center]
         earlier = number - 1
         while (before := self.tracks(earlier)) and stamp - self._stamps[earlier] <= span:
-            rows = {track: row for row, track in enumerate(before.id.tolist())}
             places = np.full((len(tracks), 3), np.nan, np.float32)
-            for row, track in enumerate(tracks.id.tolist()):
-                if track in rows:
-                    places[row] = before.boxes.center[rows[track]]
+            _, rows, rows_before = np.intersect1d(tracks.id, before.id, return_indices=True)
+            places[rows] = before.boxes.center[rows_before]
             columns.insert(0, places)
             earlier -= 1
         return np.stack(columns, axis=1).astype(np.float32)
@@ -373,14 +369,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             UserError: there is no such frame, or it cannot be read.
         """
         return self.drive.raw(number)
-
-    def configured(self, settings: Settings) -> Config:
-        """Return the configuration with other values.
-
-        Raises:
-            UserError: a parameter is unknown, or a value is wrong.
-        """
-        return changed_config(self.drive.config, settings) if settings else self.drive.config
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
         """Return the questions about the robot's chain around a frame, see ``GrowingDrive``."""

@@ -9,8 +9,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,11 +119,9 @@ class RunningRobot(GrowingDrive):
             self.truth_of = _truth_in_frame
         self.news.tell()
 
-    @contextmanager
-    def reader(self, lane: str, first: int, state: PageState) -> Iterator[Reader]:
+    def reader(self, lane: str, first: int, state: PageState) -> AbstractContextManager[Reader]:
         """Return a context in which a page reads the newest pieces. Marks of answers are among them."""
-        with self.recording.shown(state) as page:
-            yield page
+        return self.recording.shown(state)
 
     # --- frames --------------------------------------------------------------------------------
 
