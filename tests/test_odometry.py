@@ -19,7 +19,7 @@ from bevviz.live.runtime import LiveSession
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.session import Session, SessionGroup
+from bevviz.pipeline.session import Session, Variants
 from bevviz.recording import entities
 from bevviz.stages.odometry import ESTIMATED, Odometry, place
 from bevviz.workbench.recorded_drive import RecordedDrive
@@ -137,9 +137,10 @@ def test_kiss_icp_replaces_a_pose_that_never_changes(street: list[Frame]) -> Non
 
 
 def test_variants_share_one_estimate(street: list[Frame]) -> None:
-    group = SessionGroup([load(), load(settings=["clustering.eps=0.6"])])
+    variants = Variants()
+    sessions = [variants.session(config) for config in (load(), load(settings=["clustering.eps=0.6"]))]
     for frame in map(without_pose, street[:4]):
-        a, b = group.perceive(frame)
+        a, b = (session.perceive(variants.frame(frame, session.config)) for session in sessions)
         np.testing.assert_array_equal(a.frame.pose, b.frame.pose)
     assert a.frame.pose[0, 3] > 1.5
 

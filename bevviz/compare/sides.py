@@ -20,7 +20,7 @@ from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
-from bevviz.pipeline.session import SessionGroup, check_same_frames
+from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.stages.robot_results import detections_of, in_points_frame
@@ -82,23 +82,23 @@ class Comparison:
 
     def __init__(self, configs: Sequence[Config], topic: str = "", truth: TruthLookup | None = None) -> None:
         check_same_frames(dict(zip("AB", configs, strict=False)))
-        self._sessions, self._topic, self._truth = SessionGroup(configs), topic, truth
+        self._topic, self._truth, self._variants = topic, truth, Variants()
+        self._sessions = [self._variants.session(config) for config in configs]
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> ComparedFrame:
         """Run the stages of the configurations on a frame."""
-        a, *others = self._sessions.perceive(frame, network)
-        truth = None if self._truth is None else self._truth(a.frame)
-        return ComparedFrame(a, others[0] if others else self._published(a), truth)
+        a, *others = (
+            session.perceive(self._variants.frame(frame, session.config), network)
+            for session in self._sessions
+        )
+        b = others[0] if others else published_result(a.frame, self._topic, a.config)
+        return ComparedFrame(a, b, None if self._truth is None else self._truth(a.frame))
 
     def finish(self, compared: ComparedFrame) -> ComparedFrame:
         """Finish the results of the configurations in frame order."""
-        if self._topic or compared.b is None:
-            return replace(compared, a=self._sessions.finish((compared.a,))[0])
-        a, b = self._sessions.finish((compared.a, compared.b))
-        return replace(compared, a=a, b=b)
-
-    def _published(self, a: FrameResult) -> FrameResult | None:
-        return published_result(a.frame, self._topic, a.config)
+        first, *others = self._sessions
+        a, b = first.finish(compared.a), compared.b
+        return replace(compared, a=a, b=others[0].finish(b) if others and b is not None else b)
 
 
 class ComparisonRecorder(Observer[ComparedFrame]):

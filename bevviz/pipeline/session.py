@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -197,25 +197,6 @@ class Variants:
         """
         stages = self._loader.load(config)
         return perceive(self.frame(frame, config), config, stages, self._memo, network=network)
-
-
-class SessionGroup:
-    """Several sessions on the same frames as one processor. A result is a tuple of theirs."""
-
-    def __init__(self, configs: Sequence[Config]) -> None:
-        self._variants = Variants()
-        self.sessions = [self._variants.session(config) for config in configs]
-
-    def perceive(self, frame: Frame, network: Executor | None = None) -> tuple[FrameResult, ...]:
-        """Run ``perceive`` of each session on the frame."""
-        return tuple(
-            session.perceive(self._variants.frame(frame, session.config), network)
-            for session in self.sessions
-        )
-
-    def finish(self, results: tuple[FrameResult, ...]) -> tuple[FrameResult, ...]:
-        """Run ``finish`` of each session on its result."""
-        return tuple(session.finish(result) for session, result in zip(self.sessions, results, strict=True))
 
 
 def check_same_frames(configs: Mapping[str, Config]) -> None:

@@ -200,17 +200,6 @@ class Experiment:
                 self._kept.popitem(last=False)
         return Outcome(name, result, self._truth)
 
-    def outcomes(
-        self, frame: Frame, configurations: Mapping[str, Config], network: Executor | None = None
-    ) -> Iterator[Outcome]:
-        """Yield the outcome of each configuration on a frame, one at a time to bound the memory.
-
-        Raises:
-            UserError: as ``outcome``.
-        """
-        for name, config in configurations.items():
-            yield self.outcome(frame, config, name, network)
-
     def table(
         self, frames: Iterable[Frame], configurations: Mapping[str, Config], *, reasons: bool = False
     ) -> pa.Table:
@@ -222,8 +211,8 @@ class Experiment:
         return table_of(
             row
             for frame in frames
-            for outcome in self.outcomes(frame, configurations)
-            for row in outcome.rows(reasons=reasons)
+            for name, config in configurations.items()
+            for row in self.outcome(frame, config, name).rows(reasons=reasons)
         )
 
 
