@@ -160,18 +160,17 @@ def demo(seeds: Sequence[int]) -> DataSet:
     )
 
 
-def kitti(data: Path, most: int, *, by_labels: bool) -> DataSet:
+def kitti(data: Path, *, by_labels: bool) -> DataSet:
     """Return KITTI's labelled frames. They are no drive: a frame's neighbours are other places.
 
     Args:
         data: folder with ``kitti``, ``kitti_more`` and ``models``.
-        most: most frames of each folder.
         by_labels: detect by the labels' image boxes, in place of YOLOX.
     """
     loader, frames = LabelDetections() if by_labels else StageLoader(), list[LabelledFrame]()
     for folder in ("kitti", "kitti_more"):
         with bevviz.open(data / folder) as drive:
-            for number in range(min(most, len(drive))):
+            for number in range(len(drive)):
                 frame = drive.frames.frame(number)
                 assert frame is not None and frame.truth is not None and frame.truth.image is not None
                 if isinstance(loader, LabelDetections):
@@ -222,18 +221,17 @@ def _classes(data: Path, loader: StageLoader) -> tuple[str, ...]:
     return loader.load(bevviz.config.load(settings=_yolox(data))).class_names
 
 
-def data_sets(data: Path, seeds: Sequence[int], most: int) -> dict[str, Callable[[], DataSet]]:
+def data_sets(data: Path, seeds: Sequence[int]) -> dict[str, Callable[[], DataSet]]:
     """Return what reads or simulates each data set, by name.
 
     Args:
         data: folder with the real frames.
         seeds: of the synthetic drives.
-        most: most frames of each folder of KITTI.
     """
     return {
         "drives": partial(drives, seeds),
         "demo": partial(demo, seeds[: max(1, len(seeds) // 2)]),
-        "kitti": partial(kitti, data, most, by_labels=False),
-        "kitti-labels": partial(kitti, data, most, by_labels=True),
+        "kitti": partial(kitti, data, by_labels=False),
+        "kitti-labels": partial(kitti, data, by_labels=True),
         "sus": partial(sus, data),
     }

@@ -17,6 +17,7 @@ from bevviz.model.results import ClusterState
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_log import Memo
 
+pytestmark = pytest.mark.long
 ASKED = ideal_data.ASKED[0]
 
 
