@@ -13,6 +13,7 @@ import bevviz
 from bevviz.anomalies import AnomalyDetector
 from bevviz.anomalies.calibration_drift import LEAST_PAST, find_error, score_rotations
 from bevviz.anomalies.sensor_faults import ImageWatch
+from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import AnomaliesConfig
 from bevviz.model.frame import Image
 from bevviz.model.results import Anomaly, FrameResult
@@ -97,6 +98,19 @@ def test_turned_sensor_is_told_by_name(
     row, anomaly = told[f"{sensor}: turned in its mounting"]
     assert row == FIRST + 1
     assert float(anomaly.text.partition("by ")[2].partition(" degrees")[0]) == pytest.approx(3, abs=0.3)
+
+
+def test_runs_that_share_a_watch_tell_the_same(drive: Results) -> None:
+    """A frozen image would begin at the second run of each frame if that were another frame."""
+    watch, hold = SensorWatch(), AnomaliesConfig(hold=0.0)
+    first, second = AnomalyDetector(watch), AnomalyDetector(watch)
+    told = []
+    for i, result in enumerate(drive):
+        planted = with_image(result, pixels(drive[FIRST]).copy()) if FIRST <= i < LAST else result
+        anomalies = [[one.text for one in side.update(planted, hold)] for side in (first, second)]
+        assert anomalies[0] == anomalies[1]
+        told.append(bool(anomalies[0]))
+    assert not any(told[: FIRST + 1]) and all(told[FIRST + 2 : LAST])
 
 
 def test_sensor_fault_ends_with_its_cause(drive: Results) -> None:
