@@ -24,15 +24,12 @@ import numpy as np
 import pyarrow as pa
 
 from bevviz.config import load
-from bevviz.evaluate.evaluation import Evaluation
-from bevviz.evaluate.ground_truth import Truth, truth_of
+from bevviz.findings.frame_findings import find_findings
 from bevviz.fleet.causes import NAMES, SCALES, Bound, Causes, Findings, compare_causes, find_causes
 from bevviz.fleet.findings import SCHEMA, FindingCollector
-from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
 from bevviz.pipeline.session import Session
 from bevviz.why import FrameExplainer
-from bevviz.why.false_objects import false_causes
 from tests.support import small_drives
 
 FRAMES = 8  # of a simulated drive
@@ -78,8 +75,7 @@ class SmallDrive:
         """Run the pipeline. ``planted`` names the fault of an object, or of a frame (object "")."""
         config, now = load(), list[Detections]()
         session = Session(config, lambda _: now[-1])
-        evaluation = Evaluation(_truth, false_causes)
-        collector, rows = FindingCollector(evaluation), list[Row]()
+        collector, rows = FindingCollector(), list[Row]()
         for snapshot in self.snapshots:
             index = snapshot.frame.index
             faults: dict[str, list[str]] = {}
@@ -99,14 +95,11 @@ class SmallDrive:
             if "late" in faults:
                 frame_ = replace(frame_, cameras=tuple(replace(c, sync_error=0.4) for c in frame_.cameras))
             result = session.add_anomalies(session.perceive(frame_))
-            evaluation.observe(result)
+            explainer = FrameExplainer(result)
             place = {"bag": self.bag, "recording": self.name, "frame": index, "stamp": frame_.stamp}
-            rows += [{**place, **finding} for finding in collector.of_frame(FrameExplainer(result))]
+            findings = collector.of_frame(explainer.traces, find_findings(explainer))
+            rows += [{**place, **finding} for finding in findings]
         return rows
-
-
-def _truth(frame: Frame) -> Truth | None:
-    return None if frame.truth is None else truth_of(frame, frame.truth)
 
 
 def drawn(rows: Sequence[Row], number: int, rng: np.random.Generator) -> list[Row]:

@@ -338,7 +338,8 @@ def labelled(*rows: tuple[str, float, float]) -> Truth:
     center = np.array([[x, y, 0.0] for _, x, y in rows]).reshape(-1, 3)
     there = Boxes3D(center, np.ones((len(rows), 3), np.float32), np.zeros(len(rows), np.float32))
     names = tuple(name for name, *_ in rows)
-    return Truth(there, names, tuple(ACCEPTED[name] for name in names), np.ones(len(rows), bool))
+    accepted = tuple(ACCEPTED.get(name, frozenset({name})) for name in names)
+    return Truth(there, names, accepted, np.ones(len(rows), bool))
 
 
 def named(*rows: tuple[str, float, float]) -> Objects:
@@ -350,6 +351,22 @@ def named(*rows: tuple[str, float, float]) -> Objects:
     return Objects(
         labelled(*(("Car", x, y) for _, x, y in rows)).boxes, names, score, numbers, ("",) * count, numbers
     )
+
+
+@pytest.mark.parametrize(
+    ("labels", "false"),
+    [
+        ((), {"car", "person", "truck"}),  # a frame in which nothing was there to label
+        (("Car",), {"car", "person", "truck"}),  # KITTI labels persons, too, in other frames
+        (("crate",), set()),  # nobody knows whether cars were labelled
+        (("crate", "car"), {"car"}),
+        (("pedestrian",), {"car", "person", "truck"}),  # nuScenes
+    ],
+)
+def test_an_object_is_false_where_such_objects_are_labelled(labels: tuple[str, ...], false: set[str]) -> None:
+    objects = named(("car", 5, 5), ("person", 7, 7), ("truck", 9, 9), ("bench", 11, 11))
+    matches = judge(objects, labelled(*((label, 30.0, 0.0) for label in labels)))
+    assert {objects.names[row] for row in np.flatnonzero(matches.false)} == false
 
 
 def test_false_boxes_count_for_each_class_they_may_be() -> None:

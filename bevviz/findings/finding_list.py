@@ -187,6 +187,8 @@ class FindingList:
     def replace(self, kinds: Sequence[str]) -> None:
         """Remove all findings of these kinds, before new ones are added."""
         with self._lock:
+            if "anomaly" in kinds:
+                self._anomalies.clear()
             for number in [number for number, group in self._groups.items() if group.what in kinds]:
                 del self._groups[number]
             for key in [key for key in self._recent if key[0] in kinds]:
