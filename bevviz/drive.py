@@ -255,11 +255,13 @@ class Drive(Closable, Tabular):
             ...     print(questioner.with_hints(answer).verdict.text)
         """
         from bevviz.why import FrameExplainer
+        from bevviz.why.neighbours import frames_beside
 
         result = self.at(frame=self._number(time, frame))
         if self._questioner is None or self._questioner.traces.result is not result:
             names = self.session.stages.class_names
-            self._questioner = FrameExplainer(result, self.session.loader, names)
+            beside = frames_beside(self.frames, result.frame.index)
+            self._questioner = FrameExplainer(result, self.session.loader, names, neighbours=beside)
         return self._questioner
 
     @errors_about_arguments()

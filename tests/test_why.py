@@ -25,10 +25,10 @@ from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection, why
 from bevviz.why.answer_results import AnswerResult
 from bevviz.why.answer_text import summary_line
-from bevviz.why.confidence import Outcome, features_of
-from bevviz.why.confidence_table import COEFFICIENTS, FEATURES
+from bevviz.why.collect import collect_evidence
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import projected_box
+from bevviz.why.verdict import likely_reasons
 from tests.support import bags, documented_json
 from tests.support.commands import error_of
 from tests.support.planted_faults import at, drive, planted, run
@@ -156,26 +156,20 @@ def test_two_people_are_explained_without_truth() -> None:
     assert any(not a.verdict.reported and a.verdict.reason["others"] for a in merged)
 
 
-def test_without_truth_an_unsure_answer_names_two_reasons() -> None:
-    """The table has a coefficient for each feature of a box, and the probabilities make the text."""
-    result = run("merged_people", "default")
-    blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
-    detections = result.cameras[0].detections
-    assert detections is not None
-    answer = blind.ask(Selection(box=tuple(detections.xyxy[0].tolist())))[0]
-    assert tuple(features_of(answer.subject, answer.evidence, blind.traces) or ()) == FEATURES
-    assert all(len(row) == 1 + len(FEATURES) for row in COEFFICIENTS.values())
-    assert answer.confidence is not None
-    assert sum(outcome.probability for outcome in answer.outcomes) == pytest.approx(1)
-    verdict = answer.verdict.kind, answer.verdict.reported
-    other = ReasonKind.SPLIT if verdict[0] is not ReasonKind.SPLIT else ReasonKind.MERGED
-    sure = replace(answer, outcomes=(Outcome(*verdict, 0.8), Outcome(other, True, 0.2)))
-    assert (sure.likely, sure.text) == ((), f"{answer.verdict.text} (80% sure)")
-    unsure = replace(answer, outcomes=(Outcome(*verdict, 0.6), Outcome(other, True, 0.4)))
-    assert unsure.likely == (verdict[0], other)
-    assert unsure.text.startswith(f"Cannot tell (60% sure): {verdict[0]} or {other}. ")
-    known = asked("merged_people", "default", "person")
-    assert all(answer.confidence is None for answer in known), "ground truth tells"
+def test_two_losses_without_truth_are_both_named() -> None:
+    """Ground and noise took about as much of it, and no ideal result can tell which one mattered."""
+    result = run("flat_car", "reference")
+    blind = replace(result, frame=replace(result.frame, truth=None))
+    explainer = FrameExplainer(blind, classes=CLASSES)
+    subject = next(a.subject for a in explainer.ask(Selection()) if a.subject.kind == "detection")
+    evidence = collect_evidence(subject, explainer.traces)
+    lost = replace(evidence, ground=np.zeros(30, np.float32), noise=25, main=-1, parts=())
+    reasons = likely_reasons(subject, lost, explainer.traces, ReasonKind.GROUND)
+    assert reasons == (ReasonKind.GROUND, ReasonKind.NOISE)
+    few = replace(lost, noise=5)
+    assert likely_reasons(subject, few, explainer.traces, ReasonKind.GROUND) == ()
+    known = FrameIndex(result)
+    assert likely_reasons(subject, lost, known, ReasonKind.GROUND) == (), "ground truth tells"
 
 
 def test_a_box_that_names_two_clusters_is_explained() -> None:

@@ -75,6 +75,7 @@ def _why(options: WhyOptions) -> int:
     from bevviz.pipeline.stage_loader import StageLoader
     from bevviz.why import FrameExplainer
     from bevviz.why.answer_text import plain_text
+    from bevviz.why.neighbours import frames_beside
 
     config, subject, at = load_config(options), options.subject, options.frame.at
     selection = subject.selection()
@@ -100,7 +101,8 @@ def _why(options: WhyOptions) -> int:
         result = session.run(frame) if outputs else session.run_explained(frame)
         checks.observe(result)
         warn(text for text in checks.warnings if text not in early)
-        questioner = FrameExplainer(result, loader, session.stages.class_names)
+        beside = frames_beside(source, frame.index)
+        questioner = FrameExplainer(result, loader, session.stages.class_names, neighbours=beside)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
         answers = questioner.explain(selection, subject.limit, bar, everything=subject.all)
         neighbours = _neighbours(questioner, selection, answers)

@@ -11,7 +11,7 @@ import numpy as np
 
 from bevviz.evaluate.ground_truth import MAX_DISTANCE, Truth
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D, Camera
 from bevviz.model.results import CameraResult, Objects
 
 DETECTION_OVERLAP = 0.5  # least IoU of a detection and its label in the image
@@ -223,7 +223,7 @@ class DetectionScore:
         detections, camera = result.detections, result.camera
         if detections is None or camera.intrinsics is None or camera.camera_from_points is None:
             return
-        boxes = _image_boxes(truth, result)
+        boxes = image_boxes_of(truth, camera)
         kept = np.flatnonzero(detections.kept)
         kept = kept[np.argsort(-detections.score[kept], kind="stable")]
         names = [detections.names[d].lower() for d in kept]
@@ -241,12 +241,11 @@ class DetectionScore:
             self._labels[truth.labels[row].lower()]["missed"] += 1
 
 
-def _image_boxes(truth: Truth, result: CameraResult) -> F32:
-    """Return (K, 4) image boxes of the labels.
+def image_boxes_of(truth: Truth, camera: Camera) -> F32:
+    """Return (K, 4) image boxes of the labels in a camera with a pose.
 
     They are labelled, or enclose the visible part of the projected 3D box. NaN if the box is not visible.
     """
-    camera = result.camera
     if truth.image is not None and truth.camera is not None and truth.camera.name == camera.name:
         return truth.image.xyxy
     assert camera.intrinsics is not None

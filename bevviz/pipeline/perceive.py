@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +46,30 @@ from bevviz.support.numba_kernel import common_clock, thread_clock
 LEAST_SCORE = 0.01  # of candidates that are decoded, so that configurations and runs can share them
 
 
+class StageEdits(Protocol):
+    """Changes of single stages' results, made before the next stage runs."""
+
+    def ground(self, voxels: Voxels, ground: Ground) -> Ground:
+        """Return the ground mask that the clustering sees."""
+
+    def clusters(self, obstacles: F32, clusters: Clusters) -> Clusters:
+        """Return the clusters that the fusion sees."""
+
+    def detections(self, camera: Camera, detections: Detections) -> Detections:
+        """Return the detections that the fusion sees."""
+
+    def objects(self, obstacles: F32, cameras: Sequence[CameraResult], objects: Objects) -> Objects:
+        """Return the objects that the frame reports."""
+
+
 def perceive(
-    frame: Frame, config: Config, stages: Stages, memo: Memo | None = None, *, network: Executor | None = None
+    frame: Frame,
+    config: Config,
+    stages: Stages,
+    memo: Memo | None = None,
+    *,
+    network: Executor | None = None,
+    edits: StageEdits | None = None,
 ) -> FrameResult:
     """Run the stages that need no other frame on one frame: everything but tracks and anomalies.
 
@@ -61,12 +83,14 @@ def perceive(
         memo: results shared by configurations that run on the same frame.
         network: executor of the detector. It runs beside the LiDAR stages, since it does not need Python's
             lock. None: it runs after them.
+        edits: changes of single stages' results. None: the stages are left as they are.
     """
     log, detector_log = StageLog(memo), StageLog(memo)
     start = common_clock()
 
     def detect(camera: Camera) -> Detections | None:
-        return _detect(detector_log, frame, camera, config, stages)
+        detections = _detect(detector_log, frame, camera, config, stages)
+        return detections if edits is None or detections is None else edits.detections(camera, detections)
 
     futures = [network.submit(detect, camera) for camera in frame.cameras] if network is not None else []
 
@@ -79,10 +103,14 @@ def perceive(
         voxels = log.run("voxel", voxel_grid, frame.points, config.voxel)
     if voxels is not None:
         ground = _ground(log, frame, voxels, config, stages)
+        if edits is not None and ground is not None:
+            ground = edits.ground(voxels, ground)
     if voxels is not None and ground is not None:
         obstacles = log.run("ground", _obstacles, voxels, ground)
     if obstacles is not None:
         clusters = _clusters(log, frame, obstacles, config, stages)
+        if edits is not None and clusters is not None:
+            clusters = edits.clusters(obstacles, clusters)
 
     cameras = []
     for i, camera in enumerate(frame.cameras):
@@ -115,6 +143,8 @@ def perceive(
     log.failures.extend(detector_log.failures)
 
     objects = _objects(log, frame, obstacles, clusters, cameras, config, stages)
+    if edits is not None and objects is not None and obstacles is not None:
+        objects = edits.objects(obstacles, cameras, objects)
     result_opinions = ranges = None
     if objects is not None and config.objects.method != "frustum" and _detects(config, stages):
         ranges = log.run("opinions", range_image, frame.points)

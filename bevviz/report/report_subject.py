@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
@@ -11,7 +11,6 @@ from bevviz.report.facts import AnswerText, Cause, TriedText
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.hints import Hint
 from bevviz.why.log import focus_point
-from bevviz.why.sentences import make_verdict
 from bevviz.why.side_effects import Effects
 
 LISTED = 5  # further objects of the frame that are listed
@@ -63,7 +62,6 @@ def cause_of(result: FrameResult, seconds: float, answer: Answer, tried: TriedVa
         answer: the answer, with hints.
         tried: values that the user tried.
     """
-    verdict = make_verdict(answer.subject, answer.verdict.reason, answer.verdict.reported)
     kind = "Reported" if answer.verdict.reported else "Missed"
     if answer.false:
         kind = "False" if result.frame.truth is not None else "Doubtful"
@@ -72,7 +70,7 @@ def cause_of(result: FrameResult, seconds: float, answer: Answer, tried: TriedVa
     return Cause(
         what=f"{kind}: {answer.subject.name}",
         where=f"{_place(result, answer)}in frame {result.frame.index} of the drive, at {seconds:.3f} s.",
-        why=replace(answer, verdict=verdict).text,
+        why=answer.verdict.cause,
         chain=[(step.stage, step.text) for step in answer.steps],
         tried=list(_tried(answer, tried)),
         remark="" if answer.hints or answer.tried or tried is not None else answer.remark,

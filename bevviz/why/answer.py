@@ -13,17 +13,19 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.collect import collect_evidence
-from bevviz.why.confidence import LIMIT, Outcome
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.hints import Hint, HintFinder, HintSearch, TriedChange
+from bevviz.why.ideal import StageSet
+from bevviz.why.neighbours import FrameLookup, NeighbourRuns
+from bevviz.why.reruns import FrameRuns
 from bevviz.why.resolve import object_subject, select_subjects, subjects_at_place
 from bevviz.why.selection import Selection
 from bevviz.why.sentences import make_verdict, untried_text
 from bevviz.why.steps import Step, steps_of
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import FALSE, HOPELESS, Verdict, find_reason
+from bevviz.why.verdict import FALSE, HOPELESS, Verdict, find_reason, likely_reasons, stage_of
 
 KERB = 0.3  # metres above the ground's level up to which ground at a place is nothing else
 NAMED = 3  # tried changes of the same result that a sentence names
@@ -45,7 +47,7 @@ class Answer:
         tried: changes that were run and did not help.
         remark: one sentence about the search for hints: the best one, or what was tried, or why nothing could
             be. Empty: none was searched, or there is nothing to mend.
-        outcomes: possible outcomes, the most probable first. Empty: ground truth tells, or they are unknown.
+        likely: two reasons that each lost much of it where nothing tells which one mattered; else empty.
         near: whether the pipeline had to report it, see ``FrameIndex.must``.
     """
 
@@ -59,33 +61,18 @@ class Answer:
     evidence: Evidence = field(repr=False)
     tried: tuple[TriedChange, ...] = ()
     remark: str = ""
-    outcomes: tuple[Outcome, ...] = ()
+    likely: tuple[ReasonKind, ...] = ()
     near: bool = False
 
     @property
-    def confidence(self) -> float | None:
-        """Probability that the verdict is right, where ground truth does not tell; None: unknown."""
-        if not self.outcomes:
-            return None
-        verdict = self.verdict.kind, self.verdict.reported
-        return next((outcome.probability for outcome in self.outcomes if outcome[:2] == verdict), 0.0)
-
-    @property
-    def likely(self) -> tuple[ReasonKind, ...]:
-        """The two most likely reasons where it cannot tell the reason; else empty."""
-        if self.confidence is None or self.confidence >= LIMIT:
-            return ()
-        return tuple(dict.fromkeys(outcome.kind for outcome in self.outcomes))[:2]
+    def restored_by(self) -> tuple[StageSet, ...]:
+        """Smallest sets of stages whose ideal results bring it back, see ``Verdict``."""
+        return self.verdict.restored_by
 
     @property
     def text(self) -> str:
-        """The sentence, with its confidence where ground truth does not tell the reason."""
-        if self.confidence is None:
-            return self.verdict.text
-        if self.likely:
-            reasons = " or ".join(kind.value for kind in self.likely)
-            return f"Cannot tell ({self.confidence:.0%} sure): {reasons}. {self.verdict.text}"
-        return f"{self.verdict.text} ({self.confidence:.0%} sure)"
+        """The sentence."""
+        return self.verdict.text
 
     @property
     def center(self) -> tuple[float, float, float] | None:
@@ -159,6 +146,7 @@ class FrameExplainer:
         loader: stage loader with the networks already loaded, for ``hints``.
         classes: names of the classes that the detector knows.
         truth: ground truth of the frame; None: its own.
+        neighbours: returns the frames before and after, on which hints are tried, too.
     """
 
     def __init__(
@@ -167,9 +155,14 @@ class FrameExplainer:
         loader: StageLoader | None = None,
         classes: Sequence[str] = (),
         truth: Truth | None = None,
+        neighbours: FrameLookup = tuple,
     ) -> None:
         self.traces = FrameIndex(result, classes, truth)
-        self._hint_finder = HintFinder(self.traces, loader)
+        loader = loader or StageLoader()
+        self._runs = FrameRuns(self.traces, loader)
+        self._hint_finder = HintFinder(
+            self.traces, self._runs, NeighbourRuns(neighbours, result.config, loader)
+        )
         self._answers: dict[tuple[object, ...], Answer] = {}
 
     def ask(self, selection: Selection) -> list[Answer]:
@@ -247,7 +240,9 @@ class FrameExplainer:
     def search(self, answer: Answer) -> HintSearch:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
-        return self._hint_finder.search(answer.subject, answer.evidence, verdict.reason, verdict.reported)
+        return self._hint_finder.search(
+            answer.subject, answer.evidence, verdict.reason, verdict.reported, verdict.restored_by
+        )
 
     def with_hints(self, answer: Answer) -> Answer:
         """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
@@ -261,22 +256,25 @@ class FrameExplainer:
             clause = f"change {', '.join(hint.settings)}: {hint.text}{also}"
         else:
             clause = answer.tried_text()
-        text = verdict.text if answer.folded or not clause else f"{verdict.text.removesuffix('.')}; {clause}."
+        advice = "" if answer.folded else clause
         brief = clause if search.hints else answer.tried_text(named=1)
         remark = brief or untried_text(answer.subject, verdict)
         remark = f"{remark[:1].upper()}{remark[1:]}." if remark else ""
-        return replace(answer, verdict=replace(verdict, text=text), remark=remark)
+        return replace(answer, verdict=replace(verdict, advice=advice), remark=remark)
 
     def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
         evidence = collect_evidence(subject, self.traces)
-        reason, reported, outcomes = find_reason(subject, evidence, self.traces)
-        verdict = make_verdict(subject, reason, reported)
+        restored_by = self._runs.restored_by(subject.row) if subject.kind == "truth" else ()
+        reason, reported = find_reason(subject, evidence, self.traces, restored_by)
+        likely = () if reported else likely_reasons(subject, evidence, self.traces, reason.kind)
+        blamed = stage_of(reason.kind, evidence)
+        verdict = make_verdict(subject, reason, reported, restored_by, blamed, likely)
         steps = tuple(steps_of(subject, evidence, self.traces))
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
-        answer = replace(answer, outcomes=outcomes, near=self.traces.must(subject))
+        answer = replace(answer, likely=likely, near=self.traces.must(subject))
         if subject.asked is None and not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer

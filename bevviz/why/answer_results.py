@@ -42,6 +42,8 @@ class HintResult:
     """lost objects that were false"""
     changed: int
     """number of other changes"""
+    beside: int | None
+    """objects that it fixes in the frames before and after, minus those that it breaks; null: unknown"""
 
     @classmethod
     def of(cls, hint: Hint) -> HintResult:
@@ -56,6 +58,7 @@ class HintResult:
             lost=effects.lost,
             right=effects.right,
             changed=effects.changed,
+            beside=hint.beside,
         )
 
 
@@ -85,10 +88,11 @@ class AnswerResult:
     reason: str
     """one of the reasons in docs/reference.md"""
     verdict: str
-    confidence: float | None
-    """0 to 1, that the reason is right; null: ground truth tells it, or it is unknown"""
+    restored_by: Sequence[Sequence[str]]
+    """smallest sets of stages (ground, clustering, detector, fusion) whose ideal results, together, bring a
+    missed object of the ground truth back; empty: none does, or there is no ground truth"""
     likely: Sequence[str]
-    """the two likely reasons where it cannot tell the reason"""
+    """two reasons that each lost much of it, where nothing tells which one mattered"""
     folded: bool
     """no parameter can help"""
     false: bool
@@ -106,7 +110,7 @@ class AnswerResult:
     @classmethod
     def of(cls, answer: Answer) -> AnswerResult:
         """Return an answer in plain values, without the points."""
-        subject, verdict, confidence = answer.subject, answer.verdict, answer.confidence
+        subject, verdict = answer.subject, answer.verdict
         box, chain = subject.box, list[Any]()
         for step in answer.steps:
             chain.append({"stage": step.stage, "text": step.text, **step.numbers})
@@ -123,7 +127,7 @@ class AnswerResult:
             reported=verdict.reported,
             reason=verdict.kind.value,
             verdict=answer.text,
-            confidence=None if confidence is None else round(confidence, 3),
+            restored_by=verdict.restored_by,
             likely=[kind.value for kind in answer.likely],
             folded=answer.folded,
             false=answer.false,

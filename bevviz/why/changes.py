@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from bevviz.config import Config, plugin_of, preset_differences
+from bevviz.config import Config, parameters, plugin_of, preset_differences, values
 from bevviz.errors import UserError
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
@@ -18,6 +18,33 @@ from bevviz.why.frame_index import FrameIndex
 from bevviz.why.subject import NOISE
 
 Change = Mapping[str, Any]  # dotted key -> value
+
+STEPS = (0.5, 2.0)  # factors of a number
+FAR_STEPS = (0.25, 4.0)
+_GRID: Mapping[str, tuple[str, ...]] = {  # numbers of each stage that are stepped, the most telling first
+    "ground": ("ground.distance_threshold", "ground.max_step"),
+    "clustering": (
+        "clustering.min_points",
+        "clustering.eps",
+        "clustering.min_cluster_points",
+        "clustering.max_cluster_points",
+        "voxel.size",
+    ),
+    "detector": ("detector.conf_threshold", "detector.iou_threshold"),
+    "fusion": (
+        "fusion.min_iou",
+        "fusion.min_points",
+        "fusion.min_rating",
+        "fusion.max_gap",
+        "fusion.max_depth",
+        "fusion.match_radius",
+    ),
+}
+_SECTIONS = {"voxel", "ground", "clustering", "detector", "fusion"}
+_METHODS: Mapping[str, tuple[Change, ...]] = {  # other methods of each stage
+    "ground": ({"ground.method": "polar", "ground.distance_threshold": 0.2}, {"ground.method": "plane"}),
+    "fusion": ({"fusion.method": "frustum"}, {"fusion.split": True}, {"fusion.split": False}),
+}
 
 # Parameters that bevviz applies to the output of user functions, too.
 _SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
@@ -62,6 +89,54 @@ _OTHER_OWNER = {  # another subject has the detection or the cluster
     ReasonKind.OTHER_CLUSTER,
     ReasonKind.MISNAMED,
 }
+
+
+def with_changes(config: Config, change: Change) -> Config:
+    """Return the configuration with other values."""
+    tree = config.model_dump()
+    for key, value in change.items():
+        *path, name = key.split(".")
+        section = tree
+        for part in path:
+            section = section[part]
+        section[name] = value
+    return config.restated(tree)
+
+
+def restored_values(config: Config) -> Iterator[Change]:
+    """Yield the preset's values of all parameters that have another value, together."""
+    restored = {
+        key: value for key, value in preset_differences(config).items() if key.partition(".")[0] in _SECTIONS
+    }
+    if restored:
+        yield restored
+
+
+def stage_changes(stage: str, config: Config) -> Iterator[Change]:
+    """Yield changes of one of our stages: the preset's values, other methods, and steps of its numbers."""
+    present, differing = values(config), preset_differences(config)
+    prefixes = ("clustering.", "voxel.") if stage == "clustering" else (f"{stage}.",)
+    restored = {key: value for key, value in differing.items() if key.startswith(prefixes)}
+    if restored:
+        yield restored
+    yield from ({key: value} for key, value in restored.items() if len(restored) > 1)
+    for change in _METHODS.get(stage, ()):
+        if any(present[key] != value for key, value in change.items()):
+            yield change
+    yield from stepped_numbers(stage, config, STEPS)
+
+
+def stepped_numbers(stage: str, config: Config, factors: Sequence[float]) -> Iterator[Change]:
+    """Yield the numbers of a stage times some factors, within their bounds."""
+    present = values(config)
+    keys = [key for key in _GRID[stage] if present[key] is not None]
+    for factor in factors:
+        for key in keys:
+            value, declared = present[key] * factor, parameters()[key]
+            value = max(1, round(value)) if isinstance(present[key], int) else float(f"{value:.3g}")
+            high = math.inf if declared.high is None else declared.high
+            if value != present[key] and (declared.low or 0) <= value <= high:
+                yield {key: value}
 
 
 def changes_for(

@@ -21,11 +21,10 @@ from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.reasons import STAGES, Reason
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.session import Variants
-from bevviz.why.collect import collect_evidence
+from bevviz.why.answer import FrameExplainer
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.selection import Selection
-from bevviz.why.verdict import find_reason
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -88,10 +87,10 @@ class Outcome:
         """The objects matched with the ground truth. None: it is unknown."""
         return None if self.truth is None else judge(self.objects, self.truth)
 
-    @cached_property
+    @property
     def traces(self) -> FrameIndex:
         """Index of the result."""
-        return FrameIndex(self.result, truth=self.truth)
+        return self._explainer.traces
 
     def rows(self, *, reasons: bool = False) -> Iterator[ObjectRow]:
         """Yield a row for each object that had to be found, and for each false one.
@@ -152,9 +151,11 @@ class Outcome:
 
     def _reason(self, row: int) -> Reason:
         """Return why an object of the ground truth is missed."""
-        subject = self.traces.truth[row]
-        reason, _, _ = find_reason(subject, collect_evidence(subject, self.traces), self.traces)
-        return reason
+        return self._explainer.about(Selection(truth=row)).verdict.reason
+
+    @cached_property
+    def _explainer(self) -> FrameExplainer:
+        return FrameExplainer(self.result, truth=self.truth)
 
 
 class Experiment:

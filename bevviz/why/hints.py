@@ -2,59 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from bevviz.config import Config
-from bevviz.errors import UserError
 from bevviz.evaluate import MAX_DISTANCE
-from bevviz.model.frame import Camera
 from bevviz.model.reasons import Reason, ReasonKind
-from bevviz.model.results import Detections, DetectionState
-from bevviz.pipeline.perceive import perceive
-from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
-from bevviz.pipeline.stage_log import Memo
-from bevviz.why.changes import Change, changes_for
+from bevviz.why.changes import FAR_STEPS, Change, changes_for, restored_values, stage_changes, stepped_numbers
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
+from bevviz.why.ideal import STAGES, StageSet
+from bevviz.why.neighbours import NeighbourRuns
+from bevviz.why.reruns import FrameRuns
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import FALSE, FLAWED, find_reason
+from bevviz.why.verdict import FALSE, FLAWED, HOPELESS, find_reason, stage_of
 
-TRIES = 10  # configurations to run for one subject
+TRIES = 10  # changes for the reason
+LATER = 12  # changes that are tried after one that helps the frame in question alone
+HELPFUL = 3  # changes of each stage that are combined with those of others
 OFFERED = 3  # hints of one answer
-FURTHER = 10  # more configurations, combined with the best changes so far
-RESULTS = 20  # results of other configurations in the cache, for other subjects of the frame
-
-_ORDER = {kind: place for place, kind in enumerate(ReasonKind)}  # in the order of the stages
+MISSED = "it stays missed"
 
 
 @dataclass(frozen=True, slots=True)
-class _ReachedStage:
-    """The stage that a subject reached. A later stage is greater."""
+class _Question:
+    """A subject, and the reason why it was lost or is false."""
 
-    reported: bool
-    kind: ReasonKind
-
-    def __gt__(self, other: _ReachedStage) -> bool:
-        return (self.reported, _ORDER[self.kind]) > (other.reported, _ORDER[other.kind])
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """The mildest change that brings a subject to a stage, and the result there."""
-
-    change: Change
-    reason: Reason
+    subject: Subject
     evidence: Evidence
-    traces: FrameIndex
+    reason: Reason
+    reported: bool
+
+    @property
+    def is_false(self) -> bool:
+        """Whether it is a false object."""
+        return self.reason.kind in FALSE and self.subject.kind == "object"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,16 +54,25 @@ class Hint:
         text: the result for the subject.
         effects: other objects of the frame that change.
         balance: number of objects that it fixes, the subject included, minus those that it breaks.
+        beside: the same for the frames before and after, None: they are not known.
     """
 
     settings: tuple[str, ...]
     text: str
     effects: Effects
     balance: int = 1
+    beside: int | None = None
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it fixes more than it breaks, and breaks no more in the frames before and after."""
+        return self.balance > 0 and (self.beside or 0) >= 0
 
     @property
     def objection(self) -> str:
         """The result, and what speaks against it."""
+        if self.balance > 0:
+            return f"{self.text}, but it breaks more than it fixes in the frames before and after"
         return f"{self.text}, but it breaks as much as it fixes: it {self.effects.text}"
 
 
@@ -103,65 +100,56 @@ class HintSearch:
 
 
 class HintFinder:
-    """Finder of changes that help. It runs one frame with other configurations, each once.
+    """Finder of changes that help.
 
     Args:
         traces: index of the frame's result.
-        loader: stage loader with the networks already loaded.
+        runs: runs of the frame with other parameters.
+        neighbours: runs of the frames before and after.
     """
 
-    def __init__(self, traces: FrameIndex, loader: StageLoader | None = None) -> None:
-        self._traces, self._result = traces, traces.result
-        self._loader, self._memo = loader or StageLoader(), Memo()
-        self._runs: dict[tuple[tuple[str, Any], ...], FrameIndex | None] = {}
+    def __init__(self, traces: FrameIndex, runs: FrameRuns, neighbours: NeighbourRuns) -> None:
+        self._traces, self._runs, self._neighbours = traces, runs, neighbours
 
-    def search(self, subject: Subject, evidence: Evidence, reason: Reason, reported: bool) -> HintSearch:
+    def search(
+        self,
+        subject: Subject,
+        evidence: Evidence,
+        reason: Reason,
+        reported: bool,
+        restored_by: Sequence[StageSet] = (),
+    ) -> HintSearch:
         """Search the mildest change that changes the verdict and makes no other object worse.
 
         If each helpful change makes another object worse, return those that fix more objects than they break,
-        the best first. The others count as tried in vain. If none helps, combine the changes that bring the
-        subject to a later stage with the changes for the reason there. If these do not help either, a missed
-        object that is found with a fault is better than none.
+        the best first. The others count as tried in vain. If none does, a missed object that is found with a
+        fault is better than none.
         """
-        is_false = reason.kind in FALSE and subject.kind == "object"
+        question = _Question(subject, evidence, reason, reported)
+        is_false = question.is_false
         hints: list[Hint] = []
-        start = _ReachedStage(reported, reason.kind)
-        reached: dict[_ReachedStage, _Step] = {}  # by the mildest change
         tried: list[TriedChange] = []
         faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
-
-        def ways() -> Iterator[Change]:
-            """Yield the changes to try."""
-            changes = changes_for(evidence, reason, self._traces, is_false=is_false)
-            yield from islice(changes, TRIES)
-            if not hints:
-                yield from islice(_combined_changes(reached), FURTHER)
-
-        for change in ways():
-            after = self._run(change)
+        left = 0  # changes that are still tried after one that helps this frame alone
+        for change in self._changes(question, restored_by):
+            after = self._runs.with_change(change)
             if after is None:
                 continue
             if is_false:
                 self._try_on_false(subject, change, after, hints, tried)
-                if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
-                    break
+            elif self._stays_missed(question, after):
+                tried.append(TriedChange(_settings(change), MISSED))
                 continue
-            then = collect_evidence(subject, after)
-            new, now_reported, _ = find_reason(subject, then, after)
-            old_kind, new_kind = (reason.kind, reported), (new.kind, now_reported)
-            text, object_row = _new_outcome(subject, old_kind, new_kind, then, after)
-            if text and _is_sure(subject, change, then):
-                row = subject.row if subject.kind == "truth" else -1
-                hints.append(self._hint(change, text, after, row, object_row))
-                if not hints[-1].effects.harm and hints[-1].balance > 0:
+            else:
+                self._try_on_missed(question, change, after, hints, tried, faulty)
+            if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
+                hints[-1] = replace(hints[-1], beside=self._neighbours.balance(change))
+                if hints[-1].beside is None or hints[-1].beside > 0:
                     break
-                continue
-            result = _result_text(subject, reason, new, now_reported, then)
-            tried.append(TriedChange(_settings(change), result))
-            if now_reported and not reported and subject.kind == "truth" and then.named is not None:
-                faulty[tried[-1]] = self._hint(change, result, after, subject.row, then.named.row)
-            if not text and (stage := _ReachedStage(now_reported, new.kind)) > start:
-                reached.setdefault(stage, _Step(change, new, then, after))
+                left = left or LATER
+            left -= left > 0
+            if left == 1:
+                break
         if not any(hint.balance > 0 for hint in hints):
             hints += [hint for hint in faulty.values() if hint.balance > 0][:1]
             tried = [
@@ -169,9 +157,98 @@ class HintFinder:
                 for change in tried
                 if faulty.get(change) not in hints
             ]
-        best = sorted(hints, key=lambda hint: -hint.balance)
-        tried += [TriedChange(hint.settings, hint.objection) for hint in best if hint.balance <= 0]
-        return HintSearch(tuple(hint for hint in best if hint.balance > 0)[:OFFERED], tuple(tried))
+        best = sorted(hints, key=lambda hint: (-(hint.beside or 0), -hint.balance))
+        tried += [TriedChange(hint.settings, hint.objection) for hint in best if not hint.is_good]
+        return HintSearch(tuple(hint for hint in best if hint.is_good)[:OFFERED], tuple(tried))
+
+    def _changes(self, question: _Question, restored_by: Sequence[StageSet]) -> Iterator[Change]:
+        """Yield the changes to try, each once: those for the reason, for the stages, then combined ones."""
+        traces, evidence, reason = self._traces, question.evidence, question.reason
+        blamed = stage_of(reason.kind, evidence)
+        stages = tuple(dict.fromkeys(stage for stages in restored_by for stage in stages))
+        alone = tuple(stage for (stage,) in (one for one in restored_by if len(one) == 1))
+        tried: set[tuple[tuple[str, Any], ...]] = set()
+
+        def new(changes: Iterable[Change]) -> Iterator[Change]:
+            for change in changes:
+                key = tuple(sorted(change.items()))
+                if key not in tried:
+                    tried.add(key)
+                    yield change
+
+        steered = changes_for(evidence, reason, traces, is_false=question.is_false)
+        yield from new(islice(steered, TRIES))
+        if question.is_false or not self._is_ours():
+            return
+        nearest = alone or stages or tuple(stage for stage in STAGES if stage == blamed)
+        if reason.kind in HOPELESS or not nearest:
+            return
+        yield from new(restored_values(traces.result.config))
+        config = traces.result.config
+        for stage in nearest:
+            yield from new(stage_changes(stage, config))
+        for needed in restored_by:
+            if len(needed) > 1:
+                yield from new(self._combined(question.subject.row, needed))
+        others = [stage for stage in STAGES if stage not in nearest]
+        yield from new(change for stage in others for change in stage_changes(stage, config))
+        yield from new(change for stage in nearest for change in stepped_numbers(stage, config, FAR_STEPS))
+
+    def _combined(self, row: int, needed: StageSet) -> Iterator[Change]:
+        """Yield combined changes of several stages.
+
+        Each one alone brings the object back if the other stages have their ideal results.
+        """
+        helpful: list[list[Change]] = []
+        for stage in needed:
+            others = tuple(other for other in needed if other != stage)
+            changes = (
+                change
+                for change in stage_changes(stage, self._traces.result.config)
+                if self._runs.is_found(row, change, others)
+            )
+            helpful.append([*islice(changes, HELPFUL)])
+        for changes_of_stages in product(*helpful):
+            combined: dict[str, Any] = {}
+            for change in changes_of_stages:
+                combined |= change
+            yield combined
+
+    def _is_ours(self) -> bool:
+        """Return whether the objects come from our fusion."""
+        return self._traces.origin("objects").ours
+
+    def _stays_missed(self, question: _Question, after: FrameIndex) -> bool:
+        """Return whether a missed object of the ground truth is missed in another result, too."""
+        subject, matches = question.subject, after.matches
+        if subject.kind != "truth" or question.reported or matches is None:
+            return False
+        return not bool((matches.partner == subject.row).any()) and len(self._runs) > TRIES
+
+    def _try_on_missed(
+        self,
+        question: _Question,
+        change: Change,
+        after: FrameIndex,
+        hints: list[Hint],
+        tried: list[TriedChange],
+        faulty: dict[TriedChange, Hint],
+    ) -> None:
+        """Add the result of a change on a missed object, or on one with a fault, to the hints or the rest."""
+        subject, reason, reported = question.subject, question.reason, question.reported
+        then = collect_evidence(subject, after)
+        new, now_reported = find_reason(subject, then, after)
+        text, object_row = _new_outcome(
+            subject, (reason.kind, reported), (new.kind, now_reported), then, after
+        )
+        if text and _is_sure(subject, change, then):
+            row = subject.row if subject.kind == "truth" else -1
+            hints.append(self._hint(change, text, after, row, object_row))
+            return
+        result = _result_text(subject, reason, new, now_reported, then)
+        tried.append(TriedChange(_settings(change), result))
+        if now_reported and not reported and subject.kind == "truth" and then.named is not None:
+            faulty[tried[-1]] = self._hint(change, result, after, subject.row, then.named.row)
 
     def _hint(self, change: Change, text: str, after: FrameIndex, asked: int = -1, own: int = -1) -> Hint:
         """Return a hint with its effects on all objects of the frame, as ``evaluate`` counts them."""
@@ -202,57 +279,6 @@ class HintFinder:
                 tried.append(TriedChange(_settings(change), "it stays false"))
                 return
         hints.append(self._hint(change, text, after))
-
-    def _run(self, change: Change) -> FrameIndex | None:
-        """Run the frame with a change, once. None: the configuration cannot be run."""
-        key = tuple(change.items())
-        if key not in self._runs:
-            try:
-                config = with_changes(self._result.config, change)
-                stages = self._loader.load(config, self._known_detections(config, change))
-            except (UserError, ValidationError):  # the model file has gone, or the value is out of bounds
-                self._runs[key] = None
-            else:
-                result = perceive(self._result.frame, config, stages, self._memo)
-                self._runs[key] = self._traces.for_result(result)
-            while len(self._runs) > RESULTS:
-                del self._runs[next(iter(self._runs))]
-        return self._runs[key]
-
-    def _known_detections(self, config: Config, change: Change) -> DetectFunction | None:
-        """Return a detector that applies another threshold to the known detections. None: run the network.
-
-        The candidates kept for explanations do not tell the result of another NMS, nor that of other
-        parameters of a user's detector. Detections of the robot never change.
-        """
-        touched = {key for key in change if key.startswith("detector.")} - {"detector.conf_threshold"}
-        if touched or self._traces.origin("detector").topic:
-            return None
-        known = {c.camera.name: c.detections for c in self._result.cameras}
-
-        def detect(camera: Camera) -> Detections | None:
-            """Return the detections of a camera with the states of the new threshold."""
-            detections = known[camera.name]
-            if detections is None:
-                return None
-            kept = detections.score >= config.detector.conf_threshold
-            state = np.where(kept, DetectionState.KEPT, DetectionState.BELOW_THRESHOLD).astype(np.int32)
-            state[detections.state == DetectionState.SUPPRESSED] = DetectionState.SUPPRESSED
-            return replace(detections, state=state)
-
-        return detect
-
-
-def with_changes(config: Config, change: Change) -> Config:
-    """Return the configuration with other values."""
-    tree = config.model_dump()
-    for key, value in change.items():
-        *path, name = key.split(".")
-        section = tree
-        for part in path:
-            section = section[part]
-        section[name] = value
-    return config.restated(tree)
 
 
 def _new_outcome(
@@ -302,17 +328,6 @@ def _result_text(subject: Subject, before: Reason, after: Reason, reported: bool
 def _settings(change: Change) -> tuple[str, ...]:
     """Return a change as settings ``key=value``."""
     return tuple(f"{key}={_setting_text(value)}" for key, value in change.items())
-
-
-def _combined_changes(reached: Mapping[_ReachedStage, _Step]) -> Iterator[Change]:
-    """Yield combined changes, from the latest stage back. ``reached`` may grow meanwhile."""
-    done: set[_ReachedStage] = set()
-    while left := reached.keys() - done:
-        stage = max(left)
-        done.add(stage)
-        step = reached[stage]
-        for more in changes_for(step.evidence, step.reason, step.traces):
-            yield {**step.change, **more}
 
 
 def _setting_text(value: Any) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.why.ideal import StageSet
 from bevviz.why.subject import Subject, count
 from bevviz.why.verdict import Verdict
 
@@ -15,8 +16,24 @@ WITHIN = f"evaluate allows {MAX_DISTANCE:g} m"
 _ONLY = ("nothing", "only ground", "mostly ground")  # at a place without an object
 
 
-def make_verdict(subject: Subject, reason: Reason, reported: bool) -> Verdict:
-    """Return the verdict with its reason in one sentence."""
+def make_verdict(
+    subject: Subject,
+    reason: Reason,
+    reported: bool,
+    restored_by: tuple[StageSet, ...] = (),
+    blamed: str = "",
+    likely: Sequence[ReasonKind] = (),
+) -> Verdict:
+    """Return the verdict with its reason in one sentence.
+
+    Args:
+        subject: the object or place in question.
+        reason: the stage or rule that decided.
+        reported: whether it is an object of a right class.
+        restored_by: sets of stages whose ideal results bring it back.
+        blamed: stage that the reason blames; empty: none.
+        likely: two reasons between which nothing decides; empty: the reason is plain.
+    """
     is_false = subject.kind == "object" and reason.kind in FALSE_SENTENCES
     because = (FALSE_SENTENCES if is_false else SENTENCES)[reason.kind](reason, subject)
     head = subject.name[0].upper() + subject.name[1:]
@@ -25,10 +42,36 @@ def make_verdict(subject: Subject, reason: Reason, reported: bool) -> Verdict:
     elif because.startswith(_ONLY):
         content, _, rest = because.partition(": ")
         text = f"There is {content} {subject.name.removeprefix('what is ')}: {rest}."
+    elif likely:
+        text = f"{head} was not reported; {' and '.join(likely)} each lost much of it: {because}."
     else:
         joint = "was reported, but" if reported else "was not reported because"
-        text = f"{head} {joint} {because}."
-    return Verdict(reason, reported, text)
+        text = f"{head} {joint} {because}{_restored_text(restored_by, blamed)}."
+    return Verdict(reason, reported, text, restored_by)
+
+
+_IDEAL = {  # ideal result of each stage
+    "ground": "the right ground",
+    "clustering": "a cluster of its own",
+    "detector": "a right detection",
+    "fusion": "the right match",
+}
+
+
+def _restored_text(sets: Sequence[StageSet], blamed: str) -> str:
+    """Return a clause with the ideal results that bring an object back.
+
+    It is empty if only that of the blamed stage does, or if none is known.
+    """
+    if not sets or sets == ((blamed,),):
+        return ""
+    ideals = [" and ".join(_IDEAL[stage] for stage in stages) for stages in sets]
+    if len(sets[0]) > 1:
+        return f"; only {' together, or '.join(ideals)} together bring it back"
+    if (blamed,) in sets:
+        others = " or ".join(_IDEAL[stage] for (stage,) in sets if stage != blamed)
+        return f"; {others} alone brings it back, too"
+    return f"; {' or '.join(ideals)} alone brings it back"
 
 
 def _by(reason: Reason) -> str:

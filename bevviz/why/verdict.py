@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
-from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.model.reasons import STAGES, Reason, ReasonKind
 from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
-from bevviz.why.confidence import Outcome, rank_outcomes
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
+from bevviz.why.ideal import StageSet
 from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
 from bevviz.why.subject import Subject
 from bevviz.why.subject_matches import find_fused
 
+LikelyReasons = tuple[()] | tuple[ReasonKind, ReasonKind]
+
+NEARLY = 0.6  # share of the main loss from which a second one may matter as well
 WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 
 FALSE = {  # causes of false objects
@@ -44,12 +48,25 @@ _REFUSED = {
 class Verdict:
     """Reason and sentence about a subject.
 
-    ``reported`` means that it became an object of a right class, even if the object has other faults.
+    Attributes:
+        reason: the stage or rule that decided, with its values.
+        reported: whether it became an object of a right class, even if the object has other faults.
+        cause: the sentence about the reason.
+        restored_by: smallest sets of stages whose ideal results bring a missed object back; empty: none does,
+            or no ground truth tells what is ideal.
+        advice: clause with the best change, or with what was tried in vain; empty: nothing was searched.
     """
 
     reason: Reason
     reported: bool
-    text: str
+    cause: str
+    restored_by: tuple[StageSet, ...] = ()
+    advice: str = ""
+
+    @property
+    def text(self) -> str:
+        """The cause and the advice in one sentence."""
+        return f"{self.cause.removesuffix('.')}; {self.advice}." if self.advice else self.cause
 
     @property
     def kind(self) -> ReasonKind:
@@ -58,25 +75,57 @@ class Verdict:
 
 
 def find_reason(
-    subject: Subject, evidence: Evidence, traces: FrameIndex
-) -> tuple[Reason, bool, tuple[Outcome, ...]]:
-    """Find the first stage that lost the subject, or the fault of its reported object.
+    subject: Subject, evidence: Evidence, traces: FrameIndex, restored_by: Sequence[StageSet] = ()
+) -> tuple[Reason, bool]:
+    """Find the stage that lost the subject, or the fault of its reported object.
 
-    Without ground truth, the most probable outcome that the evidence allows is preferred.
+    It is the first stage that lost it. If ideal results are known, it is a stage whose ideal result brings
+    the object back: the first that lost it if it does, else the first one that does.
 
     Returns:
         reason: that stage or fault, with its values.
         reported: whether it still is an object of a right class.
-        outcomes: the possible outcomes, the most probable first; empty where no probability is known.
     """
     if subject.kind == "object" and (false := false_reasons(traces).get(subject.row)) is not None:
-        return false, True, ()
+        return false, True
     decider = _Decider(subject, evidence, traces)
     kind, reported = decider.decide()
-    outcomes = rank_outcomes(subject, evidence, (kind, reported), traces)
-    if outcomes and not subject.is_place and decider.allows(outcomes[0]):
-        kind, reported, _ = outcomes[0]
-    return ReasonValues(subject, evidence, traces).reason(kind), reported, outcomes
+    stages = [stage for stages in restored_by for stage in stages]
+    if stages and not reported and decider.stage_of(kind) not in stages:
+        kind = next(filter(None, map(decider.kind_at, stages)), kind)
+    return ReasonValues(subject, evidence, traces).reason(kind), reported
+
+
+def stage_of(kind: ReasonKind, evidence: Evidence) -> str:
+    """Return the stage that a reason blames, empty for none."""
+    if kind is ReasonKind.MISNAMED and evidence.named is not None:
+        return "detector" if evidence.named.own else "fusion"
+    if kind is ReasonKind.MERGED and evidence.joined_by is not None:
+        return "fusion"
+    return STAGES.get(kind, "")
+
+
+def likely_reasons(
+    subject: Subject, evidence: Evidence, traces: FrameIndex, kind: ReasonKind
+) -> LikelyReasons:
+    """Return two reasons that each lost much of a subject, the reason of the verdict first; else nothing.
+
+    Ground truth tells which one mattered, so there are none with it.
+    """
+    aside = evidence.aside
+    lost = {
+        ReasonKind.GROUND: len(evidence.ground),
+        ReasonKind.NOISE: evidence.noise,
+        ReasonKind.TOO_SMALL: evidence.aside_points,
+    }
+    first = kind if aside is None or kind is not ReasonKind.TOO_LARGE else ReasonKind.TOO_SMALL
+    if traces.result.frame.truth is not None or subject.is_place or first not in lost or evidence.main >= 0:
+        return ()
+    second = max((other for other in lost if other is not first), key=lambda other: lost[other])
+    if lost[second] < NEARLY * lost[first]:
+        return ()
+    is_large = aside is not None and aside.state == ClusterState.TOO_LARGE
+    return kind, ReasonKind.TOO_LARGE if is_large and second is ReasonKind.TOO_SMALL else second
 
 
 class _Decider:
@@ -151,27 +200,53 @@ class _Decider:
         flaw = self._flaw(named)
         return flaw if flaw in (ReasonKind.MERGED, ReasonKind.SPLIT) else ReasonKind.MISPLACED
 
-    def allows(self, outcome: Outcome) -> bool:
-        """Return whether the evidence holds the values that the sentence about an outcome states."""
-        evidence, kind = self.evidence, outcome.kind
-        named, best, part = evidence.named, evidence.best, evidence.part(evidence.main)
-        if outcome.reported != (named is not None):
-            return False
-        weak = best is not None and best.state == DetectionState.BELOW_THRESHOLD
-        rest = part is not None and part.count > part.points
-        sizes = {part.state for part in evidence.parts}
-        allowed = {
-            ReasonKind.REPORTED: True,
-            ReasonKind.MERGED: rest,
-            ReasonKind.SPLIT: sum(part.kept for part in evidence.parts) > 1,
-            ReasonKind.GROUND: len(evidence.ground) > 0,
-            ReasonKind.NOISE: evidence.noise > 0,
-            ReasonKind.TOO_SMALL: ClusterState.TOO_SMALL in sizes,
-            ReasonKind.TOO_LARGE: ClusterState.TOO_LARGE in sizes,
-            ReasonKind.NOT_DETECTED: best is None or weak,
-            ReasonKind.BELOW_THRESHOLD: weak,
-        }
-        return allowed.get(kind, False)
+    def stage_of(self, kind: ReasonKind) -> str:
+        """Return the stage that a reason blames, empty for none."""
+        return stage_of(kind, self.evidence)
+
+    def kind_at(self, stage: str) -> ReasonKind | None:
+        """Return how a stage lost the subject; None: it shows no loss there."""
+        evidence = self.evidence
+        if stage == "ground":
+            return ReasonKind.GROUND if len(evidence.ground) else None
+        if stage == "clustering":
+            return self._clustering_loss()
+        best = evidence.best
+        if stage == "detector":
+            named = evidence.named
+            if named is not None and named.own and not self.subject.accepts(named.name):
+                return ReasonKind.MISNAMED
+            if best is None or not self.subject.accepts(best.name):
+                return ReasonKind.NOT_DETECTED
+            return None if best.kept else self._weakness(best)
+        if best is None or not best.kept:
+            return None
+        _, fusion = camera_and_fusion(self.result, best.camera)
+        if fusion is None:
+            return ReasonKind.NOT_FUSED
+        if evidence.main < 0:
+            return _REFUSED.get(best.decision)
+        kind = pair_reason(fusion, self.result.config, best.row, evidence.main).kind
+        return None if kind is ReasonKind.MATCHED else kind
+
+    def _clustering_loss(self) -> ReasonKind | None:
+        """Return how the clustering lost the subject; None: it has a cluster of its own."""
+        evidence = self.evidence
+        if evidence.main < 0:
+            if evidence.aside is None and not evidence.noise:
+                return None
+            if evidence.aside is None or evidence.aside_points < evidence.noise:
+                return self._noise()
+            is_small = evidence.aside.state == ClusterState.TOO_SMALL
+            return ReasonKind.TOO_SMALL if is_small else ReasonKind.TOO_LARGE
+        part = evidence.part(evidence.main)
+        if evidence.mates or evidence.purity < MOST:
+            return ReasonKind.MERGED
+        inside = 0 if part is None else part.points
+        rest = evidence.obstacles - inside - evidence.noise
+        if evidence.noise > max(rest, 0):
+            return self._noise()
+        return ReasonKind.SPLIT if rest > 0 else None
 
     # --- our stages ----------------------------------------------------------------------------
 

@@ -360,7 +360,7 @@ def _set(settings: Sequence[str]) -> list[str]:
 def _brief(answer: Answer, *, chain: bool = True) -> dict[str, Any]:
     """Return an answer with its stages in words. The numbers with their units are in these words."""
     tree = json_tree(AnswerResult.of(answer))
-    kept = ("name", "reported", "reason", "verdict", "confidence", "likely", "distance", "points", "remark")
+    kept = ("name", "reported", "reason", "verdict", "restored_by", "likely", "distance", "points", "remark")
     selection = answer.selection
     brief = {"about": "" if selection is None else str(selection), **{key: tree[key] for key in kept}}
     if not chain:

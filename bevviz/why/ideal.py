@@ -1,0 +1,273 @@
+"""Ideal results of single stages at missed objects, and which of them bring an object back.
+
+A stage is the cause of a miss if its ideal result alone brings the object back. The ideal comes from the
+ground truth: the object's points are no ground, they are one cluster of their own, a detection frames it, or
+the fusion matches both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from bevviz.config import Config
+from bevviz.evaluate.matching import image_boxes_of, judge
+from bevviz.model import geometry
+from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
+from bevviz.model.results import (
+    CameraResult,
+    Clusters,
+    ClusterState,
+    Detections,
+    DetectionState,
+    Ground,
+    Objects,
+    Voxels,
+)
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.stage_loader import Stages
+from bevviz.pipeline.stage_log import Memo
+from bevviz.stages.clustering import describe_clusters
+from bevviz.stages.frustum_fusion import claim_clusters
+from bevviz.why.changes import with_changes
+from bevviz.why.frame_index import FEW, FrameIndex
+from bevviz.why.subject import LINK
+
+STAGES = ("ground", "clustering", "detector", "fusion")  # in the order in which they run
+SURE = 0.99  # score of an ideal detection
+NO_LIMITS = {"min_iou": 0.0, "min_points": 1, "min_rating": 0.0, "max_depth": 1e4}  # of the fusion
+
+StageSet = tuple[str, ...]  # stages whose ideal results are needed together, in their order
+
+
+class IdealStages:
+    """Stage edits that replace the results of some stages at some objects by the ideal ones.
+
+    Args:
+        traces: index of the frame's result.
+        rows: objects of the ground truth.
+        stages: stages to replace.
+        memo: shared results of the frame's stages; each ideal result is made once.
+    """
+
+    def __init__(self, traces: FrameIndex, rows: tuple[int, ...], stages: StageSet, memo: Memo) -> None:
+        self._traces, self._rows, self._stages, self._memo = traces, rows, frozenset(stages), memo
+
+    def ground(self, voxels: Voxels, ground: Ground) -> Ground:
+        """Return the ground without the points of the objects."""
+        if "ground" in self._stages:
+            ground = self._memo.call(_without_objects, self._traces, self._rows, voxels, ground)
+        self._voxels, self._ground = voxels, ground
+        return ground
+
+    def clusters(self, obstacles: F32, clusters: Clusters) -> Clusters:
+        """Return the clusters with one more for each object, which holds all of its obstacle points."""
+        self._own = self._memo.call(_obstacles_of, self._traces, self._rows, self._voxels, self._ground)
+        if "clustering" in self._stages:
+            clusters = self._memo.call(_with_own_clusters, self._traces, self._own, obstacles, clusters)
+        self._clusters = clusters
+        return clusters
+
+    def detections(self, camera: Camera, detections: Detections) -> Detections:
+        """Return the detections with an ideal one of each object in the image, in place of its own ones."""
+        if "detector" not in self._stages:
+            return detections
+        boxes = self._image_boxes(camera)
+        shown = [row for row in self._rows if np.isfinite(boxes[row]).all()]
+        result, state = self._traces.camera(camera.name), detections.state.copy()
+        if result is not None and result.detections is not None and len(result.detections) == len(detections):
+            state[np.isin(self._traces.owners(result), shown)] = DetectionState.BELOW_THRESHOLD
+        count = len(shown)
+        return Detections(
+            np.concatenate([detections.xyxy, boxes[shown].astype(np.float32)]),
+            np.concatenate([detections.score, np.full(count, SURE, np.float32)]),
+            np.concatenate([detections.class_id, np.zeros(count, np.int32)]),
+            (*detections.names, *(self._name(row, detections) for row in shown)),
+            np.concatenate([state, np.full(count, DetectionState.KEPT, np.int32)]).astype(np.int32),
+            np.concatenate([detections.suppressed_by, np.full(count, -1, np.int32)]).astype(np.int32),
+            np.concatenate([detections.overlap, np.zeros(count, np.float32)]),
+        )
+
+    def _image_boxes(self, camera: Camera) -> F32:
+        """Return (K, 4) image boxes of the ground truth in a camera, NaN without a pose or out of view."""
+        truth = self._traces.labels_in_evaluate
+        assert truth is not None
+        if camera.camera_from_points is None or camera.intrinsics is None:
+            return np.full((len(truth.labels), 4), np.nan, np.float32)
+        return image_boxes_of(truth, camera)
+
+    def _name(self, row: int, detections: Detections) -> str:
+        """Return a class name that is right for an object, one that the detector uses if possible."""
+        subject = self._traces.truth[row]
+        known = (name for name in (*detections.names, *self._traces.classes) if subject.accepts(name))
+        return next(known, None) or min(subject.accepted, default=subject.label.lower())
+
+    def objects(self, obstacles: F32, cameras: Sequence[CameraResult], objects: Objects) -> Objects:
+        """Return the objects with one for each object that has a detection and points.
+
+        Its detection gets the points of the object that the clustering left to the fusion: those of its
+        largest cluster, or, where detections split clusters, those of all kept clusters and the noise.
+        """
+        for row, own in zip(self._rows if "fusion" in self._stages else (), self._own, strict=False):
+            for camera in cameras:
+                detection = self._own_detection(camera, row)
+                if detection >= 0 and (box := self._fused_box(obstacles, own, camera, detection)) is not None:
+                    objects = _with_object(objects, camera, detection, box)
+                    break
+        return objects
+
+    def _own_detection(self, camera: CameraResult, row: int) -> int:
+        """Return the kept detection of an object with a right class, -1: none."""
+        detections, subject = camera.detections, self._traces.truth[row]
+        if detections is None or camera.uv is None:
+            return -1
+        overlap = np.nan_to_num(geometry.iou(self._image_boxes(camera.camera)[[row]], detections.xyxy)[0])
+        accepted = np.array([subject.accepts(name) for name in detections.names], np.bool_)
+        overlap[~detections.kept | ~accepted] = 0
+        return int(overlap.argmax()) if overlap.max(initial=0.0) >= LINK else -1
+
+    def _fused_box(self, obstacles: F32, own: I64, camera: CameraResult, detection: int) -> Boxes3D | None:
+        """Return the box that the fusion fits to an object's points without its limits; None: none."""
+        config, clusters = self._traces.result.config, self._clusters
+        labels = clusters.labels[own]
+        if config.fusion.method == "frustum" and config.fusion.split:
+            rows = own[np.append(clusters.kept, True)[labels]]
+            return self._claimed_box(obstacles, rows, camera, detection) if len(rows) >= FEW else None
+        kept = labels[np.append(clusters.kept, False)[labels]]
+        return (
+            clusters.boxes(config.clustering).chosen([int(np.bincount(kept).argmax())]) if len(kept) else None
+        )
+
+    def _claimed_box(self, obstacles: F32, rows: I64, camera: CameraResult, detection: int) -> Boxes3D | None:
+        """Return the box that a detection gets if it may claim some points, and no others."""
+        config, detections = self._traces.result.config, camera.detections
+        assert detections is not None and camera.uv is not None and camera.depth is not None
+        alone = replace(camera, detections=_single(detections, detection), fusion=None)
+        alone = replace(alone, uv=camera.uv[rows], depth=camera.depth[rows])
+        noise = describe_clusters(obstacles[rows], np.full(len(rows), -1, np.int32), config.clustering)
+        height = self._ground.height.compress(~self._ground.mask)[rows]
+        fusion = config.fusion.model_copy(update=NO_LIMITS)
+        clustering = ideal_config(config, self._stages).clustering
+        _, (claims,), _ = claim_clusters(
+            obstacles[rows], height, noise, (alone,), fusion, config.objects, clustering
+        )
+        return None if claims is None or claims.cluster[0] < 0 else claims.boxes.chosen([0])
+
+
+def ideal_config(config: Config, stages: Container[str]) -> Config:
+    """Return the configuration of a run with ideal stages: no limit removes an ideal cluster."""
+    return with_changes(config, {"clustering.min_cluster_points": 1}) if "clustering" in stages else config
+
+
+def _single(detections: Detections, row: int) -> Detections:
+    """Return one of the detections, without its mask."""
+    one = np.array([row])
+    return Detections(
+        detections.xyxy[one],
+        detections.score[one],
+        detections.class_id[one],
+        (detections.names[row],),
+        detections.state[one],
+        np.full(1, -1, np.int32),
+        np.zeros(1, np.float32),
+    )
+
+
+def _with_object(objects: Objects, camera: CameraResult, detection: int, box: Boxes3D) -> Objects:
+    """Return the objects with one more, which takes the place of another one of its detection."""
+    detections, name = camera.detections, camera.camera.name
+    assert detections is not None
+    sources = zip(objects.camera, objects.detection.tolist(), strict=True)
+    rest = [row for row, source in enumerate(sources) if source != (name, detection)]
+    return Objects(
+        boxes=Boxes3D.joined([objects.boxes.chosen(rest), box]),
+        names=(*(objects.names[row] for row in rest), detections.names[detection]),
+        score=np.append(objects.score[rest], detections.score[detection]),
+        cluster=np.append(objects.cluster[rest], np.int32(-1)),
+        camera=(*(objects.camera[row] for row in rest), name),
+        detection=np.append(objects.detection[rest], np.int32(detection)),
+    )
+
+
+def _voxels_of(traces: FrameIndex, row: int, voxels: Voxels) -> I64:
+    """Return the voxels of an object."""
+    rows: I64 = np.unique(voxels.inverse[traces.place(traces.truth[row])]).astype(np.int64)
+    return rows
+
+
+def _without_objects(traces: FrameIndex, rows: tuple[int, ...], voxels: Voxels, ground: Ground) -> Ground:
+    """Return a ground without the points of some objects."""
+    mask = ground.mask.copy()
+    for row in rows:
+        mask[_voxels_of(traces, row, voxels)] = False
+    return replace(ground, mask=mask)
+
+
+def _obstacles_of(
+    traces: FrameIndex, rows: tuple[int, ...], voxels: Voxels, ground: Ground
+) -> tuple[I64, ...]:
+    """Return the obstacle points of some objects."""
+    obstacle = np.where(ground.mask, -1, np.cumsum(~ground.mask) - 1)
+    own = (obstacle[_voxels_of(traces, row, voxels)] for row in rows)
+    return tuple(points[points >= 0] for points in own)
+
+
+def _with_own_clusters(
+    traces: FrameIndex, own: tuple[I64, ...], obstacles: F32, clusters: Clusters
+) -> Clusters:
+    """Return the clusters with one more for each object, which is kept whatever its size."""
+    labels, first = clusters.labels.copy(), len(clusters)
+    for label, rows in enumerate((rows for rows in own if len(rows) >= FEW), first):
+        labels[rows] = label
+    used, inverse = np.unique(labels[labels >= 0], return_inverse=True)
+    labels[labels >= 0] = inverse.astype(np.int32)
+    described = describe_clusters(obstacles, labels, traces.result.config.clustering)
+    state = described.state.copy()
+    state[used >= first] = ClusterState.KEPT
+    return replace(described, state=state)
+
+
+def restoring_stages(
+    traces: FrameIndex, rows: tuple[int, ...], stages: Stages, memo: Memo
+) -> dict[int, tuple[StageSet, ...]]:
+    """Return the smallest sets of stages whose ideal results bring each missed object back.
+
+    All objects get their ideal results in one run. A larger set is tried for those that no smaller one brings
+    back.
+
+    Args:
+        traces: index of the frame's result, with ground truth.
+        rows: missed objects of the ground truth.
+        stages: stages of the result's configuration.
+        memo: shared results of the frame's stages.
+    """
+    result, truth = traces.result, traces.labels_in_evaluate
+    restored: dict[int, list[StageSet]] = {row: [] for row in rows}
+    if truth is None or result.objects is None:
+        return dict.fromkeys(rows, ())
+
+    def found(chosen: StageSet) -> Bool:
+        """Return (K,) whether each object is found with the ideal results of some stages."""
+        edits = IdealStages(traces, rows, chosen, memo)
+        after = perceive(result.frame, ideal_config(result.config, chosen), stages, memo, edits=edits)
+        return (
+            np.zeros(len(truth.must), np.bool_)
+            if after.objects is None
+            else ~judge(after.objects, truth).missed
+        )
+
+    curable = found(STAGES)
+    left = [row for row in rows if curable[row]]
+    for size in range(1, len(STAGES)):
+        for chosen in combinations(STAGES, size) if left else ():
+            is_found = found(chosen)
+            for row in left:
+                if is_found[row]:
+                    restored[row].append(chosen)
+        left = [row for row in left if not restored[row]]
+    for row in left:
+        restored[row].append(STAGES)
+    return {row: tuple(sets) for row, sets in restored.items()}

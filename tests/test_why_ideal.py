@@ -1,0 +1,69 @@
+"""Ideal results of single stages: a planted fault is found by what brings the missed object back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bevviz.config import load
+from bevviz.evaluate import judge
+from bevviz.pipeline.perceive import perceive
+from bevviz.pipeline.session import Session
+from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.pipeline.stage_log import Memo
+from bevviz.why import FrameExplainer, Selection
+from bevviz.why.ideal import IdealStages
+from tests.support.planted_faults import at
+
+CLASSES = ("car", "person", "cyclist")
+
+
+def explained(*settings: str) -> FrameExplainer:
+    config = load(None, ["detector.model=demo", *settings])
+    return FrameExplainer(Session(config).run_explained(at("flat_car").frame), classes=CLASSES)
+
+
+@pytest.mark.parametrize(
+    ("planted", "stage"),
+    [
+        ("ground.distance_threshold=2.5", "ground"),
+        ("clustering.min_cluster_points=400", "clustering"),
+        ("detector.conf_threshold=0.97", "detector"),
+        ("fusion.min_rating=0.97", "fusion"),
+    ],
+)
+def test_the_stage_with_the_planted_value_brings_the_objects_back(planted: str, stage: str) -> None:
+    sound = explained()
+    assert sound.traces.matches is not None
+    found = set(np.flatnonzero(~sound.traces.matches.missed).tolist())
+    asked = explained(planted)
+    assert asked.traces.matches is not None
+    lost = [row for row in np.flatnonzero(asked.traces.matches.missed).tolist() if row in found]
+    assert lost, "the planted value loses an object that is found without it"
+    answers = [asked.about(Selection(truth=row)) for row in lost]
+    right = [answer for answer in answers if (stage,) in answer.restored_by]
+    assert len(right) >= 0.9 * len(answers)
+
+
+def test_pairs_are_named_where_no_stage_alone_restores() -> None:
+    asked = explained("detector.conf_threshold=0.97", "clustering.min_cluster_points=400")
+    sets = [answer.restored_by for answer in asked.missed()]
+    both = [one for one in sets if ("clustering", "detector") in one]
+    assert both
+    assert all(len(stages) == 2 for one in both for stages in one), "no single stage restores them"
+    answer = next(a for a in asked.missed() if ("clustering", "detector") in a.restored_by)
+    assert "a cluster of its own and a right detection" in answer.verdict.cause
+
+
+def test_ideal_results_leave_the_other_objects_alone() -> None:
+    asked = explained("fusion.min_rating=0.97")
+    traces, result = asked.traces, asked.traces.result
+    assert traces.matches is not None and traces.labels_in_evaluate is not None
+    row = int(np.flatnonzero(traces.matches.missed)[0])
+    memo = Memo()
+    stages = StageLoader().load(result.config, lambda camera: result.cameras[0].detections)
+    edits = IdealStages(traces, (row,), ("fusion",), memo)
+    after = perceive(result.frame, result.config, stages, memo, edits=edits)
+    assert after.objects is not None
+    new = judge(after.objects, traces.labels_in_evaluate)
+    assert np.flatnonzero(new.missed != traces.matches.missed).tolist() == [row]
