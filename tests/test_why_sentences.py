@@ -38,7 +38,13 @@ PAIR: dict[str, Any] = {
     "centroid": False,
     "mask": "",
 }
-SEEN: dict[str, Any] = {"detection": Scored("car", 0.0125), "by": "", "robot": False, "shared": None}
+SEEN: dict[str, Any] = {
+    "detection": Scored("car", 0.0125),
+    "by": "",
+    "robot": False,
+    "shared": None,
+    "nearest": None,
+}
 SHARED: dict[str, Any] = {
     "shared": Scored("car", 0.38),
     "overlap": 0.44,
@@ -101,6 +107,12 @@ CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
     (K.NOT_RUN, False, {"problems": ("detector.model is not set",)}, CAR),
     (K.NOT_DETECTED, False, {**SEEN, "detection": None}, CAR),
     (K.NOT_DETECTED, False, {**SEEN, "detection": None, **SHARED}, CAR),
+    (
+        K.NOT_DETECTED,
+        False,
+        {**SEEN, "detection": None, "nearest": Scored("car", 0.142), "overlap": 0.22},
+        CAR,
+    ),
     (K.NOT_DETECTED, False, {**SEEN, "by": "/camera_2d", "robot": True}, CAR),
     (K.BELOW_THRESHOLD, False, SEEN, CAR),
     (K.BELOW_THRESHOLD, False, SEEN, DETECTION),
@@ -206,3 +218,9 @@ def test_each_kind_has_its_sentence() -> None:
     assert made == REFERENCE.read_text(encoding="utf-8").splitlines()
     assert {case[0] for case in CASES} == SENTENCES.keys()
     assert {case[0] for case in FALSE_CASES} == FALSE_SENTENCES.keys() == FALSE_KINDS
+
+
+def test_a_score_is_told_from_its_limit() -> None:
+    assert Scored("person", 0.2496).beside(0.25) == "0.2496"
+    assert Scored("person", 0.12).beside(0.25) == "0.12"
+    assert Scored("person", 0.0125).beside(0.25) == "0.01"

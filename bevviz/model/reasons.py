@@ -198,6 +198,11 @@ class Scored(NamedTuple):
     def __str__(self) -> str:
         return f"{self.name} {self.score:.2f}"
 
+    def beside(self, limit: float) -> str:
+        """Return the score with as many digits as tell it from a limit, two at least."""
+        texts = (f"{self.score:.{digits}f}" for digits in range(2, 8))
+        return next((text for text in texts if float(text) != round(limit, 7)), f"{self.score:.2f}")
+
 
 def scored(items: Any, row: int) -> Scored:
     """Return name and score of a row of detections or objects."""

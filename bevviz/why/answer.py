@@ -241,7 +241,12 @@ class FrameExplainer:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         verdict = answer.verdict
         return self._hint_finder.search(
-            answer.subject, answer.evidence, verdict.reason, verdict.reported, verdict.restored_by
+            answer.subject,
+            answer.evidence,
+            verdict.reason,
+            verdict.reported,
+            verdict.restored_by,
+            answer.likely,
         )
 
     def with_hints(self, answer: Answer) -> Answer:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from bevviz.config import Config, parameters, plugin_of, preset_differences, values
 from bevviz.errors import UserError
 from bevviz.model.reasons import Reason, ReasonKind
-from bevviz.model.results import FrameResult
+from bevviz.model.results import DetectionState, FrameResult
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.subject import NOISE
@@ -276,6 +276,8 @@ def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Ite
         if best.score >= NOISE:
             passes = {"detector.conf_threshold": math.floor(100 * best.score) / 100}
             yield passes
+            if best.state == DetectionState.SUPPRESSED:
+                yield from ({**passes, "detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
             if config.fusion.method == "frustum" and config.fusion.split:
                 # The rating of a match is proportional to the score.
                 weak = config.fusion.min_rating * best.score / config.detector.conf_threshold

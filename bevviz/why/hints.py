@@ -18,6 +18,7 @@ from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.ideal import STAGES, StageSet
 from bevviz.why.neighbours import NeighbourRuns
+from bevviz.why.reason_values import ReasonValues
 from bevviz.why.reruns import FrameRuns
 from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
@@ -118,6 +119,7 @@ class HintFinder:
         reason: Reason,
         reported: bool,
         restored_by: Sequence[StageSet] = (),
+        likely: Sequence[ReasonKind] = (),
     ) -> HintSearch:
         """Search the mildest change that changes the verdict and makes no other object worse.
 
@@ -131,7 +133,7 @@ class HintFinder:
         tried: list[TriedChange] = []
         faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
         left = 0  # changes that are still tried after one that helps this frame alone
-        for change in self._changes(question, restored_by):
+        for change in self._changes(question, restored_by, likely):
             after = self._runs.with_change(change)
             if after is None:
                 continue
@@ -161,7 +163,9 @@ class HintFinder:
         tried += [TriedChange(hint.settings, hint.objection) for hint in best if not hint.is_good]
         return HintSearch(tuple(hint for hint in best if hint.is_good)[:OFFERED], tuple(tried))
 
-    def _changes(self, question: _Question, restored_by: Sequence[StageSet]) -> Iterator[Change]:
+    def _changes(
+        self, question: _Question, restored_by: Sequence[StageSet], likely: Sequence[ReasonKind]
+    ) -> Iterator[Change]:
         """Yield the changes to try, each once: those for the reason, for the stages, then combined ones."""
         traces, evidence, reason = self._traces, question.evidence, question.reason
         blamed = stage_of(reason.kind, evidence)
@@ -176,8 +180,10 @@ class HintFinder:
                     tried.add(key)
                     yield change
 
-        steered = changes_for(evidence, reason, traces, is_false=question.is_false)
-        yield from new(islice(steered, TRIES))
+        values = ReasonValues(question.subject, evidence, traces)
+        for either in (reason, *(values.reason(kind) for kind in likely[1:])):
+            steered = changes_for(evidence, either, traces, is_false=question.is_false)
+            yield from new(islice(steered, TRIES))
         if question.is_false or not self._is_ours():
             return
         nearest = alone or stages or tuple(stage for stage in STAGES if stage == blamed)

@@ -12,7 +12,7 @@ from bevviz.model.reasons import Limit, Reason, ReasonKind, Scored, StageOwner, 
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.why.evidence import Evidence, camera_and_fusion
 from bevviz.why.frame_index import Fate, FrameIndex
-from bevviz.why.subject import Subject
+from bevviz.why.subject import LINK, Subject
 from bevviz.why.subject_matches import find_fused, opinion_on
 
 _OWN_LIMIT = {  # section of a stage whose parameter decides only if the stage is ours
@@ -230,11 +230,30 @@ class ReasonValues:
             "by": owner.name,
             "robot": bool(owner.topic),
             "shared": None if shared is None else shared.label,
+            "nearest": None,
         }
         if shared is None:
-            return values
+            nearest, overlap = self._nearest_detection()
+            return {**values, "nearest": nearest, "overlap": overlap}
         owner_name = self.traces.truth[shared.owner].name
         return {**values, "overlap": shared.overlap, "shared_owner": owner_name}
+
+    def _nearest_detection(self) -> tuple[Scored | None, float]:
+        """Return the detection of a right class that overlaps an object of the ground truth most.
+
+        It is one that overlaps too little to be a candidate. None: no detection does at all.
+        """
+        best: tuple[float, Scored | None] = 0.0, None
+        for camera in self.result.cameras if self.subject.kind == "truth" else ():
+            detections = camera.detections
+            if detections is None or not len(detections):
+                continue
+            overlap = self.traces.fits(camera).overlap[:, self.subject.row].copy()
+            overlap[[not self.subject.accepts(name) for name in detections.names]] = 0
+            row = int(overlap.argmax())
+            if best[0] < overlap[row] < LINK:
+                best = float(overlap[row]), scored(detections, row)
+        return best[1], best[0]
 
     def _suppressed(self) -> dict[str, Any]:
         best = self.evidence.best

@@ -249,6 +249,9 @@ def _not_detected(reason: Reason, subject: Subject) -> str:
             f"the detector has no box for it alone: {fit}, but is the box of {reason['shared_owner']}{wrong}"
         )
     least = reason.limit.number
+    if reason["nearest"] is not None:
+        fit = f"the best of its class there, {reason['nearest']}, overlaps it by {reason['overlap']:.2f}"
+        return f"the detector has no box that fits it: {fit}{wrong}"
     if subject.kind == "detection":
         return "it is probably that of something else: the detector has no candidate for the object there"
     if best is not None and not subject.label:
@@ -258,8 +261,10 @@ def _not_detected(reason: Reason, subject: Subject) -> str:
 
 def _below_threshold(reason: Reason, subject: Subject) -> str:
     best = reason["detection"]
-    weak = f"its detection is too weak: {best.name} {best.score:.3g}"
-    return f"{'it is too weak' if subject.kind == 'detection' else weak}, {reason.limit}"
+    assert reason.limit is not None
+    score = best.beside(float(reason.limit.value))
+    weak = f"its detection is too weak: {best.name} {score}"
+    return f"{f'it is too weak: {score}' if subject.kind == 'detection' else weak}, {reason.limit}"
 
 
 def _suppressed(reason: Reason, subject: Subject) -> str:

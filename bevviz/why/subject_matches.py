@@ -108,7 +108,7 @@ def sort_candidates(
             elsewhere,
             not candidate.kept,
             weak,
-            suppressed,
+            suppressed and not weak,
             not matched,
             known and candidate.overlap < SURE,
             -sure,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
 from bevviz.model.reasons import STAGES, Reason, ReasonKind
@@ -19,6 +21,7 @@ from bevviz.why.subject_matches import find_fused
 
 LikelyReasons = tuple[()] | tuple[ReasonKind, ReasonKind]
 
+ROAD = 0.1  # metres above the local ground up to which a voxel in an image box may be the road itself
 NEARLY = 0.6  # share of the main loss from which a second one may matter as well
 WHOLE = 0.7  # least share of an object's clustered points in its named cluster; with less, it is split
 
@@ -105,6 +108,16 @@ def stage_of(kind: ReasonKind, evidence: Evidence) -> str:
     return STAGES.get(kind, "")
 
 
+def ground_lost(subject: Subject, evidence: Evidence) -> int:
+    """Return the number of a subject's voxels that were taken for ground.
+
+    The image box of a detection also holds the road before and behind its object. It does not count.
+    """
+    if subject.kind != "detection":
+        return len(evidence.ground)
+    return len(evidence.ground) - int((np.abs(evidence.ground) < ROAD).sum())
+
+
 def likely_reasons(
     subject: Subject, evidence: Evidence, traces: FrameIndex, kind: ReasonKind
 ) -> LikelyReasons:
@@ -114,7 +127,7 @@ def likely_reasons(
     """
     aside = evidence.aside
     lost = {
-        ReasonKind.GROUND: len(evidence.ground),
+        ReasonKind.GROUND: ground_lost(subject, evidence),
         ReasonKind.NOISE: evidence.noise,
         ReasonKind.TOO_SMALL: evidence.aside_points,
     }
@@ -140,6 +153,7 @@ class _Decider:
     def __init__(self, subject: Subject, evidence: Evidence, traces: FrameIndex) -> None:
         self.subject, self.evidence, self.traces = subject, evidence, traces
         self.result: FrameResult = traces.result
+        self.ground = ground_lost(subject, evidence)
 
     def decide(self) -> tuple[ReasonKind, bool]:
         """Return the kind of the reason, and whether the subject is an object of a right class."""
@@ -208,7 +222,7 @@ class _Decider:
         """Return how a stage lost the subject; None: it shows no loss there."""
         evidence = self.evidence
         if stage == "ground":
-            return ReasonKind.GROUND if len(evidence.ground) else None
+            return ReasonKind.GROUND if self.ground else None
         if stage == "clustering":
             return self._clustering_loss()
         best = evidence.best
@@ -281,9 +295,10 @@ class _Decider:
         """Return the stage that took most points of a subject without a kept cluster."""
         evidence = self.evidence
         aside = evidence.aside
-        if aside is not None and evidence.aside_points >= max(evidence.noise, len(evidence.ground)):
+        if aside is not None and evidence.aside_points >= max(evidence.noise, self.ground):
             return ReasonKind.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else ReasonKind.TOO_LARGE
-        return ReasonKind.GROUND if len(evidence.ground) >= evidence.noise else self._noise()
+        ground = self.ground or (len(evidence.ground) if not evidence.noise else 0)
+        return ReasonKind.GROUND if ground and ground >= evidence.noise else self._noise()
 
     def _noise(self) -> ReasonKind:
         """Return the reason for points in no cluster. Only for our clustering the cause is known."""
@@ -332,7 +347,7 @@ class _Decider:
             return None
         rest = evidence.obstacles - inside - evidence.noise
         lost = (
-            (len(evidence.ground), ReasonKind.GROUND),
+            (self.ground, ReasonKind.GROUND),
             (evidence.noise, self._noise()),
             (rest, ReasonKind.SPLIT),
         )
@@ -373,7 +388,7 @@ class _Decider:
             return ReasonKind.NOT_AMONG
         cluster = self._has_cluster()
         if "clustering" in robot and self.result.clusters is not None and not cluster:
-            removed = "ground" in robot and len(evidence.ground) >= evidence.noise
+            removed = "ground" in robot and self.ground >= evidence.noise
             return ReasonKind.GROUND if removed else ReasonKind.NO_CLUSTER
         kept = [candidate for candidate in evidence.own_candidates if candidate.kept]
         detected = any(subject.accepts(candidate.name) for candidate in kept)
