@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+from backports import zstd
+from mcap.writer import Writer
 
 from bevviz.bags.source import BagSource
 from bevviz.config import load
+from bevviz.errors import UserError
 from tests.support import bags, foxglove_bags, kept_drives
 from tests.support.single_frames import assert_as_in_the_run
 
@@ -132,3 +136,128 @@ def test_single_frames_of_other_bags_are_those_of_the_run(tmp_path: Path, shared
     assert_as_in_the_run([kept_drives.BAG])
     assert_as_in_the_run([foxglove_bags.write(tmp_path / "foxglove.mcap")])
     assert_as_in_the_run([bags.write(tmp_path / "kitti", bags.kitti_items(shared, scans=4, step=20))])
+
+
+# --- files and channels ------------------------------------------------------------------------
+
+
+def stamps_of(path: Path) -> tuple[list[int], list[str]]:
+    """Return the stamps of all frames, in units of the period, and the warnings about the recording."""
+    with BagSource([path], load()) as source:
+        frames = [(frame.stamp - bags.START) // bags.PERIOD for frame in source]
+        return frames, source.recording.warnings
+
+
+@pytest.mark.parametrize("left_beside", [True, False])
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+def test_an_unpacked_bag_is_read_once(tmp_path: Path, form: str, left_beside: bool) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=5), form=form, compression="file")
+    (packed,) = bag.glob("*.zstd")
+    packed.with_suffix("").write_bytes(zstd.decompress(packed.read_bytes()))
+    if not left_beside:
+        packed.unlink()
+    stamps, warnings = stamps_of(bag)
+    assert stamps == list(range(5))
+    names = [packed.with_suffix("").name] if left_beside else []
+    assert [name in warning for name, warning in zip(names, warnings, strict=True)] == [True] * len(names)
+
+
+def test_a_packed_bag_is_that_of_its_metadata(tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=5))
+    (file,) = bag.glob("*.mcap")
+    file.with_name(f"{file.name}.zstd").write_bytes(zstd.compress(file.read_bytes()))
+    file.unlink()
+    assert stamps_of(bag) == (list(range(5)), [])
+
+
+def test_metadata_decide_which_files_are_the_bag(tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=5))
+    part = bags.write(tmp_path / "part", bags.small_items(scans=3), form="sqlite3")
+    shutil.copy(next(part.glob("*.db3")), bag / "converted.db3")
+    stamps, (warning,) = stamps_of(bag)
+    assert stamps == list(range(5))
+    assert warning.startswith(
+        f"{bag}: converted.db3 left out, which metadata.yaml does not list; if it is no"
+    )
+
+
+def test_a_copy_beside_a_bag_without_metadata_is_left_out(tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=5))
+    other = bags.write(tmp_path / "other", bags.small_items(scans=5), form="sqlite3")
+    shutil.copy(next(other.glob("*.db3")), bag / "other.db3")
+    (bag / "metadata.yaml").unlink()
+    stamps, warnings = stamps_of(bag)
+    assert stamps == list(range(5))
+    assert f"{bag}: other.db3 left out: a copy of another file" in warnings
+
+
+def channel(path: Path, msgtype: str, schema: tuple[str, bytes] | None, encoding: str, topic: str) -> Path:
+    """Write five clouds to an MCAP file with one channel."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        number = 0 if schema is None else writer.register_schema(msgtype, *schema)
+        sent = writer.register_channel(topic, encoding, number)
+        messages = bags.Messages()
+        for item in [i for i in bags.small_items(messages, scans=5) if i.topic == bags.CLOUD]:
+            data = bytes(messages.store.serialize_cdr(item.message, item.type))
+            writer.add_message(sent, item.received, data, item.received)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "schema", "topic", "name"),
+    [
+        ("sensor_msgs/msg/PointCloud2", ("ros2msg", b""), "/points", "/points"),
+        ("sensor_msgs/msg/PointCloud2", ("ros2idl", b" \n"), "/points", "/points"),
+        ("sensor_msgs/msg/PointCloud2", ("", b""), "/points", "/points"),
+        (
+            "sensor_msgs::msg::dds_::PointCloud2_",
+            ("omgidl", b"module sensor_msgs {};"),
+            "rt/points",
+            "/points",
+        ),
+        ("sensor_msgs::msg::dds_::PointCloud2_", ("", b""), "rt/a/points", "/a/points"),
+    ],
+)
+def test_channels_of_other_writers_are_read(
+    tmp_path: Path, msgtype: str, schema: tuple[str, bytes], topic: str, name: str
+) -> None:
+    path = channel(tmp_path / "drive.mcap", msgtype, schema, "cdr", topic)
+    with BagSource([path], load()) as source:
+        assert source.roles.lidars == (name,)
+        assert len(list(source)) == 5
+        assert not source.recording.warnings
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "schema", "encoding", "what"),
+    [
+        ("", None, "cdr", "/points: its channel has no schema"),
+        (
+            "foxglove.PointCloud",
+            ("flatbuffer", b"bfbs"),
+            "flatbuffer",
+            "flatbuffer, .*; write protobuf, JSON or CDR",
+        ),
+        (
+            "sensor_msgs/msg/PointCloud2",
+            ("jsonschema", b"{}"),
+            "json",
+            "/points: encoded as json, .*; write CDR",
+        ),
+        (
+            "sensor_msgs/msg/PointCloud2",
+            ("ros2msg", b""),
+            "cbor",
+            "/points: encoded as cbor, which is not read",
+        ),
+    ],
+)
+def test_an_encoding_that_is_not_read_is_named(
+    tmp_path: Path, msgtype: str, schema: tuple[str, bytes] | None, encoding: str, what: str
+) -> None:
+    path = channel(tmp_path / "drive.mcap", msgtype, schema, encoding, "/points")
+    with pytest.raises(UserError, match=what):
+        BagSource([path], load())

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores
 
 from bevviz.bags import mcap
 from bevviz.bags.file_types import BagFile, find_saved_bag, open_file
-from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1
+from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1, unread
 from bevviz.bags.reader import LAST_TIME, normalized
 from bevviz.bags.remote import address_of, beside, open_bytes
 from bevviz.config import SourceConfig
@@ -55,6 +55,7 @@ ATTACHED = "lidar_calibration"  # name prefix of an attached calibration; the to
 METADATA = "metadata.yaml"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # first fields of Foxglove messages whose layout is that of a Header
+MAX_ENCAPSULATION = 3  # of CDR and of parameter lists in CDR
 REWIND = 2_000_000_000  # nanoseconds of the first search for a key frame; each next one spans four times more
 LONGEST_SCAN = 1_000_000_000  # nanoseconds from the first packet of a scan to the last
 MANY = 12  # longest list of files in a sentence
@@ -343,7 +344,9 @@ class Recording(Closable):
         return make_decoder
 
     def _lacks(self, connection: Connection) -> str:
-        """Return why the packets of a topic are not read. Empty: they are, or it is another topic."""
+        """Return why the messages of a topic are not read; empty: they are."""
+        if why := unread(connection):
+            return why
         stream = packet_stream(connection.msgtype)
         if stream is None or connection.topic in self._sensors:
             return ""
@@ -413,7 +416,14 @@ class Recording(Closable):
 
     def _deserialized(self, message: RawMessage, data: bytes | memoryview) -> Any:
         connection, msgtype = message.connection, message.type
+        if why := unread(connection):
+            raise MessageError(f"{message.topic}: {why}")
         store = self.types.store(connection)
+        if not is_ros1(connection) and len(data) > 3 and data[1] > MAX_ENCAPSULATION:
+            raise MessageError(
+                f"{message.topic}: encoded as XCDR2 (encapsulation {data[1]}), which is not read; set the "
+                "data representation of its publisher to XCDR1"
+            )
         try:
             if is_ros1(connection):
                 return store.deserialize_ros1(data, msgtype)
@@ -433,6 +443,8 @@ class Recording(Closable):
     def _has_header(self, connection: Connection) -> bool:
         if foxglove_encoding(connection):
             return True
+        if unread(connection):
+            return False
         try:
             _, fields = self.types.store(connection).fielddefs[normalized(connection.msgtype)]
         except KeyError:
@@ -508,6 +520,17 @@ class Recording(Closable):
                 f"recognised (--dataset NAME){hint}"
             )
         metadata = self._read_metadata(folder)
+        try:
+            expected = int(metadata.get("message_count", 0))
+            listed = {PurePath(p).name for p in metadata.get("relative_file_paths", ())}
+        except (TypeError, ValueError):
+            expected, listed = 0, set()
+        files, others, missing = _listed_files(files, listed)
+        if others:
+            self._notes.append(
+                f"{folder}: {_some(others)} left out, which {METADATA} does not list; if it is no copy, open "
+                "it by its name"
+            )
         failed: list[UserError] = []
         before = len(self.files)
         for file in files:
@@ -518,19 +541,29 @@ class Recording(Closable):
         if len(failed) == len(files):
             raise failed[0]
         self._notes += map(str, failed)
-        try:
-            expected = int(metadata.get("message_count", 0))
-            listed = {PurePath(p).name for p in metadata.get("relative_file_paths", ())}
-        except (TypeError, ValueError):
-            expected, listed = 0, set()
-        if missing := sorted(listed - {f.name for f in files}):
-            names = f"{', '.join(missing[:MANY])}{' ...' if missing[MANY:] else ''}"
-            self._notes.append(f"{folder}: {names} of {METADATA} is missing: read without")
+        if missing:
+            self._notes.append(f"{folder}: {_some(missing)} of {METADATA} is missing: read without")
+        self._leave_out_copies(folder, before)
         found = sum(c.msgcount for f in self.files[before:] for c in f.connections)
         if found < expected:
             self._notes.append(
                 f"{folder}: {METADATA} counts {expected} messages, {found} were found: "
                 f"{expected - found} are lost"
+            )
+
+    def _leave_out_copies(self, folder: Path, first: int) -> None:
+        """Close each file of a folder that has the topics, counts and times of another one."""
+        known, copies = dict[object, BagFile](), list[BagFile]()
+        for file in self.files[first:]:
+            counts = sorted((c.topic, c.msgcount) for c in file.connections if c.msgcount)
+            if counts and known.setdefault((file.span, *counts), file) is not file:
+                copies.append(file)
+        for file in copies:
+            self.files.remove(file)
+            file.close()
+        if copies:
+            self._notes.append(
+                f"{folder}: {_some([f.path.name for f in copies])} left out: a copy of another file"
             )
 
     def _open_dataset(self, folder: Path, name: str) -> bool:
@@ -566,3 +599,30 @@ class Recording(Closable):
         except (UserError, KeyError, TypeError, AttributeError, ValueError):
             self._notes.append(f"{path}: not readable as {METADATA}: read without")
             return {}
+
+
+def _listed_files(files: Sequence[Path], listed: Collection[str]) -> tuple[list[Path], list[str], list[str]]:
+    """Choose the files of a folder that its metadata list.
+
+    A file may have been packed or unpacked since: ``bag_0.db3.zstd`` is as good as ``bag_0.db3``.
+
+    Returns:
+        The files, the names of others in the folder, and the listed names that are missing. If none of the
+        listed files exists, all files are chosen: the metadata are those of another bag.
+    """
+    by_name = {file.name: file for file in files}
+    chosen, missing = list[Path](), list[str]()
+    for name in sorted(listed):
+        forms = (name, name.removesuffix(".zstd"), f"{name}.zstd")
+        here = next((by_name[form] for form in forms if form in by_name), None)
+        if here is None:
+            missing.append(name)
+        else:
+            chosen.append(here)
+    if not chosen:
+        return list(files), [], missing
+    return chosen, [name for name, file in by_name.items() if file not in chosen], missing
+
+
+def _some(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:MANY])}{' ...' if names[MANY:] else ''}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from binascii import crc32
 from collections import Counter
@@ -55,6 +56,8 @@ _STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., ch
 _COUNT = struct.Struct("<HQ")
 
 PUBLISHERS = "bevviz_publishers"  # key of a channel's metadata: names of the nodes that publish the topic
+# Type of a ROS message as DDS names it: sensor_msgs::msg::dds_::PointCloud2_. The topic is rt/NAME.
+DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_$")
 NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
@@ -63,6 +66,7 @@ class Channels:
 
     def __init__(self) -> None:
         self.schemas: dict[int, tuple[str, MessageDefinition]] = {}
+        self._dds_schemas: set[int] = set()
         self._channels: dict[int, tuple[int, str, str, bytes]] = {}  # schema, topic, encoding, metadata
 
     def __contains__(self, channel: object) -> bool:
@@ -82,7 +86,13 @@ class Channels:
             )
             if encoding in (b"protobuf", b"jsonschema"):  # a character for each byte
                 definition = MessageDefinition(MessageDefinitionFormat.NONE, text.decode("latin-1"))
-            self.schemas.setdefault(number, (msgtype.decode(errors="replace"), definition))
+            name = msgtype.decode(errors="replace")
+            if match := DDS_TYPE.match(name):
+                name = "/".join(match.groups())
+                self._dds_schemas.add(number)
+            if match or not text.strip():  # The ROS release defines the type.
+                definition = NO_DEFINITION
+            self.schemas.setdefault(number, (name, definition))
         elif opcode == CHANNEL:
             number, schema = struct.unpack_from("<HH", record)
             topic, form, metadata = read_strings(record, 4, 3)
@@ -100,6 +110,8 @@ class Channels:
         profiles_by_text: dict[str, list[Qos]] = {"": []}
         for number, (schema, topic, encoding, metadata) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
+            if schema in self._dds_schemas:
+                topic = topic.removeprefix("rt") if topic.startswith("rt/") else topic
             digest, profiles, publishers = "", list[Qos](), None
             with suppress(DamageError), as_damage():
                 stated = read_metadata(metadata)

@@ -93,6 +93,21 @@ def foxglove_encoding(connection: Connection) -> str:
     return form if form in foxglove.ENCODINGS and foxglove.foxglove_type(connection.msgtype) else ""
 
 
+def unread(connection: Connection) -> str:
+    """Return why the messages of a connection cannot be decoded; empty: they can."""
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return ""
+    if not connection.msgtype:
+        return (
+            "its channel has no schema, so that the type of its messages is unknown; let its writer add one"
+        )
+    form = connection.ext.serialization_format
+    if form in ("", "cdr", "ros1") or foxglove_encoding(connection):
+        return ""
+    helps = "CDR" if form in foxglove.ENCODINGS else "protobuf, JSON or CDR"
+    return f"encoded as {form}, which is not read of a {connection.msgtype}; write {helps}"
+
+
 def is_ros1(connection: Connection) -> bool:
     """Tell whether the messages of a connection are serialised as in ROS 1."""
     extra = connection.ext

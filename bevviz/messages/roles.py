@@ -15,6 +15,7 @@ from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import check_boxes_setting
 from bevviz.messages.foxglove import foxglove_type
 from bevviz.messages.topics import (
+    CLOUDS,
     IMAGES,
     CameraRole,
     Topic,
@@ -158,7 +159,10 @@ def find_roles(
     """
     topics = sorted(topics, key=lambda t: t.name)  # topics of a bag or graph have no fixed order
     topics = _with_boxes(topics, config)
-    notes = {t.name: f"not used: {unsupported_reason(t) or f'nothing here reads {t.type}'}" for t in topics}
+    notes = {
+        t.name: f"not used: {unsupported_reason(t) or t.aside or f'nothing here reads {t.type}'}"
+        for t in topics
+    }
     staged = {key: stated_topic(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     for name in config.lidar_calibration:
@@ -273,6 +277,9 @@ def _no_lidar(topics: Sequence[Topic]) -> str:
     summary = f"no LiDAR: none of {len(topics)} topics is a sensor_msgs/PointCloud2"
     if unsupported := [f"{t.name} holds {why}" for t in topics if (why := unsupported_reason(t, "LiDAR"))]:
         return f"{summary}; {'; '.join(unsupported)}"
+    unread = [t for t in topics if t.aside and t.kind in (*CLOUDS, "")]
+    if unread and len(unread) <= MANY:
+        return f"no LiDAR that can be read: {'; '.join(f'{t.name}: {t.aside}' for t in unread)}"
     if clouds := names_of(of_kind(topics, "PointCloud2")):
         return f"no LiDAR: {', '.join(clouds)} is the result of a stage"
     if len(topics) > MANY:

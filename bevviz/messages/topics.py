@@ -244,6 +244,7 @@ def find_lidars(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, 
         set_note(notes, clouds, "not used: not in source.lidar_topics")
         set_note(notes, chosen, "LiDAR, by source.lidar_topics")
         return chosen
+    clouds = [topic for topic in clouds if not topic.aside]
     tiers = {topic: _lidar_tier(topic, config.base_frame) for topic in clouds}
     best = min(tiers.values(), default=0)
     set_note(
