@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 from backports import zstd
 from mcap.writer import Writer
@@ -13,6 +15,8 @@ from mcap.writer import Writer
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.model import geometry
+from bevviz.model.frame import F64, Frame
 from tests.support import bags, foxglove_bags, kept_drives
 from tests.support.single_frames import assert_as_in_the_run
 
@@ -261,3 +265,112 @@ def test_an_encoding_that_is_not_read_is_named(
     path = channel(tmp_path / "drive.mcap", msgtype, schema, encoding, "/points")
     with pytest.raises(UserError, match=what):
         BagSource([path], load())
+
+
+# --- frames and transforms ---------------------------------------------------------------------
+
+FORWARD = geometry.transform(np.zeros(3), np.array([0.0, 0, 0, 1]))
+OPTICAL = geometry.transform(np.array([0.1, 0, -0.2]), np.array([-0.5, 0.5, -0.5, 0.5]))
+TURN = geometry.transform(np.zeros(3), np.array([0, 0, np.sin(np.radians(4)), np.cos(np.radians(4))]))
+TF = "tf2_msgs/msg/TFMessage"
+
+
+def read(path: Path, *settings: str) -> tuple[Frame, Sequence[str]]:
+    """Return the last frame of a bag, and the doubts about the bag."""
+    with BagSource([path], load(settings=list(settings))) as source:
+        frames = list(source)
+        assert source.frame(len(frames) - 1) is not None
+        return frames[-1], source.doubts
+
+
+def again(topic: str, pose: F64, count: int = 1) -> list[bags.Item]:
+    """Return the mounting of the camera, stated again with another pose."""
+    times = [bags.START + 1 + i * bags.PERIOD // 2 for i in range(count)]
+    messages = bags.Messages()
+    edge = (bags.LIDAR_FRAME, bags.CAMERA_FRAME, pose)
+    return [bags.Item(topic, TF, time, messages.transforms(time, edge)) for time in times]
+
+
+@pytest.mark.parametrize(("topic", "count"), [("/tf_static", 1), ("/tf", 20)])
+def test_a_transform_that_is_stated_twice_is_said(tmp_path: Path, topic: str, count: int) -> None:
+    items = [*bags.small_items(scans=5), *again(topic, TURN @ OPTICAL, count)]
+    bag = bags.write(tmp_path / "drive", items)
+    frame, (doubt,) = read(bag)
+    where = "twice on /tf_static" if topic == "/tf_static" else "on /tf_static and on /tf"
+    what = f"'{bags.LIDAR_FRAME}' -> '{bags.CAMERA_FRAME}' is stated {where}, 8.0 degrees and 0.01"
+    assert what in doubt and "the newer one is used" in doubt
+    np.testing.assert_allclose(
+        frame.cameras[0].camera_from_points, geometry.inverse(TURN @ OPTICAL), atol=1e-6
+    )
+    (setting,) = re.findall(r"--set (source.extrinsics)='(.*)'", doubt)
+    frame, doubts = read(bag, "=".join(setting))
+    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-5)
+    assert not doubts
+
+
+@pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
+def test_a_transform_that_is_stated_twice_alike_is_not_said(tmp_path: Path, topic: str) -> None:
+    rounded = OPTICAL + np.pad(np.full((3, 1), 1e-5), ((0, 1), (3, 0)))
+    items = [*bags.small_items(scans=5), *again(topic, OPTICAL, 3), *again(topic, rounded, 5)]
+    assert read(bags.write(tmp_path / "drive", items))[1] == []
+
+
+def framed(image: str, info: str, *edges: tuple[str, str, F64]) -> list[bags.Item]:
+    """Return a drive whose images and CameraInfo state these frames."""
+    messages = bags.Messages()
+    items = bags.small_items(messages, scans=3)
+    for item in items:
+        if item.topic in (bags.IMAGE, bags.INFO):
+            item.message.header.frame_id = image if item.topic == bags.IMAGE else info
+    items = [item for item in items if item.topic != "/tf_static"]
+    return [bags.Item("/tf_static", TF, bags.START, messages.transforms(bags.START, *edges)), *items]
+
+
+LINK = ("velodyne", "camera_link", FORWARD)
+BELOW_LINK = ("camera_link", "camera_optical", OPTICAL)
+MOUNTED = ("velodyne", "camera_optical", OPTICAL)
+
+
+@pytest.mark.parametrize(
+    ("image", "info", "edges", "said"),
+    [
+        ("camera_optical", "camera_optical", (LINK, BELOW_LINK), ""),
+        ("/camera_optical", "camera_optical", (MOUNTED,), ""),
+        (
+            "camera_link",
+            "camera_optical",
+            (LINK, BELOW_LINK),
+            "'camera_link', and .* states 'camera_optical'",
+        ),
+        (
+            "camera_optical",
+            "camera_link",
+            (LINK, BELOW_LINK),
+            "'camera_optical', and .* states 'camera_link'",
+        ),
+        ("rgb", "camera_optical", (MOUNTED,), "the frame 'rgb', which no transform has: 'camera_optical' of"),
+        ("", "camera_optical", (MOUNTED,), "state no frame: 'camera_optical' of"),
+    ],
+)
+def test_the_optical_frame_is_that_of_image_or_camera_info(
+    tmp_path: Path, image: str, info: str, edges: tuple[tuple[str, str, F64], ...], said: str
+) -> None:
+    bag = bags.write(tmp_path / "drive", framed(image, info, *edges))
+    frame, doubts = read(bag)
+    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-9)
+    assert frame.cameras[0].image is not None and frame.cameras[0].image.frame_id.endswith("optical")
+    assert bool(doubts) == bool(said) and all(re.search(said, doubt) for doubt in doubts)
+    for setting in re.findall(r"--set source.frames='(.*)'", " ".join(doubts)):
+        other, doubts = read(bag, f"source.frames={setting}")
+        assert not doubts
+        np.testing.assert_allclose(other.cameras[0].camera_from_points, geometry.inverse(FORWARD), atol=1e-9)
+
+
+def test_a_frame_can_be_stated_for_a_recorded_bag(tmp_path: Path) -> None:
+    items = framed("", "", MOUNTED)
+    for item in items:
+        if item.topic == bags.CLOUD:
+            item.message.header.frame_id = ""
+    bag = bags.write(tmp_path / "drive", items)
+    frame, _ = read(bag, f"source.frames={{{bags.IMAGE}: camera_optical, {bags.CLOUD}: velodyne}}")
+    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-9)

@@ -126,19 +126,23 @@ def test_an_uncalibrated_camera_needs_no_other_topic(tmp_path: Path) -> None:
 def test_without_frame_ids_no_extrinsics_are_asked_for(tmp_path: Path) -> None:
     """They have two names, one of which would be empty."""
 
-    def nameless(topic: str) -> str:
+    def nameless(topic: str, *others: str) -> str:
         items = []
         for item in bags.small_items(scans=3):
-            if item.topic == topic:
+            if item.topic in (topic, *others):
                 header = replace(item.message.header, frame_id="")
                 item = item._replace(message=replace(item.message, header=header))
             items.append(item)
-        return " ".join(describe_bag([bags.write(tmp_path / topic[1:7], items)], Config()).missing)
+        return " ".join(
+            describe_bag([bags.write(tmp_path / f"{topic[1:7]}{len(others)}", items)], Config()).missing
+        )
 
     for topic, what in ((bags.CLOUD, "the points state"), (bags.IMAGE, "its images state")):
-        missing = nameless(topic)
-        assert f"camera 'camera' is not placed: {what} no frame_id; the driver must" in missing
+        missing = nameless(topic, *([bags.INFO] if topic == bags.IMAGE else []))
+        named = f"--set source.frames='{{{topic}: name}}'"
+        assert f"camera 'camera' is not placed: {what} no frame_id, name it: {named}" in missing
         assert "source.extrinsics" not in missing and "source.fixed_frame" not in missing
+    assert "not placed" not in nameless(bags.IMAGE), "the CameraInfo states the frame"
 
 
 def test_a_bag_without_a_lidar_is_described_all_the_same(tmp_path: Path) -> None:

@@ -817,7 +817,7 @@ def test_a_camera_without_a_frame_is_not_at_the_lidar() -> None:
     feed.image(0.0, frame="")
     (frame,) = feed.sync.flush()
     assert frame.cameras[0].camera_from_points is None
-    assert "a message states no frame_id; its driver must" in " ".join(frame.cameras[0].problems)
+    assert "a message states no frame_id; source.frames can state it" in " ".join(frame.cameras[0].problems)
 
 
 def test_a_static_transform_sent_once_on_tf_holds() -> None:

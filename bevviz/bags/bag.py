@@ -525,11 +525,11 @@ class Recording(Closable):
             listed = {PurePath(p).name for p in metadata.get("relative_file_paths", ())}
         except (TypeError, ValueError):
             expected, listed = 0, set()
-        files, others, missing = _listed_files(files, listed)
-        if others:
+        files, unlisted, missing = _listed_files(files, listed)
+        if unlisted:
             self._notes.append(
-                f"{folder}: {_some(others)} left out, which {METADATA} does not list; if it is no copy, open "
-                "it by its name"
+                f"{folder}: {_some(unlisted)} left out, which {METADATA} does not list; if it is no copy, "
+                "open it by its name"
             )
         failed: list[UserError] = []
         before = len(self.files)

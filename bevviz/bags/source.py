@@ -394,12 +394,11 @@ class BagSource(Closable):
             for message in messages:
                 if message.received < stop:
                     self._handle(handlers[name], message, state)
-        static = {}
-        for received, transform in self._static:
-            if received <= low or transform.child not in static:
-                static[transform.child] = transform
-        for transform in static.values():
-            state.sync.add_transform(transform, static=True)
+        known = set[str]()
+        for received, topic, transform in self._static:
+            if received <= low or transform.child not in known:
+                known.add(transform.child)
+                state.sync.add_transform(transform, static=True, topic=topic)
         for info in self._infos:
             with suppress(MessageError):  # The error is counted when the message itself is handled.
                 handlers[info.topic](info)
@@ -418,14 +417,17 @@ class BagSource(Closable):
         ]
 
     @cached_property
-    def _static(self) -> list[tuple[int, StampedTransform]]:
-        """Static transforms with the times at which they were received."""
-        transforms = list[tuple[int, StampedTransform]]()
+    def _static(self) -> list[tuple[int, str, StampedTransform]]:
+        """Static transforms that differ from the one before, with the times of receipt and the topics."""
+        transforms, last = list[tuple[int, str, StampedTransform]](), dict[str, StampedTransform]()
         for message in self.recording.messages(self.roles.tf_static):
             with suppress(MessageError):  # The error is counted when the message itself is handled.
                 content = self.recording.decode(message)
-                found = guard(message, decode_transforms, content, message.topic)
-                transforms += [(message.received, transform) for transform in found]
+                for transform in guard(message, decode_transforms, content, message.topic):
+                    former = last.get(transform.child)
+                    if former is None or not _same_edge(former, transform):
+                        transforms.append((message.received, message.topic, transform))
+                    last[transform.child] = transform
         return transforms
 
     @cached_property
@@ -516,6 +518,10 @@ class BagSource(Closable):
                 else f"{self.recording.name}: {self._driver} has no {self.noun} in the time asked for"
             )
         return chosen
+
+
+def _same_edge(a: StampedTransform, b: StampedTransform) -> bool:
+    return a.parent == b.parent and np.array_equal(a.parent_from_child, b.parent_from_child)
 
 
 def _copied(message: RawMessage) -> RawMessage:

@@ -85,6 +85,11 @@ class SourceConfig(Section):
         max_length=MAX_SENSORS,
         description="name -> file with a detector's results, which appear on the topic /results/NAME",
     )
+    frames: Mapping[str, str] = Field(
+        {},
+        max_length=MAX_SETTINGS,
+        description="camera or LiDAR topic -> frame of its messages, in place of the one that they state",
+    )
     odometry_topic: str = Field("", description="nav_msgs/Odometry used where /tf has no fixed frame")
     base_frame: str = Field("base_link", description="frame that several LiDARs are merged in")
     fixed_frame: str = Field("", description="world frame; empty: map, odom or the like, where TF has one")

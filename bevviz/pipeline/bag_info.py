@@ -345,7 +345,11 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
             missing.append(f"{name} has no CameraInfo{': ' if roles.camera_infos else ', '}{advice}")
         if not is_placed and camera.image is not None and not (frame.points_frame and camera.image.frame_id):
             subject = "its images state" if frame.points_frame else "the points state"
-            missing.append(f"{name} is not placed: {subject} no frame_id; the driver must")
+            topic = role.topic if frame.points_frame else roles.driver
+            missing.append(
+                f"{name} is not placed: {subject} no frame_id, name it: "
+                f"--set source.frames='{{{topic}: name}}'"
+            )
         elif not is_placed and camera.image is not None:
             frames = f"'{frame.points_frame}' to '{camera.image.frame_id}'"
             edge = f"{frame.points_frame} {camera.image.frame_id}"

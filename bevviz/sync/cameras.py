@@ -68,6 +68,8 @@ class Cameras:
         self.frames: dict[str, str] = {}
         self.intrinsics: dict[str, Intrinsics] = {}
         self._infos: dict[str, TopicBuffer[Intrinsics]] = {}  # by topic
+        self._info_topics = {camera.topic: camera.info_topic for camera in roles.cameras}
+        self._info_frames: dict[str, str] = {}  # by CameraInfo topic
         self._refused: dict[str, str] = {}  # why the calibrations of a topic cannot be used
         self._info_counts: Counter[str] = Counter()
         self._image_counts: Counter[str] = Counter()
@@ -76,15 +78,43 @@ class Cameras:
         """Continue with the calibrations of ``former``."""
         self._report, self._tf = former._report, former._tf
         self.intrinsics, self._infos, self._refused = former.intrinsics, former._infos, former._refused
+        self._info_frames = former._info_frames
 
     def add_image(self, topic: str, stamp: int, frame_id: str, load: Callable[[], Image]) -> bool:
         """Add an image. Return whether it replaces an image with the same stamp."""
-        self.frames[topic] = frame_id
+        self.frames[topic] = frame_id = self._optical_frame(topic, frame_id)
         self._image_counts[topic] += 1
         return self.images[topic].add(stamp, UndecodedImage(stamp, frame_id, load))
 
-    def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics) -> None:
+    def _optical_frame(self, topic: str, frame_id: str) -> str:
+        """Return the frame of an image: the stated one, or that of its CameraInfo if that fits better."""
+        if topic in self._config.source.frames:
+            return self._config.source.frames[topic]
+        info_topic = self._info_topics[topic]
+        other = self._info_frames.get(info_topic, "")
+        if not other or other.lstrip("/") == frame_id.lstrip("/"):
+            return frame_id
+        known = self._tf.frames()
+        if not frame_id:
+            chosen, why = other, "its images state no frame"
+        elif other.lstrip("/") not in known:
+            return frame_id
+        elif frame_id.lstrip("/") not in known:
+            chosen, why = other, f"its images state the frame '{frame_id}', which no transform has"
+        else:
+            chosen = other if "optical" in other and "optical" not in frame_id else frame_id
+            why = f"its images state the frame '{frame_id}', and {info_topic} states '{other}'"
+        unused = frame_id if chosen == other else other
+        helps = (
+            f"; --set source.frames='{{{topic}: {unused}}}' takes the other one" if unused in known else ""
+        )
+        used = f"'{other}' of {info_topic}" if chosen == other else f"'{frame_id}'"
+        self._report.oddities.setdefault(f"{topic} frame", f"{topic}: {why}: {used} is used{helps}")
+        return chosen
+
+    def add_info(self, topic: str, stamp: int, intrinsics: Intrinsics, frame_id: str = "") -> None:
         """Add a calibration. An image uses the calibration with the nearest stamp."""
+        self._info_frames[topic] = frame_id
         self.intrinsics[topic] = intrinsics
         self._info_counts[topic] += 1
         self._infos.setdefault(topic, TopicBuffer(self._horizon)).add(stamp, intrinsics)
@@ -122,10 +152,12 @@ class Cameras:
         try:
             lookup, compensated = self._placing.moved(reference, stamp, frame)
         except TransformError as error:
-            lacking = frame and reference.points_frame and not self._tf.knows(reference.points_frame, frame)
-            self._report.complain(
-                problems, f"{error}; source.extrinsics can state it" if lacking else str(error)
-            )
+            if not frame or not reference.points_frame:
+                helps = "; source.frames can state it"
+            else:
+                lacking = not self._tf.knows(reference.points_frame, frame)
+                helps = "; source.extrinsics can state it" if lacking else ""
+            self._report.complain(problems, f"{error}{helps}")
             return replace(camera, problems=tuple(problems))
         if image is not None and not compensated and self._placing.compensates(reference):
             self._report.complain(
@@ -174,7 +206,7 @@ class Cameras:
             )
             return None, stamp
         try:
-            image = replace(nearest[1].load(), stamp=nearest[0])
+            image = replace(nearest[1].load(), stamp=nearest[0], frame_id=nearest[1].frame_id)
             self._report.images += 1
             return image, nearest[0]
         except UserError as error:

@@ -90,7 +90,8 @@ def make_handlers(
 
     def add_transforms(message: M, static: bool) -> None:
         for transform in read(message, decode_transforms, message.topic):
-            sync.add_transform(clocked(message, transform), static, held=message.topic in roles.tf_held)
+            held = message.topic in roles.tf_held
+            sync.add_transform(clocked(message, transform), static, held=held, topic=message.topic)
 
     def clocked(message: M, transform: StampedTransform) -> StampedTransform:
         """Return the transform with the corrected stamp."""
@@ -117,7 +118,8 @@ def make_handlers(
         except MessageError as error:
             sync.refuse_camera_info(message.topic, str(error))
             raise
-        sync.add_camera_info(message.topic, info, message.header()[0], message.received)
+        stamp, frame_id = message.header()
+        sync.add_camera_info(message.topic, info, stamp, message.received, frame_id)
 
     def add_odometry(message: M) -> None:
         if sync.followed and not sync.tf.needs_odometry(sync.followed):

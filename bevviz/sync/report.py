@@ -145,8 +145,9 @@ class SyncReport:
         return self.stale > LARGE_LOSS * self.queued and self.clocks.differ_from_receipt(self.driver)
 
     def doubts(self) -> tuple[str, ...]:
-        """Return a sentence for each fault that may affect every frame: clocks, units, the vertical."""
-        return (*self.clocks.doubts(self.clocked), *self.oddities.values(), *self.upright.values())
+        """Return a sentence for each fault that may affect every frame, as of clocks and units."""
+        clocks = self.clocks.doubts(self.clocked)
+        return (*clocks, *self.tf.conflicts, *self.oddities.values(), *self.upright.values())
 
     def losses(self) -> list[str]:
         """Return a sentence for each camera and topic with content that could not be used."""

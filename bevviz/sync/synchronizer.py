@@ -175,7 +175,9 @@ class Synchronizer:
         if cloud.topic not in self._roles.lidars:
             return
         stamp = self._arrived(cloud.topic, cloud.stamp, cloud.received)
-        cloud = replace(cloud, stamp=stamp, name=self._lidar_name(cloud))
+        frame_id = self._config.source.frames.get(cloud.topic, cloud.frame_id)
+        cloud = replace(cloud, stamp=stamp, frame_id=frame_id)
+        cloud = replace(cloud, name=self._lidar_name(cloud))
         frame = cloud.frame_id.lstrip("/")
         if (former := self._lidar_frames.get(cloud.topic, frame)) != frame:
             changed = f"{cloud.topic}: its frame_id changed from '{former}' to '{frame}'"
@@ -192,6 +194,7 @@ class Synchronizer:
     def add_neighbour(self, topic: str, stamp: int, frame_id: str, received: int) -> None:
         """Add a message of the driver whose frame is not wanted. It takes what is nearest to it."""
         stamp = self._arrived(topic, stamp, received)
+        frame_id = self._config.source.frames.get(topic, frame_id)
         self._queue(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), received=received))
 
     def _queue(self, cloud: Cloud) -> None:
@@ -231,16 +234,23 @@ class Synchronizer:
                 self.report.clouds += 1
                 self._queue(Cloud(stamp, frame_id, np.zeros((0, 3), np.float32), {}, topic, received))
 
-    def add_camera_info(self, topic: str, intrinsics: Intrinsics, stamp: int, received: int) -> None:
+    def add_camera_info(
+        self, topic: str, intrinsics: Intrinsics, stamp: int, received: int, frame_id: str = ""
+    ) -> None:
         """Add a calibration on a CameraInfo topic. An image uses the calibration with the nearest stamp."""
-        self.cameras.add_info(topic, self._arrived(topic, stamp, received), intrinsics)
+        self.cameras.add_info(topic, self._arrived(topic, stamp, received), intrinsics, frame_id)
 
     def refuse_camera_info(self, topic: str, reason: str) -> None:
         """Note why a calibration cannot be used. The camera reports it if it has no other calibration."""
         self.cameras.refuse_info(topic, reason)
 
     def add_transform(
-        self, transform: StampedTransform, static: bool = False, fallback: bool = False, held: bool = False
+        self,
+        transform: StampedTransform,
+        static: bool = False,
+        fallback: bool = False,
+        held: bool = False,
+        topic: str = "",
     ) -> None:
         """Add a transform.
 
@@ -250,10 +260,11 @@ class Synchronizer:
             fallback: whether it is from odometry, which is used only if nothing else states the parent of the
                 child.
             held: whether it holds until the next one.
+            topic: its topic, for warnings.
         """
         if fallback:
             self.placing.odometry_frames.add(transform.parent.lstrip("/"))
-        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held)
+        self.tf.add(transform, static, Origin.ODOMETRY if fallback else Origin.TF, held, topic)
 
     def add_boxes(self, boxes: LabelledBoxes3D) -> None:
         """Add 3D boxes of the robot."""

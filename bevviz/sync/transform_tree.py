@@ -22,6 +22,8 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64
 from bevviz.support.limits import MAX_FRAMES
 
+SAME_ANGLE, SAME_PLACE = 0.05, 0.001  # degrees and metres; static transforms nearer to each other are equal
+
 
 class TransformError(UserError):
     """Error for two frames without a transform at a stamp."""
@@ -61,6 +63,7 @@ class _Edge:
         poses: (4, 4) parent_from_child.
         held: whether a pose holds until the next one.
         moved: whether the pose of a held edge has changed.
+        topic: topic of the pose of a static edge.
     """
 
     parent: str
@@ -70,6 +73,7 @@ class _Edge:
     poses: list[F64] = field(default_factory=list)
     held: bool = False
     moved: bool = False
+    topic: str = ""
 
     @property
     def rests(self) -> bool:
@@ -127,9 +131,15 @@ class TransformBuffer:
         self._duration = round(duration * 1e9)
         self._edges: dict[str, _Edge] = {}
         self._problems: Counter[str] = Counter()
+        self._conflicts: dict[str, str] = {}  # a sentence by child
 
     def add(
-        self, t: StampedTransform, static: bool = False, origin: Origin = Origin.TF, held: bool = False
+        self,
+        t: StampedTransform,
+        static: bool = False,
+        origin: Origin = Origin.TF,
+        held: bool = False,
+        topic: str = "",
     ) -> None:
         """Insert a sample. An unusable one is left out and listed in ``problems``.
 
@@ -138,6 +148,7 @@ class TransformBuffer:
             static: whether it holds at any time.
             origin: source of the sample.
             held: whether it holds at any time as long as no other sample differs from it.
+            topic: topic of the sample, for warnings.
         """
         parent, child = _name(t.parent), _name(t.child)
         about = f"'{parent}' -> '{child}'"
@@ -167,14 +178,37 @@ class TransformBuffer:
                 return
             edge = self._edges[child] = _Edge(parent, origin, static, held=held)
         elif static and not edge.static:
+            self._compare(edge, child, t.parent_from_child, topic)
             edge = self._edges[child] = _Edge(parent, origin, True)
+        elif edge.static:
+            self._compare(edge, child, t.parent_from_child, topic)
         elif edge.stamps and t.stamp < edge.stamps[-1] - self._duration:
             self._problems[f"the clock of {about} jumped back: its history was cleared"] += 1
             edge.keep(0, -1)
         edge.put(t.stamp, t.parent_from_child)
+        edge.topic = topic
         # Prune in chunks, which spreads the cost over many insertions.
         if edge.stamps and edge.stamps[0] < edge.stamps[-1] - self._duration * 5 // 4:
             edge.keep(edge.stamps[-1] - self._duration, edge.stamps[-1])
+
+    def _compare(self, edge: _Edge, child: str, pose: F64, topic: str) -> None:
+        """Note that a static edge is stated again with another pose."""
+        former = edge.poses[-1] if edge.poses else pose
+        if child in self._conflicts or former is pose or np.array_equal(former, pose):
+            return
+        apart = geometry.inverse(former) @ pose
+        angle = math.degrees(math.acos(max(-1.0, min(1.0, (float(np.trace(apart[:3, :3])) - 1) / 2))))
+        distance = float(np.linalg.norm(former[:3, 3] - pose[:3, 3]))
+        if angle < SAME_ANGLE and distance < SAME_PLACE:
+            return
+        numbers = [*former[:3, 3], *geometry.quaternion(former)]
+        stated = ", ".join(f"{number:.6g}" for number in numbers)
+        topics = f"twice on {topic}" if topic == edge.topic else f"on {edge.topic} and on {topic}"
+        self._conflicts[child] = (
+            f"the fixed transform '{edge.parent}' -> '{child}' is stated {topics}, {angle:.1f} degrees and "
+            f"{distance:.3f} m apart: the newer one is used; the other one is taken with "
+            f"--set source.extrinsics='{{{edge.parent} {child}: [{stated}]}}'"
+        )
 
     def _break_cycle(self, parent: str, child: str, origin: Origin) -> bool:
         """Return whether ``child`` may be below ``parent``. If needed, cut an edge of lower origin."""
@@ -262,6 +296,11 @@ class TransformBuffer:
         return {child: edge.parent for child, edge in self._edges.items()}
 
     @property
+    def conflicts(self) -> tuple[str, ...]:
+        """A sentence for each static transform that is stated with different poses."""
+        return tuple(self._conflicts.values())
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """A sentence with a count for each problem of the transforms."""
         return tuple(f"{text} ({n} time{'s' * (n > 1)})" for text, n in self._problems.items())
@@ -270,9 +309,7 @@ class TransformBuffer:
         """Return the frames below the common ancestor: from source upwards, and from target upwards."""
         up, down = self.ancestors(source), self.ancestors(target)
         if not up[0] or not down[0]:
-            raise TransformError(
-                f"no transform from '{up[0]}' to '{down[0]}': a message states no frame_id; its driver must"
-            )
+            raise TransformError(f"no transform from '{up[0]}' to '{down[0]}': a message states no frame_id")
         if up[-1] == down[-1]:
             common = next(frame for frame in up if frame in down)
             return up[: up.index(common)], down[: down.index(common)]
