@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import bevviz
+from bevviz.checks import InputChecks
+from bevviz.checks.extrinsics import candidates
 from bevviz.cli import main
+from bevviz.datasets.kitti_labels import named_rows
+from bevviz.model import geometry
+from bevviz.model.frame import F64
 from bevviz.model.input_findings import InputFinding, Remedy
+from bevviz.model.results import FrameResult
 from tests.support.small_bags import frozen_after
 
 
@@ -34,3 +44,164 @@ def test_a_finding_reads_as_one_sentence() -> None:
     assert str(InputFinding("clock", "/scan", "/scan is 0.5 s late", remedy)) == (
         "/scan is 0.5 s late: sync.offsets={/scan: -0.5} (pairs 50 of 50 frames)"
     )
+
+
+# --- extrinsics --------------------------------------------------------------------------------
+
+OPTICAL = geometry.transform([0, 0, 0], [-0.5, 0.5, -0.5, 0.5])  # body from optical axes
+
+
+@pytest.fixture(scope="module")
+def results() -> list[FrameResult]:
+    with bevviz.simulate(60) as drive:
+        return list(drive)[::12]
+
+
+def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> F64:
+    """Return the (4, 4) rotation by degrees about x, then y, then z."""
+    matrix = np.eye(4)
+    for axis, angle in enumerate((x, y, z)):
+        matrix[:3, :3] = geometry.rotations(axis, np.radians([angle]))[0] @ matrix[:3, :3]
+    return matrix
+
+
+def scaled(pose: F64, factor: float) -> F64:
+    pose = pose.copy()
+    pose[:3, 3] *= factor
+    return pose
+
+
+def read_in_order(pose: F64) -> F64:
+    """Return a pose whose quaternion x, y, z, w is read as w, x, y, z."""
+    return geometry.transform_wxyz(pose[:3, 3], geometry.quaternion(pose))
+
+
+def placed(result: FrameResult, camera_from_points: F64) -> FrameResult:
+    """Return the result with another stated pose of its camera."""
+    (camera,) = result.cameras
+    stated = replace(camera.camera, camera_from_points=camera_from_points, mounting=camera_from_points)
+    return replace(result, cameras=(replace(camera, camera=stated),))
+
+
+def judged(results: list[FrameResult], pose: F64, *, detector: bool = True) -> list[InputFinding]:
+    """Return the findings about a camera that is stated at this (4, 4) points_from_camera."""
+    with bevviz.simulate(1) as drive:
+        checks = InputChecks(drive.frames, drive.config)
+    for result in results:
+        wrong = placed(result, geometry.inverse(pose))
+        if detector:
+            checks.observe(wrong)
+        else:
+            frame = replace(wrong.frame, cameras=tuple(camera.camera for camera in wrong.cameras))
+            checks.observe_frame(frame, follows=False)
+    return [finding for finding in checks.findings if finding.kind == "calibration"]
+
+
+def proposed(finding: InputFinding) -> F64:
+    """Return the (4, 4) pose that a remedy states."""
+    assert finding.remedy is not None
+    (setting,) = finding.remedy.settings
+    values = [float(value) for value in setting.partition("[")[2].rstrip("]}").split(",")]
+    return geometry.transform(values[:3], values[3:])
+
+
+MISTAKES: dict[str, Callable[[F64], F64]] = {
+    "the inverse of the stated pose": geometry.inverse,
+    "optical axes (z ahead) instead": lambda right: right @ geometry.inverse(OPTICAL),
+    "turned by 180 degrees about the optical axis": lambda right: right @ turned(z=180),
+    "divided by 100": lambda right: scaled(right, 100),
+    "the inverse, and the translation divided by 100": lambda right: scaled(geometry.inverse(right), 100),
+    "the LiDAR's axes turned by": lambda right: turned(z=90) @ right,
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_wrong_extrinsic_is_named_with_the_pose_that_would_do(
+    results: list[FrameResult], name: str
+) -> None:
+    camera = results[0].cameras[0].camera
+    assert camera.camera_from_points is not None
+    right = geometry.inverse(camera.camera_from_points if camera.mounting is None else camera.mounting)
+    stated = MISTAKES[name](right)
+    (finding,) = judged(results, stated)
+    assert finding.subject == camera.name and finding.remedy is not None
+    assert name in finding.remedy.text and finding.remedy.tried
+    difference = geometry.inverse(proposed(finding)) @ right
+    assert np.linalg.norm(difference[:3, 3]) < 0.25
+    assert np.trace(difference[:3, :3]) > 1 + 2 * np.cos(np.radians(3))
+
+
+def test_a_quaternion_in_another_order_is_tried() -> None:
+    """Both orders, of the pose and of its inverse."""
+    right = turned(10, 40, 70) @ geometry.transform([0.1, 0.2, 0.3], [0, 0, 0, 1])
+    x, y, z, w = geometry.quaternion(right)
+    for pose in (geometry.transform(right[:3, 3], (w, x, y, z)), read_in_order(right)):
+        assert any(np.allclose(other, right, atol=1e-6) for _, other in candidates(pose, {}))
+        inverse = geometry.inverse(right)
+        assert any(
+            np.allclose(other, inverse, atol=1e-6) for _, other in candidates(geometry.inverse(pose), {})
+        )
+
+
+def test_a_right_extrinsic_is_not_doubted(results: list[FrameResult]) -> None:
+    camera = results[0].cameras[0].camera
+    assert camera.camera_from_points is not None
+    right = geometry.inverse(camera.camera_from_points)
+    for pose in (right, right @ turned(x=3), right @ turned(z=4)):
+        assert not judged(results, pose)
+        assert not judged(results, pose, detector=False)
+
+
+def test_the_vertical_tells_of_a_wrong_extrinsic_without_a_detector(results: list[FrameResult]) -> None:
+    camera = results[0].cameras[0].camera
+    assert camera.camera_from_points is not None
+    right = geometry.inverse(camera.camera_from_points)
+    (inverse,) = judged(results, geometry.inverse(right), detector=False)
+    assert "down axis of its image points" in inverse.text
+    assert np.allclose(proposed(inverse), right, atol=1e-3)
+    (body,) = judged(results, right @ geometry.inverse(OPTICAL), detector=False)
+    assert "optical axes" in str(body) and np.allclose(proposed(body)[:3, :3], right[:3, :3], atol=0.05)
+
+
+@pytest.fixture
+def folder(shared: Path, tmp_path: Path) -> Path:
+    """Write a plain folder of KITTI's drive whose calibration is stated as its inverse."""
+    rows = named_rows(shared / "kitti_drive" / "calib.txt")
+    rect, velo, shift = np.eye(4), np.eye(4), np.eye(4)
+    rect[:3, :3], velo[:3] = np.reshape(rows["R0_rect"], (3, 3)), np.reshape(rows["Tr_velo_to_cam"], (3, 4))
+    projection = np.reshape(rows["P2"], (3, 4))
+    shift[:3, 3] = np.linalg.inv(projection[:, :3]) @ projection[:, 3]
+    pose = shift @ rect @ velo  # camera from LiDAR
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "lidar").symlink_to(shared / "kitti_drive" / "velodyne")
+    (tmp_path / "drive" / "camera").symlink_to(shared / "kitti_drive" / "image_2")
+    stated = [*pose[:3, 3].tolist(), *geometry.quaternion(pose).tolist()]
+    camera = {"pose": stated, "K": projection[:, :3].ravel().tolist()}
+    lidar = {"pose": [0, 0, 0, 0, 0, 0, 1]}
+    text = json.dumps({"lidars": {"lidar": lidar}, "cameras": {"camera": camera}})
+    (tmp_path / "drive" / "calibration.yaml").write_text(text)
+    return tmp_path / "drive"
+
+
+def test_the_remedy_for_a_wrong_extrinsic_works(
+    folder: Path, shared: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every command says it, and the setting gives the objects of the right pose."""
+    model = str(shared / "models" / "yolox_nano.onnx")
+    with bevviz.open(folder, model=model, every=6) as drive:
+        assert sum(len(result.objects.names) for result in drive if result.objects is not None) < 5
+        (finding,) = [finding for finding in drive.checks.findings if finding.kind == "calibration"]
+    assert finding.remedy is not None
+    assert "the inverse of the stated pose would do" in finding.remedy.text
+    with bevviz.open(folder, model=model, every=6, set=list(finding.remedy.settings)) as drive:
+        count = sum(len(result.objects.names) for result in drive if result.objects is not None)
+        assert count >= 27
+        assert not [finding for finding in drive.checks.findings if finding.kind == "calibration"]
+    for command in (
+        ["info", str(folder), "--model", model],
+        ["why", str(folder), "--at-frame", "3", "--limit", "1", "--model", model],
+        ["calib", str(folder), "--frames", "0:2", "--every", "1"],
+    ):
+        main(command)
+        output = capsys.readouterr()
+        assert "the inverse of the stated pose" in " ".join((output.out + output.err).split()), command

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from bevviz.anomalies import Onsets
 from bevviz.anomalies.sensors import SensorWatch
-from bevviz.checks.read_input import ReadInput
+from bevviz.checks.camera_views import CameraView, view_of
+from bevviz.checks.extrinsics import wrong_extrinsics
+from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.config import Config
 from bevviz.model.frame import Frame
 from bevviz.model.input_findings import InputFinding
 from bevviz.model.protocols import Items, Observer
-from bevviz.model.results import Anomaly, FrameResult
+from bevviz.model.results import Anomaly, CameraResult, FrameResult
 
 Check = Callable[[ReadInput], Iterable[InputFinding]]
 
+VIEWS = 6  # most images of a camera that are kept; those with detections replace others
 SENSOR_KINDS = ("sensor", "sync", "tf")  # kinds of anomalies that are about the input
 
 
@@ -33,7 +36,7 @@ def sensor_faults(read: ReadInput) -> Iterator[InputFinding]:
         yield InputFinding(anomaly.kind, anomaly.subject, text)
 
 
-CHECKS: tuple[Check, ...] = (source_warnings, sensor_faults)
+CHECKS: tuple[Check, ...] = (source_warnings, wrong_extrinsics, sensor_faults)
 
 
 class InputChecks(Observer[FrameResult]):
@@ -66,6 +69,12 @@ class InputChecks(Observer[FrameResult]):
         result = FrameResult.unprocessed(frame, self._read.config)
         self._collect(result, self._onsets.of([*self._watch.update(result)] if follows else []))
 
+    def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield the frames, and collect what the checks need of each."""
+        for frame in frames:
+            self.observe_frame(frame, follows=False)
+            yield frame
+
     def _collect(self, result: FrameResult, new: Iterable[Anomaly]) -> None:
         """Collect what the checks need of one frame, with the anomalies that began in it."""
         with self._lock:
@@ -74,6 +83,13 @@ class InputChecks(Observer[FrameResult]):
                     key = anomaly.kind, anomaly.subject
                     self._read.faults.first.setdefault(key, anomaly)
                     self._read.faults.count[key] += 1
+            for row, camera in enumerate(result.cameras):
+                sample = self._read.cameras.get(camera.camera.name)
+                if sample is None or _needs_more(sample.views, camera):
+                    view = view_of(result, row, result.config.objects.sizes)
+                    if view is not None:
+                        self._read.cameras[camera.camera.name] = _with(sample, view, result, camera)
+            self._read.config = result.config
 
     @property
     def findings(self) -> list[InputFinding]:
@@ -86,3 +102,20 @@ class InputChecks(Observer[FrameResult]):
     def warnings(self) -> list[str]:
         """The same as sentences."""
         return [str(finding) for finding in self.findings]
+
+
+def _needs_more(views: Sequence[CameraView], camera: CameraResult) -> bool:
+    """Return whether another image of a camera would tell more than those of the sample."""
+    has_detections = camera.detections is not None and bool(camera.detections.kept.any())
+    return has_detections and (len(views) < VIEWS or not all(len(view.inner) for view in views))
+
+
+def _with(
+    sample: CameraSample | None, view: CameraView, result: FrameResult, camera: CameraResult
+) -> CameraSample:
+    """Return the sample with another image. An image with detections takes the place of one without any."""
+    assert camera.camera.image is not None
+    views = [] if sample is None else [v for v in sample.views if len(v.inner) or not len(view.inner)]
+    if len(view.inner) or not views:
+        views.append(view)
+    return CameraSample(result.frame.points_frame, camera.camera.image.frame_id.lstrip("/"), views)

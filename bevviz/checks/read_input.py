@@ -6,7 +6,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from bevviz.bags.source import BagSource
+from bevviz.checks.camera_views import CameraView
 from bevviz.config import Config
+from bevviz.model.input_findings import InputFinding
 from bevviz.model.protocols import Items
 from bevviz.model.results import Anomaly
 
@@ -20,6 +22,25 @@ class SensorFaults:
 
 
 @dataclass(slots=True)
+class CameraSample:
+    """Sample of the images of one camera.
+
+    Attributes:
+        points_frame: frame of the points, as ``source.extrinsics`` names it.
+        image_frame: frame of the images.
+        views: the images, at least one.
+        finding: finding about the camera's pose, if it is judged.
+        judged: whether the pose is judged. It is judged again after another image.
+    """
+
+    points_frame: str
+    image_frame: str
+    views: list[CameraView]
+    finding: InputFinding | None = None
+    judged: bool = False
+
+
+@dataclass(slots=True)
 class ReadInput:
     """What was read of a drive or from a robot so far.
 
@@ -27,11 +48,13 @@ class ReadInput:
         source: the frames. Its ``warnings`` are the oddities that it counted.
         config: configuration of the run.
         faults: faults of the sensors in the frames.
+        cameras: sample of the images of each placed camera, by name.
     """
 
     source: Items[object]
     config: Config
     faults: SensorFaults = field(default_factory=SensorFaults)
+    cameras: dict[str, CameraSample] = field(default_factory=dict)
 
     @property
     def bag(self) -> BagSource | None:

@@ -54,6 +54,7 @@ class CalibOptions:
 def _calib(options: CalibOptions) -> int:
     from bevviz.calib import calibrate, gather
     from bevviz.calib.result import CalibrationResults
+    from bevviz.checks import InputChecks
     from bevviz.errors import UserError
 
     config = load_config(options)
@@ -68,8 +69,9 @@ def _calib(options: CalibOptions) -> int:
         frames = replace(frames, every=max(1, total // FRAMES))
     with open_bag(options.drive, frames, config) as source:
         bar = progress.bar(source, total=source.total, unit="frame", desc="find edges")
-        shots = gather(bar, names, source.pose)
-        warn(source.warnings)
+        checks = InputChecks(source, config)
+        shots = gather(checks.watched(bar), names, source.pose)
+        warn(checks.warnings)
     results = []
     for name in names:
         bar_format = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"

@@ -28,6 +28,8 @@ from bevviz.errors import UserError, printable
 from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
+from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import perceive
 from bevviz.recording.provenance import model_path
 from bevviz.support import progress, table
 from bevviz.support.json_form import LEFT_OUT, json_form
@@ -194,10 +196,25 @@ def describe_bag(
         frame = first[-1] if first else None
         info = _describe(source.recording, roles, config, find_missing(roles, frame, config), frame, source)
         on_contents(info)
+        for result in _detected(first, config):
+            checks.observe(result)
         for read in chain(first, frames):
             checks.observe_frame(read, follows=not source.recording.single_frames)
         missing = (*source.large_losses(), *info.missing)
         return replace(info, missing=missing, warnings=tuple(checks.warnings))
+
+
+def _detected(frames: Sequence[Frame], config: Config) -> Iterator[FrameResult]:
+    """Yield results of frames with the detections of the detector's file, if it can be used."""
+    if model_path(config) is None:
+        return
+    try:
+        stages = _alone(config, "detector")
+    except UserError:  # It is listed as missing.
+        return
+    config = config.restated({"objects": ObjectsConfig()})
+    for frame in frames:
+        yield perceive(frame, config, stages)
 
 
 def first_frames(source: BagSource, least: int, whole: bool) -> Iterator[Frame]:
