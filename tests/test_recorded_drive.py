@@ -21,6 +21,7 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.pipeline.session import Session
 from bevviz.recording import blueprints, entities
+from bevviz.recording.addresses import RowCache
 from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
@@ -162,6 +163,30 @@ def test_without_truth_unexplained_objects_are_listed(result: FrameResult) -> No
 
 
 # --- what is shown with other values ------------------------------------------------------------
+
+
+def test_a_click_on_a_frame_with_other_values_is_about_these(bag: Path) -> None:
+    """The rows are those of the result as tried; the sensors' input has those of the drive as opened."""
+    settings = ("clustering.min_cluster_points=100000",)
+    with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
+        bench = RecordedDrive(drive, again.frames)
+        bench.observe(drive.at(frame=0))
+        bench.try_values(0, settings, bench.open_overlay().attempt())
+        opened, tried = bench.look(0), bench.look(0, settings)
+        assert opened.objects and tried.clusters is not None and not tried.clusters.kept.any()
+        aside, last = entities.SET_ASIDE.path(opened.frame.lidar), len(tried.clusters) - 1
+        clicks = [
+            ((), entities.FUSED, 1, Selection(object=1)),
+            (settings, entities.TRUTH, 2, Selection(truth=2)),
+            (settings, aside, last, Selection(cluster=last)),
+            (settings, entities.FUSED, 1, None),
+        ]
+        for _ in ("as drawn", "drawn again, because the rows of the frame were dropped"):
+            assert [bench.select(0, *click, ()) for *click, _ in clicks] == [one[-1] for one in clicks]
+            bench.recording._rows = RowCache()
+        same = (f"clustering.eps={drive.config.clustering.eps}",)
+        assert bench.look(0, same) is opened, "nothing is changed"
+        bench.close()
 
 
 def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path) -> None:
