@@ -199,7 +199,10 @@ class DriveRecording(Closable):
         Over the input of the sensors, a frame with other values shows the frame as opened.
         """
         rows = self._rows.get((number, settings))
-        return rows if rows is None or not settings else {**(self._rows.get((number, ())) or {}), **rows}
+        if rows is None or not settings:
+            return rows
+        opened = self._rows.get((number, ())) or {}
+        return {path: opened[path] for path in opened.keys() - self._logger.results} | dict(rows)
 
     def _log(
         self,
