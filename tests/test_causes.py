@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import pytest
 from bevviz.cli import main
 from bevviz.fleet.causes import Bound, Findings, compare_causes, find_causes
 from bevviz.fleet.findings import SCHEMA
+from bevviz.fleet.summary import page
 from tests.support.documented_json import check
 
 Row = dict[str, Any]
@@ -107,6 +109,28 @@ def test_chance_gives_no_cause() -> None:
         causes = find_causes(findings(batch(seed=seed)))
         assert not causes.causes
         assert causes.rest["missed"].total() > 10
+
+
+def test_what_makes_objects_hard_is_no_cause() -> None:
+    """Most objects with few points are missed in any drive, for several reasons."""
+    rng = np.random.default_rng(1)
+
+    def hard(row: Row) -> str:
+        row["points"] = float(rng.integers(10, 60))
+        reasons = ("not detected", "below threshold", "noise")
+        return str(rng.choice(reasons)) if row["points"] < 30 and rng.random() < 0.8 else ""
+
+    causes = find_causes(findings(batch(hard)))
+    assert causes.totals["missed"] > 500 and not causes.causes
+    text = "\n".join(causes.lines(5))
+    assert "without a condition in common" in text and "points" not in text
+
+
+def test_the_page_of_a_batch_shows_the_causes() -> None:
+    causes = find_causes(findings(batch(lambda row: far_persons(row) or dark(row))))
+    text = page("runs", [], [], [], "", causes)
+    assert all(html.escape(cause.title) in text for cause in causes.causes)
+    assert causes.causes[0].examples[0].command in text
 
 
 def test_many_frames_of_few_objects_are_no_cause() -> None:

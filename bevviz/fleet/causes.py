@@ -25,7 +25,10 @@ from bevviz.support import table as text_table
 from bevviz.support.json_form import LEFT_OUT, WhereKnown, json_form, rounded
 
 MOST = 30  # causes of one kind
-LEAST_LIFT = 1.2  # of a cause; less is as usual
+# Limits of a cause. A condition below them says which objects are hard, and not why they are lost.
+ONE_REASON = 0.5  # least share of its findings that have the same reason
+LEAST_LIFT, PLAIN_LIFT = 3.0, 5.0  # least ratio to the usual rate: where it is the rule, and elsewhere
+THE_RULE = 0.5  # rate under the condition from which it is the rule there
 EXAMPLES = 3
 SAME_OBJECT = 10  # consecutive frames whose findings of one class count as one object, where no id is known
 CHANGED = 2.0  # ratio of rates from which a cause has come or gone between two batches
@@ -508,10 +511,17 @@ def _causes_of(findings: Findings, kind: str, rows: I64) -> list[Cause]:
         if len(np.unique(units[of_reason])) >= LEAST_UNITS:
             targets[reason] = of_reason
     scales = [*_attributes(findings, kind, rows, positive)]
-    slices = find_slices([attribute for attribute, _ in scales], targets, units, MOST)
+
+    def accepts(found: Slice) -> bool:
+        rate = len(found.positives) / len(found.rows)
+        lift = rate / float(targets[found.target].mean())
+        is_plain = lift >= (LEAST_LIFT if rate >= THE_RULE else PLAIN_LIFT)
+        [(_, most)] = _reasons(findings, rows[found.positives]).most_common(1)
+        return is_plain and most >= ONE_REASON * len(found.positives)
+
+    slices = find_slices([attribute for attribute, _ in scales], targets, units, MOST, accepts)
     resolve = {attribute.name: resolve for attribute, resolve in scales}
-    causes = (_cause(findings, kind, rows, found, resolve, targets) for found in slices)
-    return [cause for cause in causes if cause.lift >= LEAST_LIFT]
+    return [_cause(findings, kind, rows, found, resolve, targets) for found in slices]
 
 
 def _cause(

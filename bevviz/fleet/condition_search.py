@@ -11,7 +11,7 @@ of any false slice. Rows of one object are not independent, so that the ratio is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,22 +78,33 @@ class Slice:
 
 
 def find_slices(
-    attributes: Sequence[Attribute], targets: Mapping[str, Bool], units: I64, most: int
+    attributes: Sequence[Attribute],
+    targets: Mapping[str, Bool],
+    units: I64,
+    most: int,
+    accepts: Callable[[Slice], bool],
 ) -> Iterator[Slice]:
     """Yield slices, the most significant first. Each covers its rows for the following ones.
+
+    A slice that is not accepted covers its rows for its own target alone.
 
     Args:
         attributes: columns of N rows.
         targets: (N,) rows with an outcome, by its name. The best slice of all targets comes next.
         units: (N,) object of each row. Rows of one object count less than as many objects.
         most: largest number of slices.
+        accepts: whether a significant slice says enough.
     """
     free = np.ones(len(units), bool)
+    free_of = {name: free.copy() for name in targets}
     best: dict[str, Slice | None] = {}
     for _ in range(most if attributes else 0):
         for name, positive in targets.items():
             if name not in best:
-                best[name] = _purest(attributes, name, positive, free, units)
+                best[name] = found = _purest(attributes, name, positive, free & free_of[name], units)
+                while found is not None and not accepts(found):
+                    free_of[name][found.rows] = False
+                    best[name] = found = _purest(attributes, name, positive, free & free_of[name], units)
         slices = [found for found in best.values() if found is not None]
         if not slices:
             return
