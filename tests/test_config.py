@@ -126,3 +126,9 @@ def test_clusters_that_could_have_no_size_are_refused() -> None:
             config.load(settings=settings)
     least = config.load(settings=["clustering.max_cluster_points=10"]).clustering
     assert (least.min_cluster_points, least.max_cluster_points) == (10, 10)
+
+
+def test_a_recording_is_no_configuration(tmp_path: Path) -> None:
+    (tmp_path / "drive.rrd").write_bytes(b"RRF2\xff")
+    with pytest.raises(UserError, match=r"drive\.rrd is a recording; --config takes a YAML file"):
+        config.load(tmp_path / "drive.rrd")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from bevviz.live.inputs import AGAIN, TopicWatch
+from bevviz.live.problems import CurrentProblems
 
 
 class Watched:
@@ -13,7 +16,8 @@ class Watched:
     def __init__(self) -> None:
         self.now = 0.0
         self.said: list[str] = []
-        self.watch = TopicWatch(self.said.append, lambda: self.now)
+        self.problems = CurrentProblems(self.said.append)
+        self.watch = TopicWatch(self.problems, lambda: self.now)
 
     def stream(self, topic: str, seconds: float, step: float = 0.1, size: int = 100) -> None:
         end = self.now + seconds
@@ -56,7 +60,9 @@ def test_an_unusable_topic_is_reported_once_at_its_start() -> None:
         watch.mark_unusable("/points", "/points: no field z")
     assert said == ["a message cannot be used: /points: no field z"]
     assert watch.states({"/points": True}) == {"/points": "unusable"}
-    assert watch.warnings == ["3 message(s) of /points could not be used, the first: /points: no field z"]
+    assert watch.damage.sentences == [
+        "3 message(s) of /points could not be used, the first: /points: no field z"
+    ]
     watch.mark_usable("/points")
     assert said[1:] == ["/points: its messages can be used again"]
     assert watch.states({"/points": True}) == {"/points": "ok"}
@@ -69,15 +75,18 @@ def test_an_unusable_topic_is_reported_once_at_its_start() -> None:
     assert said[2:] == ["a message cannot be used: /points: no field z"]
 
 
-def test_notes_are_told_when_they_begin_change_and_end() -> None:
-    watched = Watched()
-    watch, said = watched.watch, watched.said
-    watch.report("camera", "", "never told")
-    for text in ("gone", "gone", "gone for long"):
-        watch.report("camera", text, "back")
-    assert watch.warnings == ["gone for long"]
-    watch.report("camera", "", "back")
-    watch.report_once("found out")
-    watch.report_once("found out")
-    assert said == ["gone", "gone for long", "back", "found out"]
-    assert watch.warnings == []
+def test_problems_are_told_when_they_begin_change_and_end() -> None:
+    said: list[str] = []
+    problems = CurrentProblems(said.append)
+    problems.set("clock", "/lidar", "", "never told")
+    for text in ("0.70 s ahead", "0.71 s ahead", "0.72 s behind"):
+        problems.set("clock", "/lidar", text, "right again", "set sync.offsets")
+    assert problems.sentences == ["0.72 s behind: set sync.offsets"]
+    (problem,) = problems.of("/lidar")
+    assert problem.finding.kind == "clock" and problem.since == pytest.approx(time.time(), abs=60)
+    problems.set("clock", "/lidar", "")
+    problems.tell_once("found out")
+    problems.tell_once("found out")
+    first, second = "0.70 s ahead: set sync.offsets", "0.72 s behind: set sync.offsets"
+    assert said == [first, second, "right again", "found out"]
+    assert problems.sentences == []

@@ -138,8 +138,12 @@ def test_a_wrong_domain_is_refused(domain: str, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_wrong_arguments_are_refused() -> None:
-    with pytest.raises(UserError, match="ROS does not start"):
+    with pytest.raises(UserError, match="-r no rule: expected FROM:=TO"):
         LiveSource(load(), arguments=["-r", "no rule"])
+    with pytest.raises(UserError, match="-r __ns:=van: a namespace begins with a slash: __ns:=/van"):
+        LiveSource(load(), arguments=["-r", "__ns:=van"])
+    with pytest.raises(UserError, match="ROS does not start"):
+        LiveSource(load(), arguments=["-p", "no value"])
 
 
 def test_a_late_publisher_may_restart_with_other_qos() -> None:

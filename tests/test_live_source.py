@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
+from bevviz.drivers.video import VideoPacket
 from bevviz.errors import UserError
 from bevviz.extras.demo.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
 from bevviz.messages.encode import encode_boxes_3d, encode_cloud
 from bevviz.model.frame import Boxes3D, Cloud, Frame
 from bevviz.pipeline.run import DropPolicy, run
+from bevviz.sync.video import Video
 from tests.support.played_drive import drive_of
 from tests.support.ros_player import Play
 from tests.support.waiting import until
@@ -28,7 +30,9 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
-from bevviz.live.source import LiveSource, remedy
+from bevviz.live.input_problems import remedy
+from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.source import LiveSource
 from tests.support.fed_graph import NEEDED, FedGraph, Player, fed_graph, joined
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -302,7 +306,7 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(graph: FedGraph, cloud: 
             graph.publish(stranger, b"\0\1\0\0\0\0\0\0")
             graph.advance(0.1)
         clash = "/a has two types: /robot (sensor_msgs/msg/PointCloud2) is received, /stranger (std_msgs"
-        assert session.told(clash) and session.frames and session.source.states == {"/a": "ok"}
+        assert session.told(clash) and session.frames and session.source.states == {"/a": "degraded"}
         graph.withdraw(stranger)
         graph.advance(0.6)
         assert session.told("/a has one type")
@@ -312,3 +316,21 @@ def test_what_helps_against_losses_depends_on_the_size() -> None:
     assert "segment" in remedy(1.9e6, 1.9e6) and "docs/live.md" in remedy(1.9e6, 1.9e6)
     assert "clouds or images fill the transport" in remedy(300, 1.9e6)
     assert "segment" not in remedy(300, 300) and "queue" in remedy(300, 300)
+
+
+def test_a_topic_of_an_unknown_type_is_named_as_not_saved(graph: FedGraph) -> None:
+    graph.advertise("/arm/state", "arm_msgs/msg/State")
+    player = Player(graph)
+    with joined(graph, raw=RawRecorder(load().live)) as session:
+        player.play(NEEDED + 2.0)
+        told = "/arm/state is not among the saved messages: arm_msgs/msg/State"
+        assert session.told(told), session.said
+
+
+def test_a_video_without_a_key_frame_is_named() -> None:
+    video = Video("/camera/h264")
+    assert not video.awaits_key
+    video.add(VideoPacket(video.topic, 1, 1, "camera", "h264", b"\0", False))
+    assert video.awaits_key
+    video.add(VideoPacket(video.topic, 2, 2, "camera", "h264", b"\0", True))
+    assert not video.awaits_key

@@ -168,7 +168,8 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
             diagnostics.observe(result)
 
         live = Live(source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot="")
-        diagnostics.every_second(lambda: diagnostics.publish(live.numbers, ["two LiDARs are one"]))
+        live.problems.set("robots", "namespaces", "two robots are merged", "", "--ros-args -r __ns:=/a")
+        diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.problems.current))
 
         def feed() -> None:
             for level, text in ((0, "spins"), (1, "is slow")):
@@ -177,7 +178,7 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
                     robot.path()
                     play_in_step(player, live, source)
             robot.say("/bevviz/mark", STRING, make(STRING, data=MARK))
-            assert live.mark(PAGE_MARK)
+            live.mark(PAGE_MARK)
             for _ in range(10):
                 play_in_step(player, live, source)
             until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
@@ -240,7 +241,10 @@ def test_bevviz_publishes_its_own_diagnostics(flight: Flight) -> None:
     by_name = {status.name: status for status in flight.heard}
     assert set(by_name) == {f"bevviz: {part}" for part in PARTS}
     assert int(by_name["bevviz: sources"].level) == 1
-    assert by_name["bevviz: sources"].message == "two LiDARs are one"
+    texts = {pair.key: pair.value for pair in by_name["bevviz: sources"].values}
+    merged = "two robots are merged: --ros-args -r __ns:=/a"
+    assert texts["robots namespaces"].startswith(f"{merged} (for ")
+    assert by_name["bevviz: sources"].message.startswith(merged)
     numbers = {pair.key: pair.value for pair in by_name["bevviz: pipeline"].values}
     assert float(numbers["frames"]) > 0 and float(numbers["raw_mb"]) > 0 and "dropped: source" in numbers
 

@@ -30,6 +30,7 @@ from bevviz.support import progress
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
+    from bevviz.live.problems import CurrentProblems
     from bevviz.live.publish import ResultSink
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
@@ -246,7 +247,7 @@ def _watch_robot(
             control.save = orders.save = live.save
             orders.change = live.update
             if diagnostics is not None:
-                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.checks.warnings))
+                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.problems.current))
 
             def show(config: Config) -> None:
                 orders.show(config)
@@ -256,7 +257,8 @@ def _watch_robot(
             return show
 
         callback = on_result if publisher is not None or diagnostics is not None else None
-        return _watch(source, settings, options, notes, loader, callback, follow, control, raw)
+        problems = source.problems
+        return _watch(source, settings, options, notes, loader, callback, follow, control, raw, problems)
 
 
 def _watch(
@@ -269,6 +271,7 @@ def _watch(
     follow: Callable[[Live], Callable[[Config], None]],
     control: Control | None = None,
     raw: RawRecorder | None = None,
+    problems: CurrentProblems | None = None,
 ) -> int:
     """Run until the source ends or the user ends it."""
     from bevviz.live.runtime import Live, Outputs
@@ -292,6 +295,7 @@ def _watch(
         control=control,
         raw=raw,
         robot=options.run.robot,
+        problems=problems,
     )
     live.on_change = follow(live)
     for url in live.urls:

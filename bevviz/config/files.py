@@ -19,6 +19,8 @@ from bevviz.errors import UserError, first_line
 from bevviz.support.files import read_text
 from bevviz.support.limits import CONFIG_LIMIT, MOST_DOTS, MOST_VALUES
 
+RECORDINGS = frozenset({".rrd", ".mcap", ".bag", ".db3"})  # suffixes of files that are no configuration
+
 
 @dataclass(frozen=True, slots=True)
 class Layer:
@@ -63,6 +65,8 @@ def _read_yaml(path: Path, pipe: bool) -> Mapping[str, Any]:
     Raises:
         UserError: the file cannot be read, or is no tree of sections.
     """
+    if path.suffix in RECORDINGS:
+        raise UserError(f"{path} is a recording; --config takes a YAML file, as 'bevviz config' prints it")
     problem = f"{path}: cannot read the configuration"
     tree = parse_yaml(read_text(path, CONFIG_LIMIT, problem=problem, pipe=pipe), str(path))
     if tree is None:

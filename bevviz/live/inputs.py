@@ -7,6 +7,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from statistics import median
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from bevviz.config import Config, SourceConfig, stage_topics
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic
 from bevviz.live.live_message import LiveMessage
+from bevviz.live.problems import CurrentProblems
 from bevviz.messages import surroundings
 from bevviz.messages.decoders import declared_decoder
 from bevviz.messages.foreign_boxes import holds_boxes
@@ -56,19 +58,17 @@ class _Arrivals:
 
 
 class TopicWatch:
-    """Counter of received messages and record of the current problems.
+    """Counter of received and unusable messages.
 
     Args:
-        tell: called with one sentence each time a problem begins or ends.
+        problems: takes the topics whose messages are unusable.
         clock: returns seconds, for tests.
     """
 
-    def __init__(self, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
-        self.tell, self._clock = tell, clock
-        self._reported: set[str] = set()
+    def __init__(self, problems: CurrentProblems, clock: Callable[[], float] = time.monotonic) -> None:
+        self._problems, self._clock = problems, clock
         self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
-        self._damage = UnusableMessages()
-        self._notes: dict[str, str] = {}  # subject -> its sentence, while it holds
+        self.damage = UnusableMessages()
 
     # --- messages ------------------------------------------------------------------------------
 
@@ -93,15 +93,16 @@ class TopicWatch:
     def mark_usable(self, topic: str) -> None:
         """Record that a message of a topic could be used."""
         arrivals = self._topics[topic]
-        arrivals.row = 0
-        self.report(f"{topic} unusable", "", f"{topic}: its messages can be used again")
+        if arrivals.row:
+            arrivals.row = 0
+            self._problems.set("unusable", topic, "", f"{topic}: its messages can be used again")
 
     def mark_unusable(self, topic: str, reason: str) -> None:
         """Record a message that cannot be used. The reason names the topic."""
         arrivals = self._topics[topic]
         arrivals.row += 1
-        if self._damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
-            self.report(f"{topic} unusable", f"a message cannot be used: {reason}")
+        if self.damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
+            self._problems.set("unusable", topic, f"a message cannot be used: {reason}")
 
     def silent_for(self, topic: str, least: float = SILENCE) -> float:
         """Return the seconds since the last message of a stream, or 0 if that is a usual time.
@@ -114,8 +115,17 @@ class TopicWatch:
         silent = self._clock() - times[-1]
         if silent <= least:  # Most are: this is asked many times in a second.
             return 0.0
-        steps = [after - before for before, after in zip(times, list(times)[1:], strict=False)]
-        return silent if silent > 5 * median(steps) else 0.0
+        return silent if silent > 5 * self.step(topic) else 0.0
+
+    def step(self, topic: str, newest: int = 0) -> float:
+        """Return the usual seconds between two messages of a topic, or 0 if it is no stream yet.
+
+        ``newest``: number of the newest steps that count. 0: all that are known.
+        """
+        times = self._topics[topic].times if topic in self._topics else ()
+        if len(times) < STREAM:
+            return 0.0
+        return median([after - before for before, after in pairwise(times)][-newest:])
 
     def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
         """Return the state of each topic, given whether it has a publisher."""
@@ -128,28 +138,6 @@ class TopicWatch:
             return "silent"
         return "unusable" if topic in self._topics and self._topics[topic].row else "ok"
 
-    # --- current problems ----------------------------------------------------------------------
-
-    def report(self, about: str, text: str, over: str = "") -> None:
-        """Report ``text`` when it begins to hold, and ``over`` when ``text`` is empty again."""
-        before = self._notes.pop(about, "")
-        if text:
-            self._notes[about] = text
-        if text != before and (text or over):
-            self.tell(text or over)
-
-    def report_once(self, text: str) -> None:
-        """Report a sentence the first time, and never again."""
-        if text not in self._reported:
-            self._reported.add(text)
-            self.tell(text)
-
-    @property
-    def warnings(self) -> list[str]:
-        """Sentences that hold now, followed by the counts of unusable messages."""
-        holds = [text for about, text in self._notes.items() if not about.endswith(" unusable")]
-        return [*holds, *self._damage.sentences]
-
 
 class Inputs:
     """Roles of the topics, and a handler for each topic with a role. Only the receiving thread may use it.
@@ -157,14 +145,14 @@ class Inputs:
     Args:
         config: states topics and synchronisation.
         resolve: returns the name on the graph of a topic that the user states.
-        watch: takes reports of problems.
+        problems: takes topics that do not fit the configuration.
         results: also the robot's bird's-eye view and obstacles have roles.
     """
 
     def __init__(
-        self, config: Config, resolve: Callable[[str], str], watch: TopicWatch, *, results: bool
+        self, config: Config, resolve: Callable[[str], str], problems: CurrentProblems, *, results: bool
     ) -> None:
-        self._config, self._resolve, self._watch, self._results = config, resolve, watch, results
+        self._config, self._resolve, self._problems, self._results = config, resolve, problems, results
         self.roles = Roles()
         self.sync = Synchronizer(self.roles, config, lapse=SILENCE)
         self.handlers: dict[str, Handler[LiveMessage]] = {}
@@ -247,9 +235,9 @@ class Inputs:
         try:
             roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
-            self._watch.report("roles", str(error))
+            self._problems.set("roles", "topics", str(error))
             return False
-        self._watch.report("roles", "", "the topics fit the configuration")
+        self._problems.set("roles", "topics", "", "the topics fit the configuration")
         if replace(roles, notes={}) != replace(self.roles, notes={}):
             self.changed = time.monotonic()
             results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
@@ -287,7 +275,7 @@ class Inputs:
     def _add_metadata(self, message: LiveMessage) -> None:
         text = guard(message, surroundings.decode_mark, message.decode())
         if self._packets.add_metadata(message.topic, text):
-            self._watch.tell(f"the metadata on {message.topic} have changed")
+            self._problems.tell(f"the metadata on {message.topic} have changed")
 
     def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
         """Gather packets to scans and pass these on. A scan has the time of receipt of its last packet."""

@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -58,6 +59,7 @@ class Node(Closable):
         from rclpy.signals import SignalHandlerOptions
 
         _check_domain()
+        _check_remaps(arguments)
         self.error: BaseException | None = None  # the exception that ended a thread
         self._on_end = on_end
         self._context: Any = rclpy.Context()
@@ -210,6 +212,22 @@ def _check_domain() -> None:
     domain = os.environ.get("ROS_DOMAIN_ID", "")
     if domain and not (domain.isdecimal() and int(domain) <= LAST_DOMAIN):
         raise UserError(f"ROS_DOMAIN_ID={domain}: a domain is a number from 0 to {LAST_DOMAIN}")
+
+
+def _check_remaps(arguments: Sequence[str]) -> None:
+    """Check the remaps. The middleware's messages about a wrong one name no argument.
+
+    Raises:
+        UserError: a remap has no ``:=``, or a namespace has no slash.
+    """
+    for option, remap in pairwise(arguments):
+        if option not in ("-r", "--remap"):
+            continue
+        name, separator, value = remap.partition(":=")
+        if not separator:
+            raise UserError(f"--ros-args {option} {remap}: expected FROM:=TO")
+        if name.rpartition(":")[2] in ("__ns", "__namespace") and not value.startswith("/"):
+            raise UserError(f"--ros-args {option} {remap}: a namespace begins with a slash: {name}:=/{value}")
 
 
 def middlewares() -> set[str]:

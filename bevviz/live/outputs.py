@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from bevviz.live.encoder import Encoder, Packet
+from bevviz.live.problems import CurrentProblems
 from bevviz.live.status import Notes
 from bevviz.recording import rerun_cli
 from bevviz.recording.frame_logger import RecordingContext
@@ -256,23 +257,32 @@ class Viewer(Output):
 
 
 class LagWatch:
-    """Reporter of viewers that fall behind or catch up."""
+    """Check for viewers that fall behind.
 
-    def __init__(self, notes: Notes) -> None:
-        self._notes = notes
-        self._behind: set[str] = set()  # viewers about which the user was warned
+    Args:
+        problems: takes the viewers that are behind.
+    """
+
+    def __init__(self, problems: CurrentProblems) -> None:
+        self._problems = problems
+        self._behind: set[str] = set()
 
     def check(self, outputs: Sequence[Output]) -> None:
-        """Report each viewer once when it falls behind, and once when it keeps up again."""
-        lags = {output.name: (output, lag) for output in outputs if (lag := output.lag) is not None}
-        for name, (viewer, lag) in lags.items():
-            if lag > BEHIND and name not in self._behind:
+        """Note each viewer that falls behind, until it keeps up again."""
+        for output in outputs:
+            name, lag = output.name, output.lag
+            if lag is None:
+                continue
+            if lag > BEHIND:
                 self._behind.add(name)
-                self._notes.warn(
-                    f"the {name} viewer is {lag:.0f} s behind: it gets the newest frames, the others it "
-                    f"misses; --set live.viewer_points=20000 and --set live.viewer_rate=2 send it less"
-                )
-            elif lag < LATE and name in self._behind:
-                self._behind.remove(name)
-                missed = f"{viewer.dropped} frames" if viewer.dropped != 1 else "1 frame"
-                self._notes.info(f"the {name} viewer keeps up again; it has missed {missed} so far")
+            elif lag < LATE:
+                self._behind.discard(name)
+            missed = f"{output.dropped} frames" if output.dropped != 1 else "1 frame"
+            self._problems.set(
+                "behind",
+                f"{name} viewer",
+                f"the {name} viewer is {lag:.1f} s behind" if name in self._behind else "",
+                f"the {name} viewer keeps up again; it has missed {missed} so far",
+                "it gets the newest frames, the others it misses; --set live.viewer_points=20000 and --set "
+                "live.viewer_rate=2 send it less",
+            )

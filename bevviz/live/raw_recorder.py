@@ -239,6 +239,7 @@ class RawTopics:
         self._further = Subscriptions(node, requests, self._receive)
         self._sizes: dict[str, tuple[float, int]] = {}  # topic -> start of the measurement, bytes
         self._refused: dict[str, str] = {}  # topic -> reason why it is left out for good
+        self.unknown: dict[str, str] = {}  # the same of topics whose type is unknown
 
     def put(self, topic: PublishedTopic, received: int, info: Mapping[str, Any], data: bytes) -> None:
         """Record a message of any topic."""
@@ -298,7 +299,7 @@ class RawTopics:
         """Subscribe to a topic, if its type is known."""
         problem = self._further.listen(topic, decoded=False)
         if problem:
-            self._refused[topic.name] = problem
+            self._refused[topic.name] = self.unknown[topic.name] = problem
         elif problem is None:
             self._sizes[topic.name] = time.monotonic(), 0
 

@@ -21,9 +21,11 @@ from bevviz.live.files import BagSaver, RecordingSaver, free_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
 from bevviz.live.indexing import Indexer
 from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
+from bevviz.live.problems import CurrentProblems
 from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
+from bevviz.live.result_problems import ResultProblems
 from bevviz.live.robot_comparison import RobotComparison
 from bevviz.live.source_wrappers import RobotFrames, ThinnedSource, warm_up
 from bevviz.live.status import Health, Notes, set_nice
@@ -70,7 +72,7 @@ class Live:
     """Run of the pipeline beside a robot, until the source ends, ``stop`` is called, or Ctrl-C.
 
     Args:
-        source: source of frames. Its iteration may block. If it has a method ``stop``, that ends it.
+        source: source of the frames.
         settings: the configuration and its origin.
         outputs: outputs of the run.
         notes: takes messages to the user.
@@ -80,6 +82,7 @@ class Live:
         control: server for requests to save. None: the run opens its own.
         raw: recorder of the messages from which the source makes frames.
         robot: topic of the robot's boxes to compare with. Empty: its fused boxes. None: no comparison.
+        problems: list of current problems, to which the run adds its own.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -98,6 +101,7 @@ class Live:
         control: Control | None = None,
         raw: RawRecorder | None = None,
         robot: str | None = None,
+        problems: CurrentProblems | None = None,
     ) -> None:
         self.notes = notes
         self._control = control
@@ -106,6 +110,8 @@ class Live:
         self.frames = 0  # frames logged so far
         self._source, self._settings = source, settings
         self._thinned = ThinnedSource(source, lambda: self.config)
+        self.problems = problems or CurrentProblems(notes.warn)
+        self._results = ResultProblems(self.problems)
         self._on_result = on_result
         self.checks = InputChecks(source, settings.config)
         self._shown = settings.config  # the configuration last passed to ``on_change``
@@ -113,7 +119,7 @@ class Live:
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = self._glanced = 0.0  # seconds, monotonic
-        self._lag_watch = LagWatch(notes)
+        self._lag_watch = LagWatch(self.problems)
         self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
 
@@ -123,7 +129,6 @@ class Live:
             ObservingSession(settings.config) if observe else LiveSession(settings.config, loader=loader)
         )
         self.against = None if robot is None else RobotComparison(robot, live)
-        self._robot_problem = ""  # as last reported
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
         network = "" if observe else self.session.stages.provider
         self.encoder = Encoder(
@@ -305,6 +310,7 @@ class Live:
         compared = self.against.compare(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
         self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
+        self._results.observe(result)
         for watcher in self._watchers:
             watcher(result)
         self._logged = time.monotonic()
@@ -330,10 +336,7 @@ class Live:
 
     def _check_robot(self, against: RobotComparison) -> None:
         """Report problems of the comparison, and save when robot and ours differ for long."""
-        if against.problem != self._robot_problem:
-            self._robot_problem = against.problem
-            if against.problem:
-                self.notes.warn(against.problem)
+        self.problems.set("comparison", "robot", against.problem, f"compared with {against.names[1]}")
         if reason := against.reason():
             self.flight.save_soon(reason, self.config.live.trigger_after)
 

@@ -11,10 +11,12 @@ from typing import Any
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests, full_name, published_topics
+from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests, published_topics
+from bevviz.live.input_problems import InputProblems
 from bevviz.live.inputs import SILENCE, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer
+from bevviz.live.problems import CurrentProblems
 from bevviz.live.raw_recorder import RawRecorder, RawTopics
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_message
@@ -25,16 +27,14 @@ from bevviz.pipeline.run import MAX_BURST
 from bevviz.support.contexts import Closable
 from bevviz.support.queues import NewestQueue
 from bevviz.sync.buffers import MARKS
-from bevviz.sync.report import why_no_images
 from bevviz.sync.synchronizer import OVERTAKEN
 
 LOOK = 0.5  # seconds between two looks at the graph
 TICK = 0.05  # seconds between two checks for clouds that have waited long enough
 SETTLE = 1.0  # seconds without a change of roles after which the scene is complete
 PATIENCE = 3.0  # seconds that missing topics may delay the scene
-LASTING = 5  # frames with a missing transform or CameraInfo from which on it is reported
 CHANGING = "the topics are still changing"
-PIECE = 65_000  # bytes, largest message that DDS sends in one piece
+COUNTED = frozenset({"clock", "lost", "order", "stamp", "image", "transform", "unusable"})  # see ``warnings``
 
 
 class LiveSource(Closable):
@@ -69,10 +69,10 @@ class LiveSource(Closable):
         self.config = config
         self.lost: Counter[str] = Counter()  # topic -> messages that the middleware lost
         self.topics: dict[str, PublishedTopic] = {}  # topics published by other nodes
-        self._watch = TopicWatch(tell or (lambda text: None))
-        self._clock_resets = 0  # resets of the stamps that were reported
+        self.problems = CurrentProblems(tell or (lambda text: None))
+        self._watch = TopicWatch(self.problems)
         self._known: dict[str, PublishedTopic] = {}  # topics that may have a role, or had one
-        self._begun = self._last_cloud = time.monotonic()
+        self._last_cloud = time.monotonic()
         self._settled = threading.Event()
         self._complete = False  # whether the scene is known
         self._lock = threading.RLock()  # guards the state that the receiving thread changes
@@ -87,11 +87,14 @@ class LiveSource(Closable):
         self.node = self._node.node  # rclpy's node for publishing and services, with a thread of its own
         self.domain = self._node.domain
         self.middleware = self._node.middleware
-        self._inputs = Inputs(config, self._node.resolve, self._watch, results=results)
+        self._inputs = Inputs(config, self._node.resolve, self.problems, results=results)
         self.frame_ids = self._inputs.frame_ids  # topic -> frame id of its first message
         requests = TypeRequests(self._node)
         self._subscriptions = Subscriptions(
             self._node, requests, self._locked(self._receive), self._locked(self._count_lost)
+        )
+        self._checks = InputProblems(
+            config, self._node, self._inputs, self._subscriptions, self._watch, self.problems
         )
         self._raw = None if raw is None else RawTopics(self._node, raw, requests)
         # Subscribed before it is published, because a mark may be sent once only.
@@ -172,15 +175,15 @@ class LiveSource(Closable):
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Sentences about current problems and lost messages."""
+        """Sentences about current problems, and what was counted since the start."""
         with self._lock:
             lost = [
                 f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
                 for topic, count in self.lost.items()
             ]
+            current = [str(p) for p in self.problems.current if p.finding.kind not in COUNTED]
             report = self._inputs.sync.report
-            blind = why_no_images(self.config, self.roles, report) if self._complete else []
-            return [*self._watch.warnings, *lost, *blind, *report.warnings()]
+            return [*current, *self._watch.damage.sentences, *lost, *report.warnings()]
 
     @property
     def received(self) -> Counter[str]:
@@ -203,9 +206,11 @@ class LiveSource(Closable):
         with self._lock:
             # Topics around the robot and marks are published irregularly.
             shown = {topic for topic, _, _ in self.roles.around} | {self._mark.name}
-            return self._watch.states(
+            states = self._watch.states(
                 {name: name in self.topics for name in self._subscriptions.topics - shown}
             )
+        doubtful = {problem.finding.subject for problem in self.problems.current}
+        return {n: "degraded" if state == "ok" and n in doubtful else state for n, state in states.items()}
 
     def overtaken(self) -> tuple[LateBoxes, ...]:
         """Return the robot's results that no frame took, since the last call. Any thread may call it."""
@@ -287,11 +292,11 @@ class LiveSource(Closable):
     def _compare(self, topic: str, before: Intrinsics, after: Intrinsics) -> None:
         if (before.K != after.K).any() or before.D.tolist() != after.D.tolist():
             old, new = before.K[0, 0], after.K[0, 0]
-            self._watch.tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
+            self.problems.tell(f"the calibration on {topic} has changed: fx {old:.1f} -> {new:.1f}")
 
     def _tick(self) -> None:
         """Deliver the frames whose clouds have waited long enough."""
-        self._inputs.sync.absent = frozenset(self._not_delivering())
+        self._inputs.sync.absent = self._checks.apart.union(self._not_delivering())
         self._deliver(self._inputs.sync.ready(time.time_ns()))
 
     def _not_delivering(self) -> Iterator[str]:
@@ -311,6 +316,7 @@ class LiveSource(Closable):
         for frame in frames:
             if not self._complete:
                 continue
+            self._checks.observe(frame)
             self._numbers.append((frame.stamp, self._frames))
             for text in frame.around.marks if frame.around else ():
                 self._marks.append(UserMark(text, self._frames, frame.stamp))
@@ -329,73 +335,12 @@ class LiveSource(Closable):
         self._assign()
         if self._raw is not None:
             self._raw.follow(self.topics, self._subscriptions.topics)
-        for name in self._subscriptions.topics:
-            if name in self.topics or not any(name == shown for shown, _, _ in self.roles.around):
-                self._report_topic(name)  # topics shown around the robot come and go
-        self._report_frames()
+            self._report_unsaved(self._raw.unknown)
+        no_clouds = self._is_without_clouds
+        self._checks.look(self.topics, self.lost, complete=self._complete, no_clouds=no_clouds)
         if not self._complete and self._is_settled():
             self._complete = True
             self._settled.set()
-
-    def _report_topic(self, name: str) -> None:
-        """Report problems of one topic that has a role."""
-        topic, watch = self.topics.get(name), self._watch
-        gone = f"{name} has no publisher any more; waiting for it to come back"
-        watch.report(f"{name} gone", gone if topic is None else "", f"{name} is published again")
-        watch.report(f"{name} types", topic.clash if topic is not None else "", f"{name} has one type")
-        unheard = "; ".join(self._subscriptions.mismatches(topic)) if topic is not None else ""
-        watch.report(f"{name} quality", unheard, f"{name}: every publisher is received")
-        silent = topic is not None and watch.silent_for(name) > 0
-        silent = silent and not (name in self.roles.lidars and self._is_without_clouds)
-        quiet = f"no message on {name} for {SILENCE:g} s, though it has a publisher"
-        watch.report(f"{name} silence", quiet if silent else "", f"{name} is back")
-        sensors = {*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)}
-        several = topic is not None and name in sensors and len(topic.publishers) > 1
-        names = ", ".join(map(full_name, topic.publishers)) if topic is not None else ""
-        mixed = f"{name} has several publishers, taken for one sensor: {names}; remap all but one"
-        watch.report(f"{name} publishers", mixed if several else "", f"{name} has one publisher")
-        if self.lost[name]:
-            size = watch.volume[name] / max(1, watch.received[name])
-            sizes = (watch.volume[other] / count for other, count in watch.received.items())
-            largest = max(sizes, default=0.0)
-            watch.report_once(f"messages of {name} are lost on the way: {remedy(size, largest)}")
-
-    def _report_frames(self) -> None:
-        """Report problems that the synchroniser found."""
-        watch, report = self._watch, self._inputs.sync.report
-        for name in report.overtaken:
-            watch.report_once(f"{name} comes when its frame has gone on: shown at its own stamp")
-        for name in report.unstamped:
-            watch.report_once(f"{name}: no stamp in the header, time of receipt is used instead")
-        for camera, reason in report.first_undecodable.items():
-            watch.report_once(f"camera '{camera}': an image could not be decoded: {reason}")
-        for text in report.oddities.values():
-            watch.report_once(text)
-        for text, frames in report.problems.items():
-            if frames >= LASTING:
-                watch.report_once(text)
-        if report.resets > self._clock_resets:
-            watch.tell("the stamps of the clouds jumped back: a simulation or a bag that began anew")
-            self._clock_resets = report.resets
-        twin = (
-            f"another node is called {self._node.node.get_fully_qualified_name()}: orders for one may reach "
-            f"the other; --ros-args -r __node:=bevviz_2 gives this one another name"
-        )
-        watch.report(
-            "name", "" if self._node.is_alone else twin, "no other node has the name of this one now"
-        )
-        quiet = f"no cloud for {SILENCE:g} s on {', '.join(self.roles.lidars)}"
-        watch.report("silence", quiet if self._is_without_clouds else "", "the clouds are back")
-        first, driver = self.roles.driver, self._inputs.sync.driver
-        deputy = f"{first} does not deliver: the frames follow {driver} until it does"
-        changed = self._complete and driver != first
-        watch.report("driver", deputy if changed else "", f"the frames follow {first} again")
-        begun = time.monotonic() - self._begun > SETTLE + LOOK
-        misstated = self._inputs.misstated(self.topics.values()) if begun else {}
-        for name in self._inputs.stated:
-            watch.report(
-                f"{name} stated", misstated.get(name, ""), f"{name} is there, as the configuration states"
-            )
 
     @property
     def _is_without_clouds(self) -> bool:
@@ -409,7 +354,7 @@ class LiveSource(Closable):
             return False
         lacking = [text for text in self._lacking() if text != CHANGING]
         if lacking and calm > PATIENCE:
-            self._watch.tell(f"not waited for any longer: {'; '.join(lacking)}")
+            self.problems.tell(f"not waited for any longer: {'; '.join(lacking)}")
         return not lacking or calm > PATIENCE
 
     def _assign(self) -> None:
@@ -423,16 +368,12 @@ class LiveSource(Closable):
                 self._raw.make_room(self._known[name])
             problem = self._subscriptions.listen(self._known[name])
             text = f"{name} is not received: {problem}" if problem else ""
-            self._watch.report(f"{name} type", text, f"{name} can be received now" if problem is None else "")
+            if problem != "":  # else a publisher may still answer
+                self.problems.set("type", name, text, f"{name} can be received now")
 
-
-def remedy(size: float, largest: float) -> str:
-    """Return advice for lost messages, given their size and that of the largest messages here, in bytes."""
-    if size > PIECE:
-        return "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
-    if largest > PIECE:
-        return (
-            "clouds or images fill the transport, which a larger segment of their publishers mends, see "
-            "'Clouds were lost on the way' in docs/live.md"
-        )
-    return "small ones are where a machine is too busy; a longer queue (depth) of the publisher's helps"
+    def _report_unsaved(self, unknown: Mapping[str, str]) -> None:
+        """Report the topics that are not recorded because their type is unknown."""
+        first, *others = sorted(unknown) or [""]
+        more = f" (and {len(others)} more topics of unknown types)" if others else ""
+        text = f"{first}{more} is not among the saved messages: {unknown[first]}" if unknown else ""
+        self.problems.set("unsaved", "messages", text, "every topic of a known type is saved")

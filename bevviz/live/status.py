@@ -14,6 +14,7 @@ import numpy as np
 
 from bevviz.live.graph import open_publisher
 from bevviz.live.node import add_timer
+from bevviz.live.problems import Problem
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_header, make_message
 from bevviz.messages.surroundings import LEVELS
@@ -144,7 +145,7 @@ class Diagnostics:
     """Publisher of the state of the run, each second, with or without frames.
 
     ``NAME: pipeline`` has latencies, drops and failed stages. ``NAME: anomalies`` has the anomalies of the
-    newest frame. ``NAME: sources`` has the warnings of the source.
+    newest frame. ``NAME: sources`` has the current problems, with the seconds that they have lasted.
 
     Args:
         node: an rclpy node, whose remaps apply.
@@ -167,17 +168,22 @@ class Diagnostics:
         """Store the newest result. Any thread may call it."""
         self._result, self._at = result, time.monotonic()
 
-    def publish(self, numbers: Mapping[str, float], warnings: Sequence[str]) -> None:
+    def publish(self, numbers: Mapping[str, float], problems: Sequence[Problem]) -> None:
         """Publish the current state.
 
         Args:
             numbers: numbers of the run, by name.
-            warnings: warnings of the source, one sentence each.
+            problems: the current problems.
         """
-        more = f" (and {len(warnings) - 1} more)" if warnings[1:] else ""
-        text = f"{warnings[0]}{more}" if warnings else ""
-        listed = {str(number): text for number, text in enumerate(warnings, 1)}
-        sources = self._status("sources", WARN if warnings else OK, text, listed)
+        more = f" (and {len(problems) - 1} more)" if problems[1:] else ""
+        text = f"{problems[0]}{more}" if problems else ""
+        listed = {
+            f"{problem.finding.kind} {problem.finding.subject}": (
+                f"{problem} (for {time.time() - problem.since:.0f} s)"
+            )
+            for problem in problems
+        }
+        sources = self._status("sources", WARN if problems else OK, text, listed)
         statuses = [self._pipeline(numbers), self._anomalies(), sources]
         now = time.time_ns()
         message = make_message(TYPE, header=make_header(now, ""), status=statuses)

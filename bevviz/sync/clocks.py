@@ -20,6 +20,7 @@ from bevviz.model.frame import F64
 
 APART = 0.6  # seconds; a larger difference between the lags of two topics is hardly a usual delay
 ENOUGH, LAST = 3, 50  # least and most messages of a topic for its lag
+LIVE = 15  # the most beside a robot, so that a clock that jumps is told within two seconds
 TRIED = 500  # most messages of a topic on which a remedy is tried
 TAI = 37.0  # seconds that TAI is ahead of UTC since 2017
 BY_RECEIPT = "--set sync.by=received goes by the time of receipt"
@@ -36,10 +37,11 @@ class Clocks:
     Args:
         config: seconds to add to the stamps, or that the time of receipt is used in their place.
         driver: topic whose messages make the frames.
+        last: most messages of a topic for its lag.
     """
 
-    def __init__(self, config: SyncConfig, driver: str) -> None:
-        self._config, self.driver = config, driver
+    def __init__(self, config: SyncConfig, driver: str, last: int = LAST) -> None:
+        self._config, self.driver, self._last = config, driver, last
         self._offsets = {topic: round(seconds * 1e9) for topic, seconds in config.offsets.items()}
         self._received = config.by == "received"
         # Stamp and time of receipt of the last messages.
@@ -51,9 +53,13 @@ class Clocks:
         self._times[topic].append((stamp, received))
         return stamp
 
+    def forget(self) -> None:
+        """Forget the lags, as the clock of the robot has jumped. Those of another time would be no faults."""
+        self._times.clear()
+
     def lag(self, topic: str) -> float | None:
         """Return the median seconds from stamp to receipt; None if there are too few messages."""
-        lags = [received - stamp for stamp, received in list(self._times.get(topic, ()))[-LAST:]]
+        lags = [received - stamp for stamp, received in list(self._times.get(topic, ()))[-self._last :]]
         return median(lags) * 1e-9 if len(lags) >= ENOUGH else None
 
     def differ_from_receipt(self, topic: str) -> bool:
@@ -73,15 +79,20 @@ class Clocks:
         lags = [lag for lag in (self.lag(topic), self.lag(other)) if lag is not None]
         return off if abs(off) > LONGEST or min(lags, default=0.0) < -AHEAD else 0.0
 
+    def reference(self, topics: Iterable[str]) -> str:
+        """Return the topic whose stamps are nearest to their receipt. Its clock is taken for right."""
+        lags = {topic: lag for topic in topics if (lag := self.lag(topic)) is not None}
+        return min(lags, key=lambda topic: abs(lags[topic]), default="")
+
     def doubts(self, topics: Iterable[str]) -> Iterator[str]:
         """Yield a sentence for each topic whose clock is wrong, or whose messages come too late.
 
         Args:
             topics: topics whose clocks must agree.
         """
-        lags = {topic: lag for topic in topics if (lag := self.lag(topic)) is not None}
-        right = min(lags, key=lambda topic: abs(lags[topic]), default="")
-        for topic in lags:
+        topics = list(topics)
+        right = self.reference(topics)
+        for topic in topics:
             off = self.apart(topic, right)
             if off and self.wrong(topic, right):
                 yield f"{topic}: {_clock(off, right)}; {_remedy(topic, off)}"

@@ -193,7 +193,7 @@ class SyncReport:
         for topic, n in self.overtaken.items():
             sentences.append(
                 f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"{_describe_delay(self.slowest[topic])}: shown at that stamp, and not compared"
+                f"{_describe_delay(self.slowest[topic])}: shown at that stamp"
             )
         for camera, n in self.without_image.items():
             sentences.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")

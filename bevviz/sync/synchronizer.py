@@ -32,7 +32,7 @@ from bevviz.model.frame import (
 )
 from bevviz.sync.buffers import JUMP, SurroundingsBuffer, TopicBuffer, describe_distance
 from bevviz.sync.cameras import Cameras
-from bevviz.sync.clocks import LATENCY, Clocks
+from bevviz.sync.clocks import LAST, LATENCY, LIVE, Clocks
 from bevviz.sync.gravity import VerticalEstimate
 from bevviz.sync.pose_lookup import PoseLookup, ReferenceFrames
 from bevviz.sync.report import SyncReport
@@ -93,7 +93,7 @@ class Synchronizer:
         self.upright = VerticalEstimate(self.tf, config.source.base_frame, config.sync.tf_tolerance)
         self.report.upright = self.upright.warnings
         self.around = SurroundingsBuffer()
-        self.clocks = self.report.clocks = Clocks(config.sync, roles.driver)
+        self.clocks = self.report.clocks = Clocks(config.sync, roles.driver, LAST if lapse is None else LIVE)
         self.report.driver, self.report.noun = roles.driver, "cloud" if roles.lidars else "image"
         self.report.clocked = (*roles.lidars, *(c.topic for c in roles.cameras), *roles.tf)
         self._roles = roles
@@ -379,6 +379,7 @@ class Synchronizer:
     def _reset(self, stamp: int) -> None:
         """Start again at ``stamp``: the clock jumped back, as with a bag in a loop or a new simulation."""
         self.report.resets += 1
+        self.clocks.forget()
         self._done.extend(self._build_all())
         self._last = None
         self.tf.forget_after(stamp + JUMP)

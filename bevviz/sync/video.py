@@ -69,6 +69,11 @@ class Video:
         self._stamp = 0  # stamp of the last packet
         self._steps: deque[int] = deque(maxlen=STEPS)  # nanoseconds between packets
 
+    @property
+    def awaits_key(self) -> bool:
+        """Whether packets have come, but none from which pictures can be decoded."""
+        return bool(self._packets) and self._next == 0 and not any(packet.is_key for packet in self._packets)
+
     def add(self, packet: VideoPacket) -> bool:
         """Add a packet.
 

@@ -20,6 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.messages.definitions import typestore
+from bevviz.messages.encode import encode_transforms
+
 ROOT = Path(__file__).parents[2]
 PERIOD = 0.1  # seconds
 
@@ -29,10 +32,13 @@ class Publication:
     """Messages of one topic."""
 
     topic: str
-    kind: str = ""  # PointCloud2, Image or String; empty: the publisher is destroyed
+    kind: str = ""  # PointCloud2, Image, TFMessage or String; empty: the publisher is destroyed
     frame: str = "lidar"
     silent: bool = False
     node: str = "robot"
+    ahead: float = 0.0  # seconds that the stamps are ahead of the clock
+    points: str = ""  # "none" or "NaN"; empty: those of the ground
+    every: int = 1  # periods between two messages
 
 
 class FaultyRobot:
@@ -67,8 +73,9 @@ def main() -> None:
 
     nodes: dict[str, Any] = {}
     publications: dict[tuple[str, str], tuple[Publication, Any]] = {}
+    due, number = time.monotonic(), 0
     while True:
-        ready, _, _ = select.select([sys.stdin], [], [], PERIOD)
+        ready, _, _ = select.select([sys.stdin], [], [], max(0.0, due - time.monotonic()))
         if ready:
             if not (line := sys.stdin.readline()):
                 return
@@ -94,8 +101,11 @@ def main() -> None:
                     )
             publications[key] = publication, publisher
             print("done", flush=True)
+        if time.monotonic() < due:
+            continue
+        due, number = due + PERIOD, number + 1
         for publication, publisher in publications.values():
-            if publisher is not None and not publication.silent:
+            if publisher is not None and not publication.silent and number % publication.every == 0:
                 publisher.publish(make_message(publication, time.time_ns()))
 
 
@@ -103,11 +113,19 @@ def _type(kind: str) -> Any:
     from sensor_msgs.msg import Image, PointCloud2
     from std_msgs.msg import String
 
+    from bevviz.live.typesupport import message_type
+
+    if kind == "TFMessage":  # no wheel has it
+        return message_type("tf2_msgs/msg/TFMessage")
     return {"PointCloud2": PointCloud2, "Image": Image, "String": String}[kind]
 
 
 def make_message(publication: Publication, stamp: int) -> Any:
-    """Return a message of a publication with a stamp in nanoseconds."""
+    """Return a message of a publication with a stamp in nanoseconds, before ``ahead`` is added."""
+    stamp += round(publication.ahead * 1e9)
+    if publication.kind == "TFMessage":
+        message = encode_transforms(stamp, [("odom", publication.frame, np.eye(4))])
+        return bytes(typestore().serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
     message = _type(publication.kind)()
     if publication.kind == "String":
         message.data = "not a cloud"
@@ -122,6 +140,10 @@ def make_message(publication: Publication, stamp: int) -> Any:
 
     ground = np.mgrid[-15:15:0.5, -15:15:0.5, -1.8:-1.7:1].reshape(3, -1).T
     points = ground.astype(np.float32)
+    if publication.points == "NaN":
+        points[:] = np.nan
+    elif publication.points == "none":
+        points = points[:0]
     message.height, message.width, message.point_step = 1, len(points), 12
     message.row_step = 12 * len(points)
     message.fields = [

@@ -18,7 +18,7 @@ import pytest
 
 from bevviz.config import load
 from bevviz.extras.demo.drive import LIDAR_TOPIC
-from bevviz.live import graph, graph_info, inputs, raw_recorder, source
+from bevviz.live import graph, graph_info, input_problems, inputs, problems, raw_recorder, source
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
@@ -31,7 +31,15 @@ from tests.support.ros_player import Play
 from tests.support.waiting import until
 
 NEEDED = 3.0  # seconds of the graph after which the frames have begun
-TIMED = (graph, graph_info, inputs, raw_recorder, source)  # modules whose clock is that of the graph
+TIMED = (
+    graph,
+    graph_info,
+    input_problems,
+    inputs,
+    problems,
+    raw_recorder,
+    source,
+)  # modules whose clock is that of the graph
 
 
 @dataclass
@@ -191,6 +199,9 @@ class _Joined:
     def get_name(self) -> str:
         return self._name
 
+    def get_namespace(self) -> str:
+        return self.namespace
+
     def get_fully_qualified_name(self) -> str:
         return f"/{self._name}"
 
@@ -306,7 +317,7 @@ def joined(
 def fed_graph() -> Iterator[FedGraph]:
     """Let every ``LiveSource`` of the block join a graph of this process."""
     fed, wait = FedGraph(), LiveSource.wait
-    clock = SimpleNamespace(monotonic=lambda: fed.now, time_ns=fed.time_ns)
+    clock = SimpleNamespace(monotonic=lambda: fed.now, time_ns=fed.time_ns, time=lambda: 1e-9 * fed.time_ns())
     with pytest.MonkeyPatch.context() as patch:
         for module in TIMED:
             patch.setattr(module, "time", clock)

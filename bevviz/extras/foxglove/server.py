@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from bevviz.errors import UserError
 from bevviz.live.publish import TOPICS
 from bevviz.messages.definitions import definition
+from bevviz.recording.ports import check_port
 from bevviz.support.contexts import Closable
 from bevviz.support.queues import NewestQueue
 
@@ -80,6 +81,7 @@ class FoxgloveServer(Closable):
                 max_size=MAX_MESSAGE,
             )
         except OSError as error:
+            check_port(port, "--foxglove")
             raise UserError(f"--foxglove {port}: cannot listen: {error.strerror}") from None
         self._port: int = self._server.socket.getsockname()[1]
         self._thread = threading.Thread(target=self._server.serve_forever, name="foxglove", daemon=True)

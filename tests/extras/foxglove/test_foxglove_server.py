@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from bevviz.errors import UserError
 from bevviz.extras.foxglove.server import FoxgloveServer
 from bevviz.recording.ports import free_port
 from tests.support import replay
@@ -159,3 +160,12 @@ def received(address: str) -> dict[str, Any]:
                 topic, kind = types[number]
                 found[topic] = store.deserialize_cdr(data[13:], kind)
     return found
+
+
+def test_a_taken_port_is_named_with_a_free_one() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(UserError, match=rf"--foxglove {port}: the port is in use; another one: --fox"):
+            FoxgloveServer(port)
