@@ -188,3 +188,21 @@ def test_two_robots_with_equal_names_are_named(robot: FaultyRobot) -> None:
         )
         robot.set("/truck/points", kind="")
         session.until_told("one robot is received")
+
+
+def test_transforms_come_by_two_subscriptions_and_count_once(robot: FaultyRobot) -> None:
+    """Best effort is sooner beside large clouds, and reliable brings the rest."""
+    robot.set("/a", kind="PointCloud2", frame="a")
+    robot.set("/tf", kind="TFMessage", frame="a")
+    with running() as session:
+        session.until_frames()
+        node, received = session.source._node.input, session.source.received["/tf"]
+        qualities = [
+            info.qos_profile.reliability.name for info in node.get_subscriptions_info_by_topic("/tf")
+        ]
+        assert sorted(qualities) == ["BEST_EFFORT", "RELIABLE"]
+        until(lambda: len(session.frames) > 20, "frames")
+        assert all(frame.world_from_points is not None for frame in session.frames)
+        # One message each 0.1 s, as clouds: counted twice they would be twice as many.
+        clouds = len(session.frames)
+        assert session.source.received["/tf"] - received < 1.5 * clouds

@@ -18,6 +18,8 @@ LATCHED_DEPTH = 100  # one message of each node that publishes static transforms
 SENSOR_DEPTH = 5
 STREAM_DEPTH = 100  # small messages that come in bursts
 FIRST = 1.0  # seconds after subscribing in which lost messages are expected and not counted
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+MERGED = 1000  # messages that one of two subscriptions may be behind the other
 PATIENCE = 3.0  # seconds until a missing answer is reported and the request is repeated
 PACKET_DEPTH = 512  # LiDAR packets, about 1000 a second: those that arrive while a scan is decoded
 
@@ -157,7 +159,7 @@ Receive = Callable[[PublishedTopic, bytes, dict[str, Any]], None]  # topic, mess
 class _Subscription:
     """Subscription with its type and quality of service."""
 
-    handle: Any
+    handles: Sequence[Any]
     type: str
     qos: Any
 
@@ -216,13 +218,19 @@ class Subscriptions:
         def receive(data: bytes, info: dict[str, Any]) -> None:
             self._receive(topic, data, info)
 
+        hurried = _hurried_qos(qos) if topic.type == TRANSFORMS else None
+        take = receive if hurried is None else _first_of_two(receive)
+        node, events = self._node.input, self._events(topic.name)
+        handles = []
         try:
-            handle = self._node.input.create_subscription(
-                kind, topic.name, receive, qos, event_callbacks=self._events(topic.name), raw=True
+            handles.append(
+                node.create_subscription(kind, topic.name, take, qos, event_callbacks=events, raw=True)
             )
+            if hurried is not None:
+                handles.append(node.create_subscription(kind, topic.name, take, hurried, raw=True))
         except Exception as error:  # this process still has an endpoint of another type on that name
             return f"the middleware refuses {topic.type}: {' '.join(str(error).split())}"
-        self._by_topic[topic.name] = _Subscription(handle, topic.type, qos)
+        self._by_topic[topic.name] = _Subscription(handles, topic.type, qos)
         return None
 
     def _events(self, topic: str) -> Any:
@@ -246,7 +254,8 @@ class Subscriptions:
     def drop(self, name: str) -> None:
         """Unsubscribe from a topic, if it is subscribed."""
         if (subscription := self._by_topic.pop(name, None)) is not None:
-            self._node.input.destroy_subscription(subscription.handle)
+            for handle in subscription.handles:
+                self._node.input.destroy_subscription(handle)
 
     def mismatches(self, topic: PublishedTopic) -> Iterable[str]:
         """Yield one sentence for each publisher of a subscribed topic that cannot be received."""
@@ -259,6 +268,42 @@ class Subscriptions:
                 who = full_name(publisher)
                 text = reason.removeprefix("ERROR: ").rstrip(".;")
                 yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"
+
+
+def _hurried_qos(qos: Any) -> Any:
+    """Return the best-effort quality of service beside a reliable one. None: it is needed by nobody.
+
+    Beside large clouds reliable transforms come half a second late. Best effort brings a part of them soon.
+    """
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    if qos.reliability != ReliabilityPolicy.RELIABLE or qos.durability != DurabilityPolicy.VOLATILE:
+        return None
+    return QoSProfile(
+        history=qos.history,
+        depth=qos.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=qos.durability,
+    )
+
+
+def _first_of_two(
+    receive: Callable[[bytes, dict[str, Any]], None],
+) -> Callable[[bytes, dict[str, Any]], None]:
+    """Return a callback of two subscriptions that passes on each message when it comes first."""
+    known: dict[tuple[int, bytes], None] = {}  # in order of receipt
+
+    def take(data: bytes, info: dict[str, Any]) -> None:
+        key = int(info.get("source_timestamp") or 0), data
+        if key in known:
+            del known[key]
+            return
+        known[key] = None
+        if len(known) > MERGED:
+            del known[next(iter(known))]
+        receive(data, info)
+
+    return take
 
 
 # --- definitions of unknown types --------------------------------------------------------------
