@@ -31,6 +31,7 @@ from benchmarks.ideal_data import DataSet, LabelledFrame, data_sets
 from benchmarks.ideal_stages import CLUSTERING, DETECTION, FUSION, GROUND, MissedObject, counts, missed_rows
 from benchmarks.pages import write_section
 from bevviz.config import Config, changed_config, load
+from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_log import Memo
@@ -228,7 +229,9 @@ class FrameBenchmark:
             chosen = [row for row in chosen if cured[row]][: most - 1] + others[:1]
         rows = chosen[:most]
         start = time.process_time()
-        explainer = FrameExplainer(self._asked_result(), self.data.loader, self.data.classes)
+        explainer = FrameExplainer(
+            self._asked_result(), self.data.loader, self.data.classes, neighbours=self._asked_beside
+        )
         for number, row in enumerate(rows):
             judge = MissedObject(self.labelled, row, self.result, self.stages, self.data.classes, self.memo)
             selection = self._selection(judge)
@@ -267,6 +270,11 @@ class FrameBenchmark:
         if not self.blind:
             return self.result
         return replace(self.result, frame=replace(self.result.frame, truth=None))
+
+    def _asked_beside(self) -> list[Frame]:
+        """Return the neighbouring frames that hints may be tried on."""
+        beside = [labelled.frame for labelled, _ in self._beside]
+        return [replace(frame, truth=None) for frame in beside] if self.blind else beside
 
     def _selection(self, missed: MissedObject) -> Selection | None:
         """Return how the object is selected: by its label, or by the image box that shows most of it.

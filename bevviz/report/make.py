@@ -66,6 +66,7 @@ from bevviz.support.files import file_hash, save_text
 from bevviz.support.unfinished_folder import UnfinishedFolder
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.log import clear_answers, log_answers
+from bevviz.why.neighbours import frames_beside
 
 DetectionsByImage = Mapping[tuple[str, int], Detections]  # by camera name and image stamp
 
@@ -273,7 +274,8 @@ def _ask(request: ReportRequest, source: BagSource, loader: StageLoader) -> _Ask
         if frame is None:  # The run names what is wrong with the scan.
             return None
         result = session.run_explained(frame)
-    explainer = FrameExplainer(result, loader, session.stages.class_names)
+    beside = frames_beside(source, result.frame.index)
+    explainer = FrameExplainer(result, loader, session.stages.class_names, neighbours=beside)
     return _Asked(result, explain_subject(explainer, request.selection, request.answers))
 
 

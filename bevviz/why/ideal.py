@@ -230,6 +230,14 @@ def _with_own_clusters(
     return replace(described, state=state)
 
 
+def _on_ground(traces: FrameIndex, rows: tuple[int, ...]) -> bool:
+    """Return whether a point of some objects was taken for ground. Else the ground is ideal already."""
+    voxels, ground = traces.result.voxels, traces.result.ground
+    if voxels is None or ground is None:
+        return False
+    return any(ground.mask[_voxels_of(traces, row, voxels)].any() for row in rows)
+
+
 def restoring_stages(
     traces: FrameIndex, rows: tuple[int, ...], stages: Stages, memo: Memo
 ) -> dict[int, tuple[StageSet, ...]]:
@@ -259,15 +267,16 @@ def restoring_stages(
             else ~judge(after.objects, truth).missed
         )
 
-    curable = found(STAGES)
+    stages_to_try = STAGES if _on_ground(traces, rows) else STAGES[1:]
+    curable = found(stages_to_try)
     left = [row for row in rows if curable[row]]
-    for size in range(1, len(STAGES)):
-        for chosen in combinations(STAGES, size) if left else ():
+    for size in range(1, len(stages_to_try)):
+        for chosen in combinations(stages_to_try, size) if left else ():
             is_found = found(chosen)
             for row in left:
                 if is_found[row]:
                     restored[row].append(chosen)
         left = [row for row in left if not restored[row]]
     for row in left:
-        restored[row].append(STAGES)
+        restored[row].append(stages_to_try)
     return {row: tuple(sets) for row, sets in restored.items()}

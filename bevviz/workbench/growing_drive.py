@@ -7,8 +7,8 @@ import threading
 import time
 from abc import abstractmethod
 from collections import OrderedDict, defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -288,7 +288,14 @@ class GrowingDrive(Closable):
 
     def explainer(self, result: FrameResult) -> FrameExplainer:
         """Return an explainer of a result, for the list and for questions."""
-        return FrameExplainer(result, self.pipeline.loader, self.pipeline.stages.class_names)
+        names, number = self.pipeline.stages.class_names, result.frame.index
+        return FrameExplainer(result, self.pipeline.loader, names, neighbours=lambda: [*self._beside(number)])
+
+    def _beside(self, number: int) -> Iterator[Frame]:
+        """Yield the frames before and after one, as far as they can be read."""
+        for beside in (number - 1, number + 1):
+            with suppress(UserError):
+                yield self._frame(beside)
 
     def start(self) -> None:
         """Start to make frames, if they are not made already."""
