@@ -374,3 +374,117 @@ def test_a_frame_can_be_stated_for_a_recorded_bag(tmp_path: Path) -> None:
     bag = bags.write(tmp_path / "drive", items)
     frame, _ = read(bag, f"source.frames={{{bags.IMAGE}: camera_optical, {bags.CLOUD}: velodyne}}")
     np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-9)
+
+
+# --- calibrations and robots -------------------------------------------------------------------
+
+
+def with_info(**values: object) -> list[bags.Item]:
+    """Return a drive whose CameraInfo has these values. Its images have the centre (32, 24)."""
+    items = bags.small_items(scans=3)
+    for item in items:
+        if item.topic == bags.INFO:
+            for name, value in values.items():
+                setattr(item.message, name, value)
+    return items
+
+
+def roi(x: int, y: int, width: int, height: int) -> object:
+    return bags.Messages().make(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=x,
+        y_offset=y,
+        height=height,
+        width=width,
+        do_rectify=False,
+    )
+
+
+def camera_matrix(f: float, x: float, y: float, other: float = 0.0) -> F64:
+    return np.array([f, 0, x, 0, other or f, y, 0, 0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("values", "focal", "centre", "doubt"),
+    [
+        (
+            {"width": 128, "height": 96, "binning_x": 2, "binning_y": 2},
+            60,
+            (32, 24),
+            "is that of the binned images",
+        ),
+        (
+            {"width": 128, "height": 96, "binning_x": 2, "binning_y": 2, "k": camera_matrix(120, 64, 48)},
+            60,
+            (32, 24),
+            "",
+        ),
+        ({"k": camera_matrix(120, 64, 48)}, 120, (64, 48), r"the principal point \(64, 48\) is far from"),
+        ({"k": camera_matrix(120, 64, 48), "width": 0, "height": 0}, 120, (64, 48), "far from the middle"),
+        (
+            {"width": 128, "height": 96, "k": camera_matrix(120, 90, 20), "roi": roi(64, 0, 64, 48)},
+            120,
+            (26, 20),
+            "",
+        ),
+        ({"k": camera_matrix(60, 32, 24, 120)}, 60, (32, 24), "no square pixels"),
+        ({"k": camera_matrix(5, 32, 24)}, 5, (32, 24), "a field of view of 162 degrees"),
+        (
+            {"k": camera_matrix(5, 32, 24), "distortion_model": "equidistant", "d": np.zeros(4)},
+            5,
+            (32, 24),
+            "",
+        ),
+    ],
+)
+def test_the_camera_matrix_is_checked_against_the_image(
+    tmp_path: Path, values: dict[str, object], focal: float, centre: tuple[float, float], doubt: str
+) -> None:
+    frame, doubts = read(bags.write(tmp_path / "drive", with_info(**values)), "source.rectified=no")
+    intrinsics = frame.cameras[0].intrinsics
+    assert intrinsics is not None
+    assert (intrinsics.K[0, 0], *intrinsics.K[:2, 2]) == (focal, *centre)
+    assert len(doubts) == bool(doubt) and all(re.search(doubt, text) for text in doubts)
+
+
+def of_robot(name: str, *, frames: bool, own_tf: bool) -> list[bags.Item]:
+    """Return a drive with the topics, and perhaps the frames and transforms, of one of several robots."""
+    items = bags.small_items(scans=3)
+    for item in items:
+        edges = item.message.transforms if item.type == TF else [item.message]
+        for message in edges if frames else ():
+            message.header.frame_id = f"{name}/{message.header.frame_id}"
+            if item.type == TF:
+                message.child_frame_id = f"{name}/{message.child_frame_id}"
+    return [i._replace(topic=f"/{name}{i.topic}") if own_tf or i.type != TF else i for i in items]
+
+
+@pytest.mark.parametrize(("frames", "own_tf"), [(True, False), (False, True), (True, True)])
+def test_one_of_two_robots_is_shown_and_the_other_is_offered(
+    tmp_path: Path, frames: bool, own_tf: bool
+) -> None:
+    items = [item for name in ("a", "b") for item in of_robot(name, frames=frames, own_tf=own_tf)]
+    bag = bags.write(tmp_path / "drive", items)
+    with BagSource([bag], load()) as source:
+        assert source.roles.lidars == (f"/a{bags.CLOUD}",)
+        assert [camera.topic for camera in source.roles.cameras] == [f"/a{bags.IMAGE}"]
+        assert all(not frame.problems and not frame.cameras[0].problems for frame in source)
+        (said,) = source.doubts
+        assert said in source.warnings
+    assert said.startswith("the topics are of 2 robots, a and b: a is shown; ")
+    (setting,) = re.findall(r"--set (\S+) shows b", said)
+    with BagSource([bag], load(settings=[setting])) as source:
+        assert source.roles.lidars == (f"/b{bags.CLOUD}",)
+        assert [camera.topic for camera in source.roles.cameras] == [f"/b{bags.IMAGE}"]
+        assert all(not frame.problems and not frame.cameras[0].problems for frame in source)
+        assert not source.doubts
+
+
+def test_two_sensor_heads_of_one_robot_are_no_robots(tmp_path: Path) -> None:
+    items = [item for name in ("front", "rear") for item in of_robot(name, frames=False, own_tf=False)]
+    for item in items:
+        if item.topic.startswith("/rear") and item.type != TF:
+            item.message.header.frame_id = f"rear_{item.message.header.frame_id}"
+    with BagSource([bags.write(tmp_path / "drive", items)], load()) as source:
+        assert len(source.roles.lidars) == len(source.roles.cameras) == 2
+        assert not source.roles.robots

@@ -140,7 +140,8 @@ class BagSource(Closable):
         synced = report.warnings() if report else ()
         blind = why_no_images(self.config, self.roles, report)
         alone = [f"{self.roles.no_lidar}: the frames are {self._driver}'s"] if self.roles.no_lidar else []
-        return [*self.recording.warnings, *alone, *self._damage, *blind, *synced]
+        robots = [self.roles.robots] if self.roles.robots else []
+        return [*self.recording.warnings, *robots, *alone, *self._damage, *blind, *synced]
 
     @property
     def _damage(self) -> Sequence[str]:
@@ -171,7 +172,8 @@ class BagSource(Closable):
         if self._state is None:
             return []
         report = self._state.sync.report
-        return [*self._damage, *report.losses(), *report.doubts()]
+        robots = [self.roles.robots] if self.roles.robots else []
+        return [*robots, *self._damage, *report.losses(), *report.doubts()]
 
     @property
     def span(self) -> tuple[int, int]:

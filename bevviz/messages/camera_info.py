@@ -27,6 +27,7 @@ OPENCV_COUNTS = (
     12,
     14,
 )  # numbers of coefficients that OpenCV takes; of an equidistant lens the first
+MOST_OFF = 0.2  # farthest principal point from the image centre without a warning, as share of the image size
 MAX_NUMBER = 1e6  # Largest coefficient, and largest focal length or centre in pixels, of any real camera.
 
 
@@ -62,9 +63,26 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
     matrix[0, 2] -= msg.roi.x_offset
     matrix[1, 2] -= msg.roi.y_offset
     binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
-    matrix[:2] /= binning[:, None]
     width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
-    return Intrinsics(int(width), int(height), matrix, model, coefficients, baseline)
+    size, doubt = (int(width), int(height)), ""
+    cropped = bool(msg.roi.x_offset or msg.roi.y_offset) or (0 < msg.roi.width < msg.width)
+    scaled = matrix / np.array([[binning[0]], [binning[1]], [1]])
+    if not cropped and off_centre(scaled, size) > MOST_OFF > 2 * off_centre(matrix, size):
+        doubt = (
+            f"its K is for the full sensor by binning {binning[0]} x {binning[1]}, but its centre "
+            f"({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}) is that of the binned images of {width} x {height} "
+            "pixels: K is taken as theirs"
+        )
+    else:
+        matrix = scaled
+    return Intrinsics(*size, matrix, model, coefficients, baseline, cropped=cropped, doubt=doubt)
+
+
+def off_centre(matrix: F64, size: tuple[int, int]) -> float:
+    """Return how far the principal point is from the middle of the image, as share of its size."""
+    if not size[0] or not size[1]:
+        return 0.0
+    return float(np.abs(matrix[:2, 2] / size - 0.5).max())
 
 
 def _is_fisheye(name: str) -> bool:

@@ -14,6 +14,7 @@ from bevviz.config import SourceConfig
 from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import check_boxes_setting
 from bevviz.messages.foxglove import foxglove_type
+from bevviz.messages.robots import choose_robot
 from bevviz.messages.topics import (
     CLOUDS,
     IMAGES,
@@ -57,6 +58,7 @@ class Roles:
         camera_infos: all topics of CameraInfo, also unused ones.
         no_lidar: why there is no LiDAR, and what would help; empty: there is one.
         no_camera: why there is no camera, and what would help; empty: there is one.
+        robots: names of the robots, if there are several, which of them is shown, and what shows another one.
         notes: for every topic, in a few words, why it has its role or none.
     """
 
@@ -79,6 +81,7 @@ class Roles:
     camera_infos: tuple[str, ...] = field(default=(), compare=False)
     no_lidar: str = field(default="", compare=False)
     no_camera: str = field(default="", compare=False)
+    robots: str = field(default="", compare=False)
     notes: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -163,6 +166,9 @@ def find_roles(
         t.name: f"not used: {unsupported_reason(t) or t.aside or f'nothing here reads {t.type}'}"
         for t in topics
     }
+    of_others, robots = choose_robot(topics, config)
+    notes.update({name: f"not used: of {robot}, another robot" for name, robot in of_others.items()})
+    topics = [topic for topic in topics if topic.name not in of_others]
     staged = {key: stated_topic(name, topics, key, STAGE_KINDS[key]) for key, name in stages.items()}
     obstacles = [topic for key, topic in staged.items() if key == "ground.method"]
     for name in config.lidar_calibration:
@@ -239,6 +245,7 @@ def find_roles(
         camera_infos=names_of(of_kind(topics, "CameraInfo")),
         no_lidar="" if lidars else _no_lidar(topics),
         no_camera="" if images else _no_camera(topics),
+        robots=robots,
         notes=notes,
     )
 

@@ -65,6 +65,8 @@ class Intrinsics:
     D: F64 = field(default_factory=lambda: np.zeros(0))  # coefficients in ROS order
     baseline: tuple[float, float] = (0.0, 0.0)  # metres right of and below the first camera of a stereo pair
     assumed: bool = False  # True: there is no CameraInfo, and these are the configured defaults
+    cropped: bool = False  # True: the images show a part of the sensor, so that the centre may be anywhere
+    doubt: str = ""  # what of the message does not fit together, as a sentence without the topic
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError
+from bevviz.messages.camera_info import MOST_OFF, off_centre
 from bevviz.messages.roles import Roles
 from bevviz.messages.topics import CameraRole
 from bevviz.model import geometry
@@ -21,7 +22,8 @@ from bevviz.sync.report import SyncReport
 from bevviz.sync.transform_tree import TransformError
 
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
-MOST_OFF = 0.2  # farthest principal point from the image centre without a warning, as share of the image size
+WIDEST, NARROWEST = 150.0, 3.0  # degrees; fields of view of lenses that are no fisheyes
+SQUARE = 1.5  # largest ratio of the two focal lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +224,10 @@ class Cameras:
         nearest = None if infos is None else infos.nearest(stamp)
         intrinsics = None if nearest is None else nearest[1]
         if intrinsics is not None and image is not None:
-            return self._fitted(role, intrinsics, image, problems)
+            fitted = self._fitted(role, intrinsics, image, problems)
+            if fitted is not None:
+                self._check_intrinsics(role, fitted)
+            return fitted
         if intrinsics is not None:
             return intrinsics
         missing = f"no CameraInfo on {role.info_topic}" if role.info_topic else "no CameraInfo topic"
@@ -243,6 +248,26 @@ class Cameras:
         )
         return None
 
+    def _check_intrinsics(self, role: CameraRole, intrinsics: Intrinsics) -> None:
+        """Note doubts about a camera matrix for images of its size."""
+        size = intrinsics.width, intrinsics.height
+        fx, fy = intrinsics.K[0, 0], intrinsics.K[1, 1]
+        view = math.degrees(2 * math.atan(size[0] / (2 * fx)))
+        images = f"images of {size[0]} x {size[1]} pixels"
+        doubt = ""
+        if intrinsics.doubt:
+            doubt = intrinsics.doubt
+        elif not intrinsics.cropped and off_centre(intrinsics.K, size) > MOST_OFF:
+            cx, cy = intrinsics.K[:2, 2]
+            doubt = f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of {images}"
+        elif max(fx / fy, fy / fx) > SQUARE:
+            doubt = f"the focal lengths {fx:.0f} and {fy:.0f} are of no square pixels"
+        elif intrinsics.distortion_model not in geometry.FISHEYE and not NARROWEST < view < WIDEST:
+            doubt = f"the focal length {fx:.0f} gives {images} a field of view of {view:.0f} degrees"
+        if doubt:
+            helps = "" if intrinsics.doubt else ": is its K for other images?"
+            self._report.oddities.setdefault(f"{role.topic} K", f"{role.info_topic}: {doubt}{helps}")
+
     def _fitted(
         self, role: CameraRole, intrinsics: Intrinsics, image: Image, problems: list[str]
     ) -> Intrinsics | None:
@@ -251,14 +276,6 @@ class Cameras:
         if (width, height) == (intrinsics.width, intrinsics.height):
             return intrinsics
         if not intrinsics.width or not intrinsics.height:  # many drivers send 0
-            middle = intrinsics.K[:2, 2] / (width, height)
-            if np.abs(middle - 0.5).max() > MOST_OFF:
-                cx, cy = intrinsics.K[:2, 2]
-                self._report.oddities.setdefault(
-                    role.info_topic,
-                    f"{role.info_topic}: the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of "
-                    f"images of {width} x {height} pixels, and no size is stated: is it for other images?",
-                )
             return replace(intrinsics, width=width, height=height)
         sx, sy = width / intrinsics.width, height / intrinsics.height
         if abs(sx / sy - 1) > 0.01:
