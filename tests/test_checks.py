@@ -14,11 +14,12 @@ import bevviz
 from bevviz.checks import InputChecks
 from bevviz.checks.extrinsics import candidates
 from bevviz.cli import main
+from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
 from bevviz.model.frame import F64
 from bevviz.model.input_findings import InputFinding, Remedy
-from bevviz.model.results import FrameResult
+from bevviz.model.results import Detections, FrameResult
 from tests.support.small_bags import frozen_after
 
 
@@ -205,3 +206,27 @@ def test_the_remedy_for_a_wrong_extrinsic_works(
         main(command)
         output = capsys.readouterr()
         assert "the inverse of the stated pose" in " ".join((output.out + output.err).split()), command
+
+
+# --- the detector ------------------------------------------------------------------------------
+
+
+def test_a_detector_without_any_candidate_is_named(results: list[FrameResult]) -> None:
+    config = load(settings=["detector.model=forklift.onnx"])
+    with bevviz.simulate(1) as drive:
+        checks = InputChecks(drive.frames, config)
+        empty = [
+            replace(
+                result, config=config, cameras=(replace(result.cameras[0], detections=Detections.empty()),)
+            )
+            for result in results
+        ]
+        for result in empty[:4]:
+            checks.observe(result)
+        assert not checks.findings, "four images tell little"
+        checks.observe(empty[4])
+        (finding,) = checks.findings
+        assert (finding.kind, finding.subject) == ("detector", "forklift.onnx")
+        assert "no candidate with a score of 0.01 or more in 5 of 5 images" in str(finding)
+        checks.observe(replace(results[0], config=config))
+        assert not [finding for finding in checks.findings if finding.kind == "detector"]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bevviz.config import DetectorConfig
 from bevviz.errors import UserError
+from bevviz.model.frame import U8
 from bevviz.model.geometry import iou
 from bevviz.model.results import Detections, DetectionState
 from bevviz.stages.detector import COCO, Detector, nms
@@ -27,10 +28,12 @@ from tests.support.onnx_networks import (
     UINT8,
     H,
     W,
+    answer,
     constant,
     head,
     image_input,
     node,
+    save,
 )
 
 KEPT, BELOW, SUPPRESSED = DetectionState.KEPT, DetectionState.BELOW_THRESHOLD, DetectionState.SUPPRESSED
@@ -803,3 +806,87 @@ def test_yolox_nano_finds_the_pedestrian_of_kitti(shared: Path) -> None:
     assert [result.names[d] for d in found] == ["person"]
     assert iou(result.xyxy[found], label)[0, 0] > 0.8
     assert result.score[found[0]] > 0.7
+
+
+# --- a detector that can never answer ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("boxes", "score", "classes", "reason"),
+    [
+        ([[100.0, 60, 40, 30]], [0.9], [0], "not corners, but perhaps centre and size"),
+        ([[60.0, 60, 90, 90], [150, 100, 30, 20]], [0.9, 0.6], [0, 1], "not corners"),
+        ([[0.2, 0.2, 0.4, 0.4]], [0.9], [0], "its boxes are not in pixels, but numbers up to 0.4"),
+        ([[20.0, 30, 60, 90]], [0.0], [0.9], "score and class are exchanged"),
+    ],
+)
+def test_a_list_that_is_read_in_the_wrong_way_is_refused(
+    tmp_path: Path, boxes: list[list[float]], score: list[float], classes: list[float], reason: str
+) -> None:
+    """A grey image tells nothing about a list, so the first images with candidates are checked."""
+    rows = np.column_stack([boxes, score, classes])
+    path = reacting(tmp_path / "m.onnx", rows)
+    network = detector(path)
+    assert len(network(np.full((H, W, 3), 114, np.uint8))) == 0
+    with pytest.raises(UserError, match=reason):
+        network(red_image())
+
+
+def test_a_list_of_corners_answers(tmp_path: Path) -> None:
+    rows = np.column_stack([[[20.0, 30, 60, 90]], [0.9], [1]])
+    assert detector(reacting(tmp_path / "m.onnx", rows))(red_image()).score.tolist() == pytest.approx([0.9])
+
+
+def red_image() -> U8:
+    image = np.full((H, W, 3), 114, np.uint8)
+    image[20:60, 20:60] = 0, 0, 255
+    return image
+
+
+def reacting(path: Path, rows: NDArray[Any]) -> str:
+    """Save a network with a list of boxes that is empty unless there is red in the image."""
+    table = np.zeros((1, 300, 6), np.float32)
+    table[0, : len(rows)] = rows
+    red = np.array([1, -0.5, -0.5], np.float32).reshape(1, 3, 1, 1)
+    nodes = [
+        node("Conv", ["images", "red"], ["redness"]),
+        node("ReduceMax", ["redness"], ["most"], keepdims=0),
+        node("Greater", ["most", "half"], ["is_red"]),
+        node("Cast", ["is_red"], ["factor"], to=FLOAT),
+        node("Mul", ["table", "factor"], ["output0"]),
+    ]
+    weights = {"table": table, "red": red, "half": np.float32(0.5)}
+    weights = {name: np.asarray(value) for name, value in weights.items()}
+    return save(path, nodes, weights, {"output0": ([1, 300, 6], FLOAT)}, [image_input(1, 3, H, W)], NAMES)
+
+
+def test_scores_that_share_the_quantisation_of_boxes_are_refused(tmp_path: Path) -> None:
+    step = 640 / 255  # pixels, and units of the score
+    y, x = np.mgrid[0:20, 0:20] * 32 + 16
+    boxes = np.stack([x, y, 0 * x + 32, 0 * x + 32]).reshape(4, 400)
+    table = np.vstack([np.rint(boxes / step) * step, np.zeros((2, 400))])[None].astype(np.float32)
+    names = {"names": "{0: 'a', 1: 'b'}"}
+    path = answer(tmp_path / "m.onnx", {"output0": table}, [image_input(1, 3, 640, 640)], names)
+    with pytest.raises(UserError, match=r"scores are all 0, because they have steps of 2\.5"):
+        detector(path)
+
+
+@pytest.mark.parametrize(("of_class", "expected"), [(0.5, 0.8), (0.48, 0.8), (0.9999, 0.8)])
+def test_the_score_of_an_untrained_class_is_left_out(
+    tmp_path: Path, of_class: float, expected: float
+) -> None:
+    """YOLOv7 does not train the class score where there is one class, and leaves it out of its own NMS."""
+    table = np.zeros((1, 25200, 6), np.float32)
+    table[0, :, :4] = 320, 320, 99, 99
+    table[0, 0, 4] = 0.8
+    table[0, :, 5] = of_class + np.linspace(-0.01, 0, 25200)
+    path = answer(tmp_path / "m.onnx", {"output": table}, [image_input(1, 3, 640, 640)])
+    assert detector(path)(np.zeros((640, 640, 3), np.uint8)).score.max() == pytest.approx(expected)
+
+
+def test_the_score_of_a_trained_class_counts(tmp_path: Path) -> None:
+    table = np.zeros((1, 25200, 6), np.float32)
+    table[0, :, :4] = 320, 320, 99, 99
+    table[0, 0, 4], table[0, 0, 5] = 0.8, 0.5
+    path = answer(tmp_path / "m.onnx", {"output": table}, [image_input(1, 3, 640, 640)])
+    assert detector(path)(np.zeros((640, 640, 3), np.uint8)).score.max() == pytest.approx(0.4)

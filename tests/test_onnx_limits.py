@@ -321,7 +321,9 @@ def test_weights_outside_of_the_folder_are_not_read(location: str, tmp_path: Pat
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     (folder / "up").symlink_to(tmp_path)
     (folder / "sub").mkdir()
-    assert "onnxruntime cannot load it: External data path" in refused(external(folder / "m.onnx", location))
+    reason = refused(external(folder / "m.onnx", location))
+    assert "onnxruntime cannot load it: External data path" in reason
+    assert reason.endswith("put the file with the weights beside it (FILE.onnx.data)")
 
 
 @pytest.mark.parametrize("version", ["1.20.0", "1.23.2", "1.24.0"])

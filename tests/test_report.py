@@ -38,6 +38,7 @@ from bevviz.report.page import spans
 from bevviz.report.pictures import marked_pictures, ticks
 from bevviz.report.report_subject import cause_of, explain_subject
 from bevviz.stages.detector import Detector
+from bevviz.support.onnx_files import network_hash
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.subject import projected_box
 from tests.support import bags, planted_faults
@@ -503,3 +504,23 @@ def test_ticks_enclose_what_they_measure(low: float, span: float, count: int) ->
 
 def test_report_windows_are_parsed() -> None:
     assert spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+
+
+def test_weights_beside_the_model_are_in_the_report(tmp_path: Path, small: Path) -> None:
+    """A newer exporter of torch writes model.onnx and model.onnx.data."""
+    bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
+    model = tmp_path / "models" / "net.onnx"
+    model.parent.mkdir()
+    network = onnx.load(Path(bevviz.__file__).parent / "data" / "demo_detector.onnx")
+    onnx.save(network, model, save_as_external_data=True, location="net.onnx.data", size_threshold=100)
+    weights = model.with_name("net.onnx.data")
+    content = weights.read_bytes()
+    call = ["report", str(bag), "--at", "0.5", "--before", "0", "--after", "0", "--model", str(model)]
+    assert main([*call, "--include-model"]) == 0
+    assert Path("net.onnx.data").read_bytes() == content
+    before = network_hash(model)
+    weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert network_hash(model) != before, "the weights count"
+    weights.unlink()
+    model.unlink()
+    assert main(["report", "--check", "bug.rrd"]) == 0

@@ -49,12 +49,16 @@ class ReadInput:
         config: configuration of the run.
         faults: faults of the sensors in the frames.
         cameras: sample of the images of each placed camera, by name.
+        images: images that the detector judged.
+        answered: those for which it had a candidate, however weak.
     """
 
     source: Items[object]
     config: Config
     faults: SensorFaults = field(default_factory=SensorFaults)
     cameras: dict[str, CameraSample] = field(default_factory=dict)
+    images: int = 0
+    answered: int = 0
 
     @property
     def bag(self) -> BagSource | None:

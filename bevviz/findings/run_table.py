@@ -18,10 +18,11 @@ from bevviz.findings.frame_findings import Finding, find_findings
 from bevviz.model.frame import Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key, with_weights
+from bevviz.pipeline.result_store import ResultStore, code_hash, open_store, store_key
 from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import model_path, versions
 from bevviz.support.files import file_hash
+from bevviz.support.onnx_files import with_weights
 from bevviz.why import FrameExplainer
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import re
 import sqlite3
 import threading
 import time
@@ -34,6 +33,7 @@ from bevviz.support import progress
 from bevviz.support.contexts import Closable
 from bevviz.support.files import file_hash
 from bevviz.support.loggers import logger
+from bevviz.support.onnx_files import with_weights
 from bevviz.support.version import __version__
 
 T = TypeVar("T")
@@ -333,13 +333,6 @@ def _identity(files: Iterable[Path], *facts: str) -> bytes:
     """Return the hash of everything but the input that a network's result depends on."""
     versions = __version__, ort.__version__, cv2.__version__, np.__version__, code_hash(NETWORKS)
     return store_key(*versions, *facts, *(file_hash(path) for file in files for path in with_weights(file)))
-
-
-def with_weights(model: Path) -> list[Path]:
-    """Return an ONNX file and the files beside it that hold its weights, by their names in it."""
-    names = re.findall(rb"\n\x08location\x12([\x01-\x7f])([^\0]{1,127})", model.read_bytes())
-    found = {text[: length[0]].decode(errors="replace") for length, text in names}
-    return [model, *(path for name in sorted(found) if (path := model.parent / name).is_file())]
 
 
 @lru_cache

@@ -19,6 +19,7 @@ from bevviz.config import METHOD_KEYS, Config, plugin_of, stage_files, with_stag
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
 from bevviz.support.files import absolute, file_hash
+from bevviz.support.onnx_files import network_hash
 from bevviz.support.version import __version__
 
 PACKAGES = (  # packages that are not installed are skipped: some libraries have several packages
@@ -81,7 +82,8 @@ def dependencies_of(config: Config) -> dict[str, Dependency]:
     dependencies = {name: Dependency(version=number) for name, number in versions().items()}
     for key, path in (("detector.model", model_path(config)), ("detector.names", names_path(config))):
         if path is not None:
-            dependencies[key] = Dependency(sha256=file_hash(path), file=path.name)
+            content = network_hash(path) if key == "detector.model" else file_hash(path)
+            dependencies[key] = Dependency(sha256=content, file=path.name)
     for key, file in stage_files(config).items():
         dependencies[key] = Dependency(sha256=file_hash(Path(file)), file=Path(file).name)
     for section, key in METHOD_KEYS.items():

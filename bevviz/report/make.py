@@ -63,6 +63,7 @@ from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
 from bevviz.support import cleanup, progress
 from bevviz.support.files import file_hash, save_text
+from bevviz.support.onnx_files import with_weights
 from bevviz.support.unfinished_folder import UnfinishedFolder
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.log import clear_answers, log_answers
@@ -187,7 +188,7 @@ def make(
             *(redactor.notes if redactor else ()),
         ]
         if model is not None:
-            written.files.append(shutil.copyfile(model, unfinished / model.name))
+            written.files += [shutil.copyfile(path, unfinished / path.name) for path in _network_files(model)]
         notes = [note for note in request.notes if window.low <= note.received < window.high]
         public = shareable(request.config)
         source = stack.enter_context(open_window([bag], request.config, window.low, window.high))
@@ -345,6 +346,12 @@ def replay(detections: DetectionsByImage) -> Callable[[Camera], Detections | Non
     return detect
 
 
+def _network_files(model: Path) -> list[Path]:
+    """Return the detector's file, and the files in its folder that hold its weights."""
+    weights = with_weights(model)[1:]
+    return [model, *(path for path in weights if path.parent == model.parent and not path.is_symlink())]
+
+
 def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path | None) -> None:
     """Check that the output files may be written.
 
@@ -358,8 +365,9 @@ def _check_targets(request: ReportRequest, targets: Sequence[Path], model: Path 
         raise UserError(f"-o {output}: there is no folder {output.parent}")
     if request.include_model and model is None:
         raise UserError("--include-model: there is no model: give --model FILE.onnx")
-    copies = [] if model is None else [output.with_name(model.name)]
-    inputs = {path.resolve() for path in request.paths} | ({model.resolve()} if model is not None else set())
+    network = [] if model is None else _network_files(model)
+    copies = [output.with_name(path.name) for path in network]
+    inputs = {path.resolve() for path in [*request.paths, *network]}
     for target in [*targets, *copies]:
         if target.resolve() in inputs:
             raise UserError(f"-o {output}: {target} is what is read; give another name")

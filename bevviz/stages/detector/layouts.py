@@ -8,7 +8,7 @@ from the wrong columns look like a bad detector.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,6 +108,8 @@ class Head:
     classes: int | None
     names: tuple[str, ...]  # class names, empty if unknown
     prototypes: str = ""  # output with mask prototypes; empty: none
+    trusted: bool = False  # Ultralytics exported the model
+    objectness_alone: bool = False  # the score of the only class says nothing
 
     @property
     def wanted(self) -> list[str]:
@@ -117,7 +119,10 @@ class Head:
     def split(self, outputs: Sequence[Any]) -> ScoredBoxes | ListedBoxes:
         """Split the outputs into boxes, scores and classes."""
         batch = self.layout.batch
-        return self.layout.split(self.classes, *(output[0] if batch else output for output in outputs))
+        split = self.layout.split(self.classes, *(output[0] if batch else output for output in outputs))
+        if self.objectness_alone and isinstance(split, ScoredBoxes):
+            return split._replace(scores=np.ones_like(split.scores))
+        return split
 
     def candidates(self, outputs: Sequence[Any], size: tuple[int, int], least: float) -> Candidates:
         """Return the detections of a run with a score of ``least`` or more.
@@ -133,9 +138,13 @@ class Head:
         split = self.split(outputs[: len(self.outputs)])
         best = read.candidates(split, self.layout.boxes, size, least)
         class_id = split.class_id[split.score >= least] if isinstance(split, ListedBoxes) else best.class_id
+        boxes = split.boxes[best.row]
         wrong = read.wrong_list(best.score, class_id, self.names)
+        wrong = wrong or read.wrong_candidates(boxes, best.score, self.layout.boxes, self.trusted)
+        if isinstance(split, ListedBoxes):
+            wrong = wrong or read.swapped_columns(split.score, split.class_id)
         if wrong:
-            raise ValueError(f"read as {self.layout}, {wrong}")
+            raise ValueError(f"read as {self.layout}, {wrong}{ADAPTER}")
         return best
 
     def coefficients(self, outputs: Sequence[Any], rows: I64) -> Any:
@@ -152,7 +161,7 @@ class Head:
             wrong = read.wrong_list(split.score, split.class_id, self.names)
         else:
             counted = facts.ultralytics or facts.names is not None or self.classes == len(COCO)
-            wrong = read.wrong_scores(split, counted)
+            wrong = read.wrong_scores(split, counted) or read.coarse_scores(split)
         return wrong or read.wrong_boxes(split.boxes, self.layout.boxes, facts.ultralytics)
 
 
@@ -400,7 +409,11 @@ def find_head(facts: ModelFacts) -> Head:
         match = layout.find(facts)
         if isinstance(match, LayoutMatch):
             names = _names(layout, match, facts)
-            head = Head(layout, match.outputs, match.classes, names, _prototypes(layout, match, facts))
+            prototypes = _prototypes(layout, match, facts)
+            head = Head(layout, match.outputs, match.classes, names, prototypes, facts.ultralytics)
+            split = head.split([facts.outputs[name] for name in head.outputs])
+            if isinstance(split, ScoredBoxes) and split.scores.size and read.has_unused_class(split):
+                head = replace(head, objectness_alone=True)
             doubt = _byte_input_problem(layout, facts) or head.doubt(facts)
             if not doubt:
                 return head

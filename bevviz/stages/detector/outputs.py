@@ -14,6 +14,9 @@ from bevviz.stages.detector.names import MAX_CLASSES
 SCORE_TOLERANCE = 0.01  # tolerance above 1 of scores in half precision or after quantisation
 MIN_SCORE = -1e-3  # the same below 0
 MAX_FRACTION_BOX = 2.0  # boxes that all lie within this many pixels are not in pixels
+CONFIDENT = 0.25  # least score of a candidate whose box must be one
+UNTRAINED = 0.05  # largest spread of class scores that were not trained
+BYTE, FEW_STEPS = 256, 8  # values of a quantised number, and values that tell nothing
 MAX_MEDIAN_SCORE = 0.2  # for an image without objects, no class has a higher median score over all positions
 
 
@@ -173,6 +176,65 @@ def wrong_list(score: Any, class_id: Any, names: tuple[str, ...]) -> str:
     if names and class_id.size and class_id.max() >= len(names):
         return f"it has class {class_id.max():.0f}, but {len(names)} class names"
     return ""
+
+
+def wrong_candidates(boxes: Any, score: Any, kind: BoxFormat, trusted: bool) -> str:
+    """Return why the candidates of an image cannot be boxes, empty if they can.
+
+    Args:
+        boxes: (N, 4) numbers of the boxes, as the network gives them.
+        score: (N,) their scores.
+        kind: how the numbers are read.
+        trusted: whether the file tells that the boxes are corners.
+    """
+    strong = boxes[score >= CONFIDENT]
+    strong = strong[np.isfinite(strong).all(axis=1)]
+    if not len(strong) or kind in (BoxFormat.FRACTIONS, BoxFormat.CELLS):
+        return ""
+    if np.abs(strong).max() <= MAX_FRACTION_BOX:
+        return f"its boxes are not in pixels, but numbers up to {np.abs(strong).max():.3g}"
+    inverted = strong[(strong[:, 2:] < strong[:, :2] - 1).any(axis=1)]
+    if kind is BoxFormat.CORNERS and len(inverted) and not trusted:
+        x0, y0, x1, y1 = inverted[0].tolist()
+        return (
+            f"its boxes are not corners, but perhaps centre and size: the second corner ({x1:.0f}, {y1:.0f}) "
+            f"lies to the left of the first ({x0:.0f}, {y0:.0f}), or above"
+        )
+    return ""
+
+
+def swapped_columns(score: Any, class_id: Any) -> str:
+    """Return why a list has score and class in each other's column, empty if it has not."""
+    odd = (score == 0) & (class_id > 0) & (class_id < 1)
+    if odd.any():
+        return f"it has a score of 0 beside class {class_id[odd][0]:.3g}: score and class are exchanged"
+    return ""
+
+
+def coarse_scores(split: ScoredBoxes) -> str:
+    """Return why the scores can only be 0, because boxes and scores share one quantisation; else empty."""
+    steps = np.unique(split.boxes)
+    if split.scores.any() or not FEW_STEPS < len(steps) <= BYTE < len(split.boxes):
+        return ""
+    counts = np.arange(1, BYTE)
+    shares = steps[:, None] / (np.abs(steps).max() / counts)
+    fitting = counts[np.abs(shares - np.rint(shares)).max(axis=0) < 0.01]
+    step = float(np.abs(steps).max() / fitting[0]) if len(fitting) else 0.0
+    if step < 1 or abs(step - round(step)) < 0.01:  # whole pixels are those of a grid
+        return ""
+    return (
+        f"its scores are all 0, because they have steps of {step:.2g} as its boxes have: quantise boxes and "
+        "scores apart, or leave the last layers as floats"
+    )
+
+
+def has_unused_class(split: ScoredBoxes) -> bool:
+    """Return whether the score of the only class says nothing, so that the objectness is the score.
+
+    YOLOv7 does not train it where there is one class, and leaves it out of its own NMS.
+    """
+    scores = split.scores
+    return split.objectness is not None and scores.shape[1] == 1 and bool(np.ptp(scores) < UNTRAINED)
 
 
 def wrong_scores(split: ScoredBoxes, counted: bool) -> str:

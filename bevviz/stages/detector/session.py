@@ -49,6 +49,23 @@ FIRST_SAFE = (1, 24, 1)
 LOG_FATAL = 4  # onnxruntime's severity "fatal", so that it does not print errors that we report ourselves
 MAX_LISTED = 8  # inputs or outputs in an error message
 MAX_LISTED_TEXT = 200  # characters of each text in an error message
+MAX_REASON = (
+    2000  # characters of onnxruntime's reason in an error message; a file may hold names of any length
+)
+AGAIN = "export it again, and test the file with onnxruntime alone"
+# What to do, by onnxruntime's reason.
+REMEDIES = (
+    (re.compile(r"external data|External data"), "put the file with the weights beside it (FILE.onnx.data)"),
+    (
+        re.compile(r"opset|IR version|is not a registered|No Op registered"),
+        "export it with an older opset (opset=17), or install a newer onnxruntime",
+    ),
+    (
+        re.compile(r"[Pp]rotobuf|INVALID_PROTOBUF"),
+        "it is damaged or no ONNX file: copy or export it again",
+    ),
+    (re.compile(r"[Ss]hape|[Dd]imension|broadcast"), "export it with a fixed input size (dynamic=False)"),
+)
 SIZE_HINT = "use a smaller network, or export it with a smaller input"
 
 NUMBERS = re.compile(r"tensor\((u?int(8|16|32|64)|float|float16|double|bool)\)")
@@ -213,10 +230,10 @@ def list_tensors(tensors: Iterable[tuple[str, Any]]) -> str:
     return ", ".join([*texts[:MAX_LISTED], *([f"and {more} more"] if more > 0 else [])])
 
 
-def clip(value: object) -> str:
+def clip(value: object, most: int = MAX_LISTED_TEXT) -> str:
     """Return the value as a text for an error message. A file may hold names of any length."""
     text = str(value)
-    return text if len(text) <= MAX_LISTED_TEXT else f"{text[:MAX_LISTED_TEXT]}..."
+    return text if len(text) <= most else f"{text[:most]}..."
 
 
 class _LimitError(Exception):
@@ -340,4 +357,6 @@ def _reason(error: Exception, otherwise: str) -> str:
     text = first_line(error)
     if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(text):
         return f"{_too_large()}; {SIZE_HINT}"
-    return f"{otherwise}: {clip(SOURCE_POSITION.sub('', ERROR_CODE.sub('', text)))}"
+    text = SOURCE_POSITION.sub("", ERROR_CODE.sub("", text))
+    remedy = next((remedy for pattern, remedy in REMEDIES if pattern.search(text)), AGAIN)
+    return f"{otherwise}: {clip(text, MAX_REASON)}; {remedy}"
