@@ -84,9 +84,13 @@ def test_problems_are_told_when_they_begin_change_and_end() -> None:
     assert problems.sentences == ["0.72 s behind: set sync.offsets"]
     (problem,) = problems.of("/lidar")
     assert problem.finding.kind == "clock" and problem.since == pytest.approx(time.time(), abs=60)
+    for count in (900, 1_000):
+        problems.set("blind", "/lidar2", f"/lidar2: all {count:,} points are NaN in {count} frames")
+    problems.set("blind", "/lidar2", "", "seen")
     problems.set("clock", "/lidar", "")
     problems.tell_once("found out")
     problems.tell_once("found out")
     first, second = "0.70 s ahead: set sync.offsets", "0.72 s behind: set sync.offsets"
-    assert said == [first, second, "right again", "found out"]
+    blind = "/lidar2: all 900 points are NaN in 900 frames"
+    assert said == [first, second, blind, "seen", "right again", "found out"]
     assert problems.sentences == []

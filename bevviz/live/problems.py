@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from bevviz.model.input_findings import InputFinding, Remedy
 
-_MEASURED = re.compile(r"\d+\.\d+")
+_VALUES = re.compile(r"(?<![\w/])\d[\d,.]*")  # numbers that are no part of a name
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class CurrentProblems:
     ) -> None:
         """Set the problem of this kind and subject.
 
-        Measured values in the sentence may change without a further line.
+        Numbers in the sentence may change without a further line.
 
         Args:
             kind: word for the kind, such as ``silence``.
@@ -99,4 +99,4 @@ class CurrentProblems:
 
 
 def _without_values(text: str) -> str:
-    return _MEASURED.sub("#", text)
+    return _VALUES.sub("#", text)

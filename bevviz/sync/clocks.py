@@ -108,8 +108,8 @@ class Clocks:
             return  # They are waited for.
         what = f"{topic}: its messages come {off:.2f} s later than those of {right}"
         remedies = []
-        if off >= spare:
-            arrivals = self._arrivals(right if drives else topic)
+        arrivals = self._arrivals(right if drives else topic) if off >= spare else np.zeros((0, 2))
+        if len(arrivals):  # else there are too few messages to try it
             wait, queue = self._needed(arrivals)
             now = self._in_time(arrivals, self._config.max_wait, self._config.queue)
             remedies.append(
@@ -118,7 +118,7 @@ class Clocks:
                 f"stamp in place of {now}"
             )
         if agree:
-            yield f"{what}, at the same stamps; {'; '.join(remedies)}"
+            yield "; ".join([f"{what}, at the same stamps", *remedies])
             return
         offset = f"--set sync.offsets='{{{topic}: {off:.2f}}}' sets it right"
         remedies.append(f"if its clock is behind, {offset}" if remedies else offset)
