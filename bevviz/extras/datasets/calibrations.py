@@ -30,12 +30,19 @@ FEW, MAX_FILES = 12, 64  # of one folder: more than few of numbered names are of
 FRAME_NAME = re.compile(r"\d{4}")  # in the name of a file of one frame: its number or stamp
 MAX_SIZE = 1 << 20  # bytes of a calibration
 LABELS = re.compile(r"label|annot|result|pred", re.IGNORECASE)  # folders that are not searched
+UNREAD = re.compile(r"extrin|^(?!calib_).*calib", re.IGNORECASE)  # names of files that state sensors
 OPENCV_TAG = re.compile(r"!!opencv-matrix|^%YAML.*$", re.MULTILINE)
 # A camera's body frame (x forward) in its optical frame (z forward).
 OPTICAL_FROM_BODY = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
 LENSES = {"radtan": "plumb_bob", "equi": "equidistant", "fisheye": "equidistant", "none": ""}
 CAMERAS = (2, 0, 1, 3, 4)  # of KITTI: the left colour camera first
 ANY_CAMERA = "camera"  # the only one of a folder, whatever its name
+# T_camera_lidar, T_cl and the like: the target first, as in a_from_b.
+DIRECTION = re.compile(
+    r"T_?(?P<target>c(am(era)?)?\d*_?(?=(l|v))|(l(idar)?|velo(dyne)?)_?(?=c))"
+    r"(c(am(era)?)?\d*|l(idar)?|velo(dyne)?)",
+    re.IGNORECASE,
+)
 SAME = 1e-3  # relative difference of two calibrations of a camera
 TOLERANCE = 0.02  # of a rotation matrix, which some tools write with few digits
 
@@ -50,6 +57,7 @@ class FoundSensor:
         sensor_from_lidar: (4, 4) transform from the LiDAR; None: not stated.
         base_from_sensor: (4, 4) pose in the frame of the vehicle; None: not stated.
         is_lidar: whether it is a LiDAR.
+        note: what the file states and is not used; empty: nothing.
     """
 
     name: str
@@ -57,6 +65,7 @@ class FoundSensor:
     sensor_from_lidar: F64 | None = None
     base_from_sensor: F64 | None = None
     is_lidar: bool = False
+    note: str = ""
 
 
 def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[str]) -> FoundCalibration:
@@ -75,6 +84,14 @@ def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[s
         except (UserError, *NOT_AS_DOCUMENTED) as error:
             why = str(error) if isinstance(error, UserError) else describe_error(error)
             found.warnings.append(f"{file.relative_to(path)}: is not used: {why}")
+
+    for file, sensors in stated_in.items():
+        found.warnings += [f"{file.relative_to(path)}: {sensor.note}" for sensor in sensors if sensor.note]
+        if not sensors and UNREAD.search(file.stem) and file.name != "calibration.yaml":
+            found.warnings.append(
+                f"{file.relative_to(path)}: is not used: no kind of calibration that is known here; "
+                "calibration.yaml can state it (docs/inputs.md)"
+            )
 
     def names_none(file: Path) -> bool:
         """Return whether a file names no camera of the folder."""
@@ -181,6 +198,9 @@ def _sensors_of(file: Path) -> list[FoundSensor]:
 
 def _text(file: Path) -> Iterator[FoundSensor]:
     """Read lines of a name and numbers: those of KITTI's benchmarks and raw drives, and of CalibAnything."""
+    if "extrin" in file.stem.lower() and (matrix := _plain_matrix(file)) is not None:
+        yield FoundSensor(ANY_CAMERA, {}, matrix)
+        return
     rows = named_rows(file)
     sizes = {name: len(values) for name, values in rows.items()}
     if not {"Tr_velo_to_cam", "Tr_velo_to_cam_0", "Tr", "Tr_velo_cam"}.isdisjoint(rows):
@@ -198,6 +218,15 @@ def _text(file: Path) -> Iterator[FoundSensor]:
     elif sizes.get("P2") == 12 and sizes.get("R") == 9 and sizes.get("T") == 3:
         K, camera_from_reference = split_projection(rows["P2"].reshape(3, 4))
         yield from _numbered({2: (K, camera_from_reference @ _rigid(read_rigid(file)))})
+
+
+def _plain_matrix(file: Path) -> F64 | None:
+    """Return camera_from_lidar of a file of 12 or 16 numbers alone (LVT2Calib); None: it has others."""
+    words = re.split(r"[\s,;]+", read_text(file, MAX_SIZE).strip())
+    try:
+        return _rigid([float(word) for word in words]) if len(words) in (12, 16) else None
+    except ValueError:
+        return None
 
 
 def _kitti(file: Path, rows: Mapping[str, F64]) -> Iterator[FoundSensor]:
@@ -283,6 +312,8 @@ def _camera_info(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
     extrinsic = tree.get("CameraExtrinsicMat")
     lidar_from_camera = _rigid(extrinsic["data"]) if isinstance(extrinsic, dict) else None
     camera_from_lidar = None if lidar_from_camera is None else geometry.inverse(lidar_from_camera)
+    if camera_from_lidar is None:
+        camera_from_lidar = _named_transform(tree)
     yield FoundSensor(str(tree.get("camera_name") or name), lens, camera_from_lidar)
 
 
@@ -299,13 +330,19 @@ def _kalibr(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
             pose = _rigid(about["T_cn_cnm1"]) @ previous
         previous = pose
         lens: dict[str, Any] = {}
-        if about.get("camera_model", "pinhole") == "pinhole" and len(about.get("intrinsics", ())) == 4:
+        model = str(about.get("camera_model", "pinhole"))
+        if model != "pinhole":
+            raise UserError(f"{key}: camera_model {model} is not supported; calibrate with pinhole")
+        note = ""
+        if pose is None and "T_cam_imu" in about:
+            note = f"T_cam_imu of {key} states the IMU, not the LiDAR: T_cam_lidar is missing"
+        if len(about.get("intrinsics", ())) == 4:
             fx, fy, cx, cy = map(float, about["intrinsics"])
             D = _flat(about.get("distortion_coeffs", ()))
             lens = {"K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
             lens |= {"size": about.get("resolution", [0, 0])}
             lens |= _lens(D, str(about.get("distortion_model", "")))
-        yield FoundSensor(key, lens, pose)
+        yield FoundSensor(key, lens, pose, note=note)
 
 
 def _autoware(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
@@ -347,6 +384,74 @@ def _named_sensors(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
         yield FoundSensor(key, lens, None, pose, is_lidar=not intrinsic)
 
 
+def _direct_visual(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read direct_visual_lidar_calibration: the lens in ``camera``, and ``T_lidar_camera`` in ``results``."""
+    camera, results = tree.get("camera"), tree.get("results")
+    if not (isinstance(camera, dict) and isinstance(results, dict)) or len(camera.get("intrinsics", ())) != 4:
+        return
+    model = str(camera.get("camera_model", "plumb_bob"))
+    if model not in ("plumb_bob", "fisheye", "equidistant", "rational_polynomial"):
+        raise UserError(f"camera_model {model} is not supported")
+    lens = {"K": _pinhole(camera["intrinsics"]), **_lens(_flat(camera.get("distortion_coeffs", ())), model)}
+    yield FoundSensor(ANY_CAMERA, lens, _named_transform(results))
+
+
+def _fast_livo(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read FAST-LIVO2: ``Rcl`` and ``Pcl`` in one file, and the lens as ``cam_fx`` in another."""
+    for inner in ("/**", "ros__parameters"):
+        tree = tree[inner] if isinstance(tree.get(inner), dict) else tree
+    extrinsic = tree.get("extrin_calib")
+    if isinstance(extrinsic, dict) and {"Rcl", "Pcl"} <= extrinsic.keys():
+        rotation, position = (
+            np.reshape(_flat(extrinsic["Rcl"]), (3, 3)),
+            np.reshape(_flat(extrinsic["Pcl"]), (3, 1)),
+        )
+        yield FoundSensor(ANY_CAMERA, {}, _rigid(np.hstack([rotation, position])))
+    if {"cam_fx", "cam_fy", "cam_cx", "cam_cy"} <= tree.keys():
+        model = str(tree.get("cam_model", "Pinhole"))
+        if model.lower() != "pinhole":
+            raise UserError(f"cam_model {model} is not supported")
+        scale = float(tree.get("scale", 1.0))
+        size = [int(tree.get(f"cam_{side}", 0)) for side in ("width", "height")]
+        lens = {"K": _pinhole([tree[f"cam_{key}"] for key in ("fx", "fy", "cx", "cy")]), "size": size}
+        if scale != 1.0:
+            raise UserError(f"scale {scale:g} of the image is not supported")
+        D = [float(tree.get(f"cam_d{i}", 0.0)) for i in range(4)]
+        yield FoundSensor(ANY_CAMERA, {**lens, **_lens(D, "plumb_bob")})
+
+
+def _matrix_by_name(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read one transform whose name tells its direction, such as ``T_cam_lidar`` or ``T_C_L``."""
+    pose = _named_transform(tree)
+    if pose is None and "extrinsic_matrix" in tree:
+        pose = _rigid(_values(tree["extrinsic_matrix"]))
+    if pose is not None:
+        yield FoundSensor(ANY_CAMERA, {}, pose)
+
+
+def _named_transform(tree: Mapping[str, Any]) -> F64 | None:
+    """Return camera_from_lidar where it is named ``T_camera_lidar``, ``T_C_L`` or the other way round."""
+    for key, value in tree.items():
+        match = DIRECTION.fullmatch(key)
+        if match is None:
+            continue
+        numbers = _flat(_values(value))
+        pose = geometry.transform(numbers[:3], numbers[3:]) if len(numbers) == 7 else _rigid(numbers)
+        return pose if match["target"].lower().startswith("c") else geometry.inverse(pose)
+    return None
+
+
+def _values(value: Any) -> Any:
+    """Return the numbers of a matrix, which OpenCV puts into ``data``."""
+    return value["data"] if isinstance(value, dict) else value
+
+
+def _pinhole(intrinsics: Any) -> list[float]:
+    """Return the nine numbers of a camera matrix from fx, fy, cx, cy."""
+    fx, fy, cx, cy = _flat(intrinsics)
+    return _square([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+
+
 PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
     _sustech,
     _supervisely,
@@ -356,6 +461,9 @@ PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
     _kalibr,
     _named_sensors,
     _autoware,
+    _direct_visual,
+    _fast_livo,
+    _matrix_by_name,
 )
 
 
