@@ -17,11 +17,21 @@ from bevviz.pipeline.session import Session
 from tests.support.sensor_plants import (
     Results,
     blocked_sector,
+    covered,
+    defocused,
+    jittered,
+    muddy,
+    noisy,
     pixels,
+    recompressed,
+    thinned,
     turned_camera,
     turned_lidar,
     turned_transform,
     with_image,
+    with_scan,
+    without_far_returns,
+    without_image,
 )
 
 FIRST, EVERY = 8, 8  # frames, when faults are planted in a drive
@@ -30,6 +40,8 @@ HORIZON = 6  # frames that a fault is watched for
 LONGEST = 100  # frames that a transform which was always wrong is watched for
 DEGREES = 3.0
 TURNS = [(axis, sign * DEGREES) for axis in range(3) for sign in (1, -1)]
+FADING = "returns that fade by 2 % a frame"
+FADED = 40  # frames, that fading returns are watched for
 ALWAYS = "transform wrong by 3 degrees from the first frame on"
 
 Plant = Callable[[Results, int, int], FrameResult]  # of a drive, a frame and the first frame with the fault
@@ -52,6 +64,12 @@ def _turns(turn: Callable[[FrameResult, int, float], FrameResult]) -> tuple[Plan
     return tuple(plant(axis, degrees) for axis, degrees in TURNS)
 
 
+def _late_after_gap(drive: Results, row: int, first: int) -> FrameResult:
+    """Return a frame without image, and then frames with the image before."""
+    late = with_image(drive[row], pixels(drive[row - 1]).copy())
+    return without_image(late) if row == first else late
+
+
 SENSOR_FAULTS = {
     "black image": SensorPlant(
         "black image", (lambda d, i, _: with_image(d[i], np.zeros_like(pixels(d[i]))),)
@@ -60,6 +78,40 @@ SENSOR_FAULTS = {
     "frozen image": SensorPlant("frozen image", (lambda d, i, k: with_image(d[i], pixels(d[k]).copy()),)),
     "image late by one": SensorPlant(
         "late image", (lambda d, i, _: with_image(d[i], pixels(d[i - 1]).copy()),)
+    ),
+    "black image with noise": SensorPlant(
+        "black image", (lambda d, i, _: with_image(d[i], noisy(np.zeros_like(pixels(d[i])), 3, i)),)
+    ),
+    "dark image with noise": SensorPlant(
+        "dark image", (lambda d, i, _: with_image(d[i], noisy(pixels(d[i]) // 8, 2, i)),)
+    ),
+    "frozen image, compressed at other qualities": SensorPlant(
+        "frozen image", (lambda d, i, k: with_image(d[i], recompressed(pixels(d[k]), 60 + 10 * (i % 4))),)
+    ),
+    "frozen image with one grey value of noise": SensorPlant(
+        "frozen image", (lambda d, i, k: with_image(d[i], noisy(pixels(d[k]), 0.7, i)),)
+    ),
+    "image late by one, compressed": SensorPlant(
+        "late image", (lambda d, i, _: with_image(d[i], recompressed(pixels(d[i - 1]), 80)),)
+    ),
+    "one image missing, then all late by one": SensorPlant("late image", (_late_after_gap,)),
+    "cover over 40 % of the lens": SensorPlant(
+        "covered lens", (lambda d, i, _: with_image(d[i], covered(pixels(d[i]))),)
+    ),
+    "mud on the lens": SensorPlant(
+        "covered lens", (lambda d, i, k: with_image(d[i], muddy(pixels(d[i]), k)),)
+    ),
+    "defocus, sigma 12": SensorPlant(
+        "blurred image", (lambda d, i, _: with_image(d[i], defocused(pixels(d[i]))),)
+    ),
+    "frozen scan": SensorPlant("frozen scan", (lambda d, i, k: with_scan(d[i], d[k].frame.points.copy()),)),
+    "frozen scan with noise of 1 cm": SensorPlant(
+        "frozen scan", (lambda d, i, k: jittered(d[i], d[k].frame.points, i),)
+    ),
+    "returns beyond 15 m lost": SensorPlant("far returns lost", (lambda d, i, _: without_far_returns(d[i]),)),
+    "half of the returns lost": SensorPlant("fewer returns", (lambda d, i, _: thinned(d[i], 0.5, i),)),
+    "blocked sector with few returns": SensorPlant(
+        "blocked sector", (lambda d, i, _: blocked_sector(d[i], 0.05),)
     ),
     "blocked sector of 35 degrees": SensorPlant("blocked sector", (lambda d, i, _: blocked_sector(d[i]),)),
     "transform jumps by 3 degrees": SensorPlant("jumped", _turns(turned_transform)),
@@ -96,6 +148,8 @@ def measure(drive: Results, tally: SensorTally) -> None:
         new = [a for a in watch.update(result) if (a.subject, a.since) not in seen]
         seen |= {(a.subject, a.since) for a in new}
         tally.alarms += new
+    fading = [thinned(r, max(1 - 0.02 * max(i - FIRST, 0), 0.1), i) for i, r in enumerate(drive[:FADED])]
+    tally.delays[FADING].append(_delay(SensorWatch(), fading, "fewer returns", tally) - 0.1 * FIRST)
     for axis, degrees in TURNS:
         wrong = [turned_transform(result, axis, degrees) for result in drive[:LONGEST]]
         tally.delays[ALWAYS].append(_delay(SensorWatch(), wrong, "not where its transform says", tally))

@@ -20,12 +20,21 @@ from bevviz.model.results import Anomaly, FrameResult
 from tests.support.sensor_plants import (
     Results,
     blocked_sector,
+    covered,
+    defocused,
+    jittered,
+    muddy,
+    noisy,
     pixels,
+    recompressed,
+    thinned,
     turned_camera,
     turned_lidar,
     turned_transform,
     with_image,
     with_scan,
+    without_far_returns,
+    without_image,
 )
 
 FIRST, LAST = 8, 18  # frames with the fault
@@ -67,6 +76,16 @@ def test_clean_real_drive_has_no_sensor_fault(drive: Results) -> None:
         (f"{LIDAR}: blocked sector", 2, lambda d, i: blocked_sector(d[i])),
         (f"{LIDAR}: returns lost", 2, lambda d, i: with_scan(d[i], d[i].frame.points[:2000])),
         (f"{LIDAR}: frozen scan", 2, lambda d, i: with_scan(d[i], d[FIRST].frame.points.copy())),
+        (f"{CAMERA}: frozen image", 2, lambda d, i: with_image(d[i], recompressed(pixels(d[FIRST]), 60 + i))),
+        (f"{CAMERA}: frozen image", 2, lambda d, i: with_image(d[i], noisy(pixels(d[FIRST]), 0.7, i))),
+        (f"{CAMERA}: late image", 1, lambda d, i: with_image(d[i], recompressed(pixels(d[i - 1]), 80))),
+        (f"{CAMERA}: covered lens", 3, lambda d, i: with_image(d[i], covered(pixels(d[i])))),
+        (f"{CAMERA}: covered lens", 3, lambda d, i: with_image(d[i], muddy(pixels(d[i]), 3))),
+        (f"{CAMERA}: blurred image", 3, lambda d, i: with_image(d[i], defocused(pixels(d[i])))),
+        (f"{LIDAR}: far returns lost", 2, lambda d, i: without_far_returns(d[i])),
+        (f"{LIDAR}: fewer returns", 2, lambda d, i: thinned(d[i], 0.5, i)),
+        (f"{LIDAR}: blocked sector", 2, lambda d, i: blocked_sector(d[i], 0.05)),
+        (f"{LIDAR}: frozen scan", 2, lambda d, i: jittered(d[i], d[FIRST].frame.points, i)),
         (f"{CAMERA}: transform from {LIDAR} jumped", 0, lambda d, i: turned_transform(d[i], 1, 3)),
     ],
     ids=lambda value: value.split(": ")[1].replace(" ", "_") if isinstance(value, str) else "",
@@ -81,6 +100,34 @@ def test_planted_fault_is_told_by_name(
     assert anomaly.severity == "ERROR"
     began = 0.7 if subject.endswith("late image") else 0.8
     assert anomaly.text.startswith(f"{subject} since {began} s")
+
+
+def test_images_are_late_after_a_missing_one(drive: Results) -> None:
+    def plant(row: int) -> FrameResult:
+        late = with_image(drive[row], pixels(drive[row - 1]).copy())
+        return without_image(late) if row == FIRST else late
+
+    told = faults(drive, plant)
+    assert list(told) == [f"{CAMERA}: late image"]
+    row, anomaly = told[f"{CAMERA}: late image"]
+    assert row == FIRST + 1 and anomaly.text.endswith(
+        "an image is missing, and those after it may be late by one"
+    )
+
+
+def test_a_cover_is_named_with_its_place(drive: Results) -> None:
+    told = faults(drive, lambda row: with_image(drive[row], covered(pixels(drive[row]))))
+    assert ", left part: " in told[f"{CAMERA}: covered lens"][1].text
+
+
+def test_returns_that_fade_are_told(drive: Results) -> None:
+    """3 % of the returns are lost with each frame from the eighth on."""
+    detector, told = AnomalyDetector(), list[tuple[int, Anomaly]]()
+    for row, result in enumerate(drive):
+        faded = thinned(result, 1 - 0.03 * max(row - FIRST, 0), row)
+        told += [(row, anomaly) for anomaly in detector.update(faded, AnomaliesConfig())]
+    assert {anomaly.subject for _, anomaly in told} == {f"{LIDAR}: fewer returns"}
+    assert told[0][0] <= FIRST + 16
 
 
 @pytest.mark.parametrize("degrees", [3.0, -3.0])

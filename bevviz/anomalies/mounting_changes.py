@@ -72,6 +72,12 @@ class ScanShape:
         )
         return ScanShape(ranges, bounds, _ground_slope(result))
 
+    def change_to(self, other: ScanShape) -> float:
+        """Return the mean difference of the ranges in each direction, as a logarithm."""
+        difference = np.abs(self.ranges - other.ranges)
+        known = np.isfinite(difference)
+        return float(np.minimum(difference[known], LARGEST).mean()) if known.any() else 0.0
+
     def rotation_to(self, other: ScanShape) -> F64 | None:
         """Return the (3,) rotation of the scene in degrees, about x, y and z of the points.
 

@@ -6,7 +6,16 @@ from collections.abc import Iterator, Sequence
 
 from bevviz.anomalies.calibration_drift import PlacementWatch
 from bevviz.anomalies.mounting_changes import MountingWatch, ScanShape
-from bevviz.anomalies.sensor_faults import ImageWatch, ScanWatch, SensorFault
+from bevviz.anomalies.sensor_faults import (
+    LEAST_SCAN_CHANGE,
+    MOVES,
+    REPEATS,
+    SAME,
+    ImageWatch,
+    ScanWatch,
+    SensorFault,
+    UsualChange,
+)
 from bevviz.model.frame import Cloud, Frame
 from bevviz.model.results import Anomaly, FrameResult
 
@@ -33,6 +42,8 @@ class SensorWatch:
         self._mountings: dict[str, MountingWatch] = {}
         self._placement = PlacementWatch()
         self._shape: ScanShape | None = None
+        self._scan_change = UsualChange(LEAST_SCAN_CHANGE)
+        self._still_scans, self._still_since, self._scan_stamp = 0, 0, 0
 
     def update(self, result: FrameResult) -> Sequence[Anomaly]:
         """Return the faults of all sensors in this frame."""
@@ -66,19 +77,34 @@ class SensorWatch:
         before, self._shape = self._shape, None
         if frame.lidar and any(camera.image is not None for camera in frame.cameras):
             self._shape = ScanShape.measure(result, before)
-        scene = None if before is None or self._shape is None else before.rotation_to(self._shape)
+        scene, scan_ratio = None, float("nan")
+        if before is not None and self._shape is not None:
+            scene = before.rotation_to(self._shape)
+            scan_ratio = self._scan_change.ratio(before.change_to(self._shape))
         for camera in frame.cameras:
             image, gray = camera.image, None
             faults: tuple[SensorFault, ...] = ()
             if image is not None:
                 watch = self._images.setdefault(camera.name, ImageWatch(f"camera {camera.name}"))
-                faults, gray = watch.update(image), watch.gray
+                faults, gray = watch.update(image, scan_moves=scan_ratio >= MOVES), watch.gray
                 yield from faults
             if faults:
                 distrusted.add(camera.name)
             mounting = self._mountings.setdefault(camera.name, MountingWatch(camera.name, frame.lidar))
             yield from mounting.update(camera, gray, scene, frame.stamp, trusted=not faults)
+        yield from self._still_scan(frame, scan_ratio)
+        self._scan_stamp = frame.stamp
         yield from self._placement.update(frame, clouds, distrusted)
+
+    def _still_scan(self, frame: Frame, ratio: float) -> Iterator[SensorFault]:
+        """Yield a scan that repeats the scan before but for its noise, while a camera sees the scene move."""
+        if not ratio < SAME or not any(watch.moves for watch in self._images.values()):
+            self._still_scans = 0
+            return
+        self._still_since = self._still_since if self._still_scans else self._scan_stamp
+        self._still_scans += 1
+        if self._still_scans >= REPEATS:
+            yield SensorFault(f"LiDAR {frame.lidar}", "frozen scan", self._still_since)
 
 
 def _anomaly(fault: SensorFault, since: str = "") -> Anomaly:
