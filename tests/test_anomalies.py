@@ -117,6 +117,18 @@ def test_an_object_lost_by_the_detector_is_found() -> None:
     assert drive.said == [(15, "one_sensor", text)]
 
 
+def test_a_near_car_that_the_image_border_cuts_is_found() -> None:
+    """A quarter of the car is outside of the image, and no detection shows it for ten frames."""
+    drive = Drive()
+    for _ in range(12):
+        drive.frame([(6.5, -4.5, 0)], CAR, ("car",))
+    for _ in range(10):
+        drive.frame([(6.5, -4.5, 0)], CAR)
+    ((row, kind, text),) = drive.said
+    assert row <= 12 + 4 and kind == "one_sensor"
+    assert text.startswith("car #0: a cluster in plain view")
+
+
 def test_the_loss_of_a_longer_track_is_reported_sooner() -> None:
     told = []
     for frames in (8, 12, 40):

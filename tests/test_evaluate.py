@@ -19,13 +19,14 @@ from bevviz.cli import main
 from bevviz.evaluate import Truth, judge, truth_in, truth_of
 from bevviz.evaluate.average_precision import DIFFICULTIES, AveragePrecision, ScoredObjects
 from bevviz.evaluate.evaluation import Evaluation
+from bevviz.evaluate.ground_truth import must_be_found
 from bevviz.evaluate.matching import ObjectScore
 from bevviz.evaluate.tracking_score import ClassTracks
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
-from bevviz.model.frame import Boxes3D, ImageLabels
+from bevviz.model.frame import Boxes3D, Frame, ImageLabels
 from bevviz.model.results import Objects
 from bevviz.stages.robot_results import in_points_frame
 from tests.support import bags, documented_json
@@ -432,3 +433,14 @@ def test_a_batch_is_evaluated_against_the_truth(
     assert "1 of 1 bags are complete and up to date" in said
     assert "drive: not kept: recall is 0." in said
     assert ElementTree.parse(junit).getroot()[0].get("failures") == "1"
+
+
+def test_two_labels_of_one_cyclist_are_one_and_racks_need_not_be_found() -> None:
+    """View of Delft labels the rider in the box of the cyclist, and racks that no detector knows."""
+    labels = ("Cyclist", "rider", "rider", "bicycle_rack")
+    center = np.array([[10, 0, 0], [10.2, 0, 0.2], [15, 3, 0], [12, -4, 0]], np.float32)
+    boxes = Boxes3D(center, np.full((4, 3), 1.5, np.float32), np.zeros(4, np.float32))
+    points = np.repeat(center, 20, axis=0)
+    frame = Frame(0, 1, 1, "lidar", points, "lidar")
+    assert must_be_found(frame, boxes, labels).tolist() == [True, False, True, False]
+    assert "cyclist" in accepted_names("rider", ()) and "rider" in accepted_names("Rider", ())

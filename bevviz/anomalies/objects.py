@@ -3,7 +3,7 @@
 The history of an object decides how surprising a miss is. For an object that was found in ``n`` of the last
 ``m`` frames in which it was plainly in view, the chance of one miss is ``1 - (n + 1) / (m + 2)`` (Laplace's
 rule). The surprise of missing it ``k`` times is ``-k ln`` of that. So a weak detector or a small object
-causes no surprise. An object is not counted while it is half hidden, cut off by the image border, or near the
+causes no surprise. An object is not counted while it is half hidden, largely outside the image, or near the
 detector's threshold.
 """
 
@@ -27,7 +27,7 @@ from bevviz.stages.visibility import range_image, visible
 MEMORY = 20  # frames of the history of an object
 PAST = 5  # least frames with the object found, before a miss counts
 SAME = 0.3  # least IoU of a projected track and its detection
-INSIDE = 0.9  # least share of a projected track that must be in the image
+INSIDE = 0.6  # least share of a projected track that must be in the image: the nearest car is cut off by it
 NOISE = 0.15  # metres, least spread of the distance between expected and measured position
 SPREADS = 6.0  # a jump is larger than this multiple of the object's own spread
 LOST_SPREADS = 4.0  # the same where the track's box is empty and a new track of the same length appeared
@@ -82,7 +82,7 @@ class _Visibility:
 
     boxes: Boxes3D  # in the frame of the points
     open: F32  # (T,) share that no nearer object hides
-    whole: Bool  # (T,) whether it is in a camera image and not cut off by the border
+    whole: Bool  # (T,) whether it is in a camera image, or most of it
     detected: Bool  # (T,) whether a kept detection, or any one of its class, overlaps it
 
 

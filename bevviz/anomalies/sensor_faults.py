@@ -247,12 +247,12 @@ class RegionWatch:
             is_low = (self._usual >= LEAST_DETAIL) & (details < DETAIL_LEFT * self._usual)
             self._low = np.where(is_low & (self._low < FORGOTTEN), self._low + 1, 0)
         self._past.append(np.where(self._low > 0, self._usual, details))
-        judged = np.count_nonzero(self._usual >= LEAST_DETAIL)
+        judged = int(np.count_nonzero(self._usual >= LEAST_DETAIL))
         ages = np.bincount(self._low.ravel(), minlength=LASTING + TOGETHER)[LASTING:]
         together = np.convolve(ages, np.ones(TOGETHER, np.int64))[: len(ages)]
         age = LASTING + int(together.argmax())
         fell = (self._low > age - TOGETHER) & (self._low <= age) & (self._low >= LASTING)
-        share = np.count_nonzero(fell) / max(judged, 1)
+        share = int(np.count_nonzero(fell)) / max(judged, 1)
         if share < COVERED or judged < LEAST_REGIONS:
             return
         since = self._stamps[-int(np.median(self._low[fell]))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -15,7 +15,7 @@ from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
-from bevviz.model.class_names import ACCEPTED_NAMES, judged_names
+from bevviz.model.class_names import ACCEPTED_NAMES, OPTIONAL, PART_OF, judged_names
 from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.stages.robot_results import in_points_frame
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 MIN_HITS = 10  # least number of LiDAR points on an object to be found
 MAX_DISTANCE = 2.0  # metres between the centres of a box and its object, on the ground plane
+SAME_PLACE = 0.8  # metres between the centres of two labels of one object
 RANGE = 40.0  # metres, largest distance of an object to be found
 
 
@@ -143,7 +144,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
             of COCO's classes use for it. Any other label accepts its own name only.
     """
     boxes = in_points_frame(frame, labelled)
-    must = must_be_found(frame, boxes)
+    must = must_be_found(frame, boxes, labelled.labels)
     flat = [
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
@@ -162,13 +163,18 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     )
 
 
-def must_be_found(frame: Frame, boxes: Boxes3D) -> Bool:
+def must_be_found(frame: Frame, boxes: Boxes3D, labels: Sequence[str]) -> Bool:
     """Return (K,) whether the object of a box has to be found.
 
     Its centre lies within 40 m, and in the image of some camera if there is one, and its box holds 10 LiDAR
-    points or more.
+    points or more. Its label is of a type that detectors know, and no second label of one object.
     """
-    must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes), bool)
+    wanted = np.array([label.lower() not in OPTIONAL for label in labels], bool)
+    must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes) & wanted, bool)
+    for row in np.flatnonzero(must).tolist():
+        whole = [k for k, label in enumerate(labels) if label.lower() == PART_OF.get(labels[row].lower())]
+        away = np.hypot(*(boxes.center[whole, :2] - boxes.center[row, :2]).T)
+        must[row] = not (away <= SAME_PLACE).any()
     rows = np.flatnonzero(must)
     must[rows] = [len(hits) >= MIN_HITS for _, hits in inside_each(frame.points, boxes.chosen(rows))]
     return must

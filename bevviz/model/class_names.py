@@ -34,7 +34,29 @@ SEMANTIC_KITTI = {  # Behley et al. 2019, classes that COCO lacks
 VIEW_OF_DELFT = {  # Palffy et al. 2022, classes that COCO lacks
     "moped_scooter": frozenset({"moped_scooter", "motorcycle"}),
     "motor": frozenset({"motor", "motorcycle"}),
+    "rider": frozenset({"rider", "cyclist", "person", "bicycle", "motorcycle"}),
 }
+SUSTECHPOINTS = {  # Li et al. 2020, classes that COCO lacks
+    "Rider": frozenset({"rider", "cyclist", "person", "bicycle", "motorcycle"}),
+    "BicycleRider": frozenset({"bicyclerider", "rider", "cyclist", "person", "bicycle"}),
+    "MotorcyleRider": frozenset({"motorcylerider", "rider", "person", "motorcycle"}),  # as it is spelt there
+    "Motor": frozenset({"motor", "motorcycle"}),
+    "ScooterRider": frozenset({"scooterrider", "rider", "person"}),
+}
+# Labels of things that no detector has to find. A box on one is not false, if its name is accepted.
+OPTIONAL = frozenset(
+    {
+        "bicycle_rack",
+        "human_depiction",
+        "ride_other",
+        "ride_uncertain",
+        "vehicle_other",
+        "misc",
+        "unknown",
+        "static_object.bicycle_rack",
+    }
+)
+PART_OF = {"rider": "cyclist"}  # one object with two labels: View of Delft labels the rider, too
 NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which omits the other categories
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
@@ -51,8 +73,8 @@ NUSCENES_CLASSES = {  # nuScenes' category -> class of its detection task, which
     "human.pedestrian.construction_worker": "pedestrian",
     "human.pedestrian.police_officer": "pedestrian",
 }
-DATA_SETS = (KITTI, NUSCENES, SEMANTIC_KITTI, VIEW_OF_DELFT)
-ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT
+DATA_SETS = (KITTI, NUSCENES, SEMANTIC_KITTI, VIEW_OF_DELFT, SUSTECHPOINTS)
+ACCEPTED_NAMES = KITTI | NUSCENES | SEMANTIC_KITTI | VIEW_OF_DELFT | SUSTECHPOINTS
 
 _STREET = frozenset(
     {"person", "bicycle", "car", "motorcycle", "bus", "truck"}
