@@ -32,6 +32,7 @@ from bevviz.datasets.dataset import (
     subfolders,
 )
 from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
+from bevviz.datasets.sustech_labels import truth_streams
 from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
@@ -168,6 +169,8 @@ class Folder(Dataset):
                 edges.append((BASE, name, pose))
             read_row = partial(_read_row, files, fields)
             streams.append(cloud_stream(f"/{name}/points", name, times, read_row, files))
+            if len(lidars) == 1:
+                streams += truth_streams(self.path, name, files, times)
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _with_found(

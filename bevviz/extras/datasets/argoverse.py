@@ -21,8 +21,8 @@ from bevviz.datasets.dataset import (
     pose_stream,
     subfolders,
 )
+from bevviz.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.errors import UserError, first_line
-from bevviz.extras.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D
 

@@ -32,9 +32,9 @@ from bevviz.datasets.dataset import (
     read_table,
     subfolders,
 )
+from bevviz.datasets.ground_truth import BOXES_WITH_IMAGE, truth_boxes, truth_stream
 from bevviz.datasets.kitti_labels import Calibration, named_rows, read_labels
 from bevviz.errors import UserError
-from bevviz.extras.datasets.ground_truth import BOXES_WITH_IMAGE, truth_boxes, truth_stream
 from bevviz.extras.datasets.kitti_files import (
     boxes_of,
     poses_of_oxts,

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.datasets.cloud_files import read_bytes
+from bevviz.datasets.ground_truth import truth_boxes
 from bevviz.datasets.kitti_labels import labelled_boxes, named_rows, split_projection
 from bevviz.errors import UserError
-from bevviz.extras.datasets.ground_truth import truth_boxes
 from bevviz.model import geometry
 from bevviz.model.class_names import KITTI
 from bevviz.model.frame import F64, Boxes3D, LabelledBoxes3D

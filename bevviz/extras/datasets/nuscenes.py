@@ -30,8 +30,8 @@ from bevviz.datasets.dataset import (
     mounting_stream,
     pose_stream,
 )
+from bevviz.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.errors import UserError, first_line
-from bevviz.extras.datasets.ground_truth import truth_boxes, truth_stream
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
 from bevviz.model.frame import F64, I64, Boxes3D, Intrinsics, LabelledBoxes3D

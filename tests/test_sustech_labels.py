@@ -1,0 +1,35 @@
+"""Labels of SUSTechPOINTS beside the clouds of a folder are its ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import bevviz
+from bevviz.datasets.sustech_labels import read_labels
+from bevviz.errors import UserError
+
+
+def test_labels_of_a_shenzhen_street_are_ground_truth(shared: Path) -> None:
+    with bevviz.open(shared / "sus") as drive:
+        truths = [frame.truth for frame in drive.frames]
+    counts = []
+    for truth in truths:
+        assert truth is not None
+        counts.append(len(truth.boxes))
+    assert counts == [19, 21, 23, 24]
+    first = truths[0]
+    assert first is not None
+    assert first.labels[:3] == ("Car", "Bus", "Rider") and first.ids[0] == "8"
+    assert first.boxes.center[0].tolist() == pytest.approx([4.145, -49.720, 1.831], abs=1e-3)
+    assert first.boxes.size[0].tolist() == pytest.approx([4.5, 1.679, 1.657], abs=1e-3)
+    assert float(first.boxes.yaw[0]) == pytest.approx(1.449, abs=1e-3)
+
+
+def test_a_label_without_its_class_is_refused_with_its_file(tmp_path: Path) -> None:
+    corner = {"x": 0, "y": 0, "z": 0}
+    file = tmp_path / "000001.json"
+    file.write_text(f'[{{"psr": {{"position": {corner}, "scale": {corner}}}}}]'.replace("'", '"'))
+    with pytest.raises(UserError, match=r"000001\.json: no boxes with psr and obj_type"):
+        read_labels(file)
