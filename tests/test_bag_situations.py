@@ -488,3 +488,45 @@ def test_two_sensor_heads_of_one_robot_are_no_robots(tmp_path: Path) -> None:
     with BagSource([bags.write(tmp_path / "drive", items)], load()) as source:
         assert len(source.roles.lidars) == len(source.roles.cameras) == 2
         assert not source.roles.robots
+
+
+# --- log times ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("early", [0, 2, 5])
+@pytest.mark.parametrize("clock", ["zero", "wall", "start"])
+def test_a_jump_of_the_log_clock_is_said_and_set_right(tmp_path: Path, clock: str, early: int) -> None:
+    """The simulation begins at 100 s. The first scans are logged by another clock."""
+    limit = bags.START + early * bags.PERIOD
+
+    def logged(received: int) -> int:
+        simulated = received - bags.START + 100 * SECOND
+        if received >= limit:
+            return simulated
+        return {"zero": 0, "wall": received, "start": received - bags.START}[clock]
+
+    items = bags.small_items(scans=20)
+    bag = bags.write(tmp_path / "drive", [i._replace(received=logged(i.received)) for i in items])
+    run = assert_as_in_the_run([bag])
+    assert [(frame.stamp - bags.START) // bags.PERIOD for frame in run] == list(range(20))
+    assert all(frame.cameras[0].image is not None for frame in run)
+    with BagSource([bag], load()) as source:
+        jumps = [text for text in source.warnings if "the log time jumps by" in text]
+        assert len(jumps) == bool(early)
+        assert source.recording.end - source.recording.start < 3 * SECOND
+        frame = source.frame(source.number_at("1.0"))
+        assert frame is not None and frame.points[0, 0] in (9, 10)
+
+
+@pytest.mark.parametrize("pause", [60, 10 * 86_400])
+def test_a_pause_of_the_recording_is_no_jump_of_its_clock(tmp_path: Path, pause: int) -> None:
+    late = bags.START + 10 * bags.PERIOD
+    items = bags.small_items(scans=20)
+    for item in items:
+        if item.received >= late and item.type != TF:
+            item.message.header.stamp.sec += pause
+    items = [i._replace(received=i.received + (i.received >= late) * pause * SECOND) for i in items]
+    with BagSource([bags.write(tmp_path / "drive", items)], load()) as source:
+        assert len(list(source)) == 20
+        assert source.recording.end - source.recording.start > pause * SECOND
+        assert not [text for text in source.warnings if "log time" in text]

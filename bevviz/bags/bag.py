@@ -20,6 +20,7 @@ from rosbags.typesys import Stores
 
 from bevviz.bags import mcap
 from bevviz.bags.file_types import BagFile, find_saved_bag, open_file
+from bevviz.bags.log_clock import Piece, describe, find_pieces, is_odd
 from bevviz.bags.message import MessageTypes, RawMessage, foxglove_encoding, is_ros1, unread
 from bevviz.bags.reader import LAST_TIME, normalized
 from bevviz.bags.remote import address_of, beside, open_bytes
@@ -99,6 +100,7 @@ class Recording(Closable):
         self._notes: list[str] = []
         self.types = MessageTypes(self._notes.append)
         self._scratch = ScratchFolder()
+        self._pieces: Sequence[Piece] = ()  # of log times, if their clock jumps
         try:
             for path in self.paths:
                 self._open(path)
@@ -107,6 +109,7 @@ class Recording(Closable):
             self.calibrations = {**self._config.lidar_calibration, **self._attached()}
             if not self.message_count:
                 raise UserError("; ".join([f"{self.name}: there are no messages in it", *self.warnings]))
+            self._find_jumps()
         except BaseException:
             self.close()
             raise
@@ -134,12 +137,44 @@ class Recording(Closable):
     @cached_property
     def start(self) -> int:
         """Log time of the first message, in nanoseconds."""
+        if self._pieces:
+            return min(int(self._moved(f.times(f.connections)).min(initial=LAST_TIME)) for f in self.files)
         return min(f.span[0] for f in self.files if f.span[1])
 
     @cached_property
     def end(self) -> int:
         """Log time of the last message, in nanoseconds."""
+        if self._pieces:
+            return max(int(self._moved(f.times(f.connections)).max(initial=0)) for f in self.files)
         return max(f.span[1] for f in self.files) - 1
+
+    def _find_jumps(self) -> None:
+        """Find jumps of the clock of the log times, and note them."""
+        if self._datasets or not is_odd(self.start, self.end):
+            return
+        times = np.sort(np.concatenate([f.times(f.connections) for f in self.files]))
+        stamped = {c.topic: c.msgcount for f in self.files for c in self._typed(f) if self._has_header(c)}
+        topics = sorted(stamped, key=lambda topic: -stamped[topic])[:MANY]
+
+        def lag(low: int, high: int) -> int | None:
+            for message in self.messages(topics, low, high):
+                with suppress(MessageError):
+                    if stamp := message.header()[0]:
+                        return message.received - stamp
+            return None
+
+        pieces = find_pieces(times, lag)
+        if pieces:
+            self._notes.append(f"{self.name}: {describe(pieces)}")
+            self._pieces = pieces
+            del self.start, self.end  # They are computed again.
+
+    def _moved(self, times: I64) -> I64:
+        """Return log times of a file on the time line of the recording."""
+        moved = times.copy()
+        for piece in self._pieces:
+            moved[(times >= piece.low) & (times < piece.high)] += piece.shift
+        return np.sort(moved)
 
     @property
     def message_count(self) -> int:
@@ -238,6 +273,25 @@ class Recording(Closable):
             few: see ``ChunkReader.messages``.
             scans: give the scans of a data set as such, see ``DatasetReader.scans``.
         """
+        if not self._pieces:
+            yield from self._stored(topics, start, stop, few=few, scans=scans)
+            return
+        low, high = start or 0, LAST_TIME if stop is None else stop
+        pieces = [
+            (piece.shift, max(low - piece.shift, piece.low), min(high - piece.shift, piece.high))
+            for piece in self._pieces
+        ]
+        moved = [
+            map(partial(_moved_by, shift), self._stored(topics, first, end, few=few, scans=scans))
+            for shift, first, end in pieces
+            if first < end
+        ]
+        yield from heapq.merge(*moved, key=attrgetter("received"))
+
+    def _stored(
+        self, topics: Collection[str], start: int | None, stop: int | None, *, few: bool, scans: bool
+    ) -> Iterator[RawMessage]:
+        """Yield messages as ``messages`` does, by the log times in the files."""
         sources = [self._lazy_messages(f, topics, start, stop, few, scans) for f in self.files]
         for _, message in heapq.merge(*sources, key=itemgetter(0)):
             if message is not None:
@@ -361,7 +415,8 @@ class Recording(Closable):
     def times(self, topic: str) -> I64:
         """Return the sorted log times in nanoseconds of all messages of a topic. Their data is not read."""
         parts = [f.times(self._by_topic(f).get(topic, [])) for f in self.files]
-        return np.sort(np.concatenate(parts))
+        times = np.sort(np.concatenate(parts))
+        return self._moved(times) if self._pieces else times
 
     def packets(self, topic: str, received: int) -> list[VideoPacket]:
         """Return the video packets that the picture received at a given time needs, including its own.
@@ -622,6 +677,10 @@ def _listed_files(files: Sequence[Path], listed: Collection[str]) -> tuple[list[
     if not chosen:
         return list(files), [], missing
     return chosen, [name for name, file in by_name.items() if file not in chosen], missing
+
+
+def _moved_by(shift: int, message: RawMessage) -> RawMessage:
+    return replace(message, received=message.received + shift) if shift else message
 
 
 def _some(names: Sequence[str]) -> str:
