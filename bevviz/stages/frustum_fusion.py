@@ -450,16 +450,20 @@ class _CameraFrustums:
         """
         longest = max(self._wide[d], self._tall[d]) * depth
         edge = self._edge[d] * depth
+        sizes, bounds = self._sizes[d], np.zeros(len(self._sizes[d]))
+        if len(sizes) > 1:
+            bounds += [self._size_cost(d, size, depth) + k * RARER for k, size in enumerate(sizes)]
         best, least = None, np.inf
-        for number, size in enumerate(self._sizes[d]):
+        for number in np.argsort(bounds, kind="stable").tolist():
+            if bounds[number] >= least:  # The cost of a fit is never negative.
+                break
+            size = sizes[number]
             prior = size[[0, 3, 1, 4]]
             flat, facing, cost = fit_from(
                 self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about
             )
-            if len(self._sizes[d]) > 1:
-                cost += self._size_cost(d, size, depth) + number * RARER
-            if best is None or cost < least:
-                best, least = _FittedBox(flat, facing, size), cost
+            if bounds[number] + cost < least:
+                best, least = _FittedBox(flat, facing, size), bounds[number] + cost
         assert best is not None
         return best
 
