@@ -856,8 +856,8 @@ def reacting(path: Path, rows: NDArray[Any]) -> str:
         node("Mul", ["table", "factor"], ["output0"]),
     ]
     weights = {"table": table, "red": red, "half": np.float32(0.5)}
-    weights = {name: np.asarray(value) for name, value in weights.items()}
-    return save(path, nodes, weights, {"output0": ([1, 300, 6], FLOAT)}, [image_input(1, 3, H, W)], NAMES)
+    arrays: dict[str, NDArray[Any]] = {name: np.asarray(value) for name, value in weights.items()}
+    return save(path, nodes, arrays, {"output0": ([1, 300, 6], FLOAT)}, [image_input(1, 3, H, W)], NAMES)
 
 
 def test_scores_that_share_the_quantisation_of_boxes_are_refused(tmp_path: Path) -> None:
