@@ -82,3 +82,14 @@ def test_the_road_in_the_box_of_a_detection_is_no_loss_to_the_ground() -> None:
     lost = replace(evidence, ground=heights)
     assert ground_lost(replace(subject, kind="detection"), lost) == 1
     assert ground_lost(subject, lost) == 10
+
+
+def test_without_truth_a_hint_tells_the_stage_that_brings_an_object_back() -> None:
+    result = explained("fusion.min_rating=0.97").traces.result
+    blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
+    lost = [a for a in blind.ask(Selection()) if a.subject.kind == "detection" and not a.verdict.reported]
+    answers = [blind.with_hints(answer) for answer in lost[:3]]
+    cured = [answer for answer in answers if answer.hints]
+    assert cured
+    assert all(answer.verdict.restored_by == () for answer in cured)
+    assert ("fusion",) in [answer.restored_by[0] for answer in cured]

@@ -12,6 +12,7 @@ from bevviz.model.frame import U8
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.why.changes import stages_of
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
@@ -66,8 +67,10 @@ class Answer:
 
     @property
     def restored_by(self) -> tuple[StageSet, ...]:
-        """Smallest sets of stages whose ideal results bring it back, see ``Verdict``."""
-        return self.verdict.restored_by
+        """Smallest sets of stages that bring it back: by their ideal results, else by the best change."""
+        if self.verdict.restored_by or not self.hints or self.verdict.reported:
+            return self.verdict.restored_by
+        return (stages_of(self.hints[0].settings),)
 
     @property
     def text(self) -> str:

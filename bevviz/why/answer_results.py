@@ -89,8 +89,8 @@ class AnswerResult:
     """one of the reasons in docs/reference.md"""
     verdict: str
     restored_by: Sequence[Sequence[str]]
-    """smallest sets of stages (ground, clustering, detector, fusion) whose ideal results, together, bring a
-    missed object of the ground truth back; empty: none does, or there is no ground truth"""
+    """smallest sets of stages (ground, clustering, detector, fusion) that together bring a missed object
+    back: by their ideal results, without ground truth by the first hint; empty: none does"""
     likely: Sequence[str]
     """two reasons that each lost much of it, where nothing tells which one mattered"""
     folded: bool
@@ -127,7 +127,7 @@ class AnswerResult:
             reported=verdict.reported,
             reason=verdict.kind.value,
             verdict=answer.text,
-            restored_by=verdict.restored_by,
+            restored_by=answer.restored_by,
             likely=[kind.value for kind in answer.likely],
             folded=answer.folded,
             false=answer.false,

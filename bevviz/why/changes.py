@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ _GRID: Mapping[str, tuple[str, ...]] = {  # numbers of each stage that are stepp
         "fusion.match_radius",
     ),
 }
+_STAGE_OF = {"voxel": "clustering", "objects": "fusion"}  # section -> stage, where their names differ
 _SECTIONS = {"voxel", "ground", "clustering", "detector", "fusion"}
 _METHODS: Mapping[str, tuple[Change, ...]] = {  # other methods of each stage
     "ground": ({"ground.method": "polar", "ground.distance_threshold": 0.2}, {"ground.method": "plane"}),
@@ -101,6 +102,13 @@ def with_changes(config: Config, change: Change) -> Config:
             section = section[part]
         section[name] = value
     return config.restated(tree)
+
+
+def stages_of(settings: Iterable[str]) -> tuple[str, ...]:
+    """Return the stages that settings ``key=value`` change, in their order."""
+    sections = {setting.partition(".")[0] for setting in settings}
+    changed = {_STAGE_OF.get(section, section) for section in sections}
+    return tuple(stage for stage in _GRID if stage in changed)
 
 
 def restored_values(config: Config) -> Iterator[Change]:
