@@ -221,7 +221,7 @@ def test_a_report_has_what_was_asked_tried_and_noted(
     talk.say(type="note", time=stamp, pick=pick, text="a note of mine")
     talk.until("noted")
     said = {"before": 0.2, "after": 0.1, "text": "it is plainly there", "set": hint["settings"]}
-    talk.say(type="report", time=stamp, **said)
+    talk.say(type="report", time=stamp, pick=before["pick"], **said)
     made = talk.until("progress", lambda m: m["reports"] and m["reports"][-1]["state"] != "running")[
         "reports"
     ][-1]
@@ -250,6 +250,29 @@ def test_a_report_has_what_was_asked_tried_and_noted(
     assert hint["settings"][0].partition("=")[0] not in told[told.index("How it was made") :]
     talk.say(type="unnote", stamp=str(stamp), text="a note of mine")
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
+
+
+def test_a_report_is_about_the_object_of_its_own_tab(talk: Talk, address: str, hinted: Hinted) -> None:
+    """Another tab asks about another object of the same frame afterwards."""
+    stamp, pick, _ = helped(hinted)
+    mine = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
+    other_pick = next(p for s, p, _ in hinted if s == stamp and p != pick)
+    with Talk(address) as other:
+        theirs = other.asked("hints", type="ask", time=stamp, set=[], pick=other_pick)
+        assert theirs["row_pick"] == other_pick
+        talk.say(type="report", time=stamp, set=[], pick=mine["pick"], before=0, after=0, text="")
+        made = talk.until("progress", lambda m: m["reports"] and m["reports"][-1]["state"] != "running")
+    report = made["reports"][-1]
+    assert report["state"] == "over", report["error"]
+    (page,) = [file["name"] for file in report["files"] if file["name"].endswith(".html")]
+    text = (Path(report["folder"]) / page).read_text()
+    assert f"Missed: {mine['name']}" in " ".join(re.sub(r"<[^>]*>", " ", unescape(text)).split())
+    far = max(talk.of("missed"), key=lambda entry: int(entry["sights"][-1][1]))["sights"][-1]
+    absent = {"kind": "truth", "label": "bus", "frame": 0, "id": "bus of another drive"}
+    said = talk.asked(
+        "never", type="report", time=int(far[1]), set=[], pick=json.dumps(absent), before=0, after=0, text=""
+    )
+    assert "of the drive as opened" in said["text"]
 
 
 def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None:

@@ -384,7 +384,7 @@ class PageConnection:
         reports = self._workbench.reports
         frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
         before, after = float(message["before"]), float(message["after"])
-        asked = frame, settings, before, after, text, self._name
+        asked = frame, settings, before, after, text, _identity(message), self._name
         await self._in_turn(number, lambda: reports.begin(*asked), settings)
 
     async def _note(self, number: int, message: Message) -> None:

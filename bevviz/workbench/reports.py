@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bevviz.report.make import ReportRequest
     from bevviz.report.report_subject import TriedValues
     from bevviz.why import Answer
+    from bevviz.why.identity import Identity
     from bevviz.workbench.growing_drive import GrowingDrive, Settings
 
 LONGEST = 600.0  # seconds before or after the frame, at most
@@ -81,6 +82,9 @@ class QuestionLog(Protocol):
     def notes(self) -> list[Note]:
         """Return the notes."""
 
+    def about(self, number: int, identity: Identity) -> Answer:
+        """Return the answer about an object in a frame of the drive as opened."""
+
     def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
         """Return number of the frame and answer of each question in a range of log times, newest first."""
 
@@ -108,7 +112,14 @@ class ReportMaker(Jobs[ReportJob]):
         self._session, self._bag_of, self._folder = session, bag_of, folder
 
     def begin(
-        self, number: int, settings: Settings, before: float, after: float, note: str, asked_by: str = ""
+        self,
+        number: int,
+        settings: Settings,
+        before: float,
+        after: float,
+        note: str,
+        identity: Identity | None = None,
+        asked_by: str = "",
     ) -> ReportJob:
         """Start to make a report.
 
@@ -118,11 +129,12 @@ class ReportMaker(Jobs[ReportJob]):
             before: seconds before the frame.
             after: seconds after the frame.
             note: what went wrong, in the user's words.
+            identity: the object that the page shows. None: the report is about the worst of the frame.
             asked_by: name of the overlay of the page that asks.
 
         Raises:
-            UserError: a report is in progress, there is no such frame, the range is too long, or a value is
-                wrong.
+            UserError: a report is in progress, there is no such frame, the object is not in it, the range is
+                too long, or a value is wrong.
         """
         from bevviz.report.make import ReportRequest
 
@@ -134,8 +146,7 @@ class ReportMaker(Jobs[ReportJob]):
         seconds = (received - bag.start) / 1e9
         output = _free(self._folder, f"{beside(bag.paths[0]).stem}-{seconds:.1f}s")
         low, high = received - round(before * 1e9), received + round(after * 1e9)
-        asked = session.asked_within(low, high)
-        about = [answer for frame, answer in asked if frame == number]
+        about = None if identity is None else session.about(number, identity)
         changed_config(bag.config, settings)  # Wrong values are told before the report is begun.
         request = ReportRequest(
             paths=bag.paths,
@@ -145,10 +156,10 @@ class ReportMaker(Jobs[ReportJob]):
             after=after,
             output=output,
             note=note.strip(),
-            answers=about,
+            answers=[] if about is None else [about],
             result=session.source.look(number),
-            asked=[answer for frame, answer in asked if frame != number],
-            tried=session.tried_on(number, settings, about[0] if about else None) if settings else None,
+            asked=[answer for frame, answer in session.asked_within(low, high) if frame != number],
+            tried=session.tried_on(number, settings, about) if settings else None,
             notes=session.notes(),
         )
         report = ReportJob(len(self.jobs), settings, asked_by, name=output.stem)

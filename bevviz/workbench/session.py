@@ -207,6 +207,28 @@ class WorkbenchSession(Closable):
             while len(self._answers) > ASKED:
                 self._answers.popitem(last=False)
 
+    def about(self, number: int, identity: Identity) -> Answer:
+        """Return the answer about an object in a frame of the drive as opened, with hints if it has them.
+
+        Raises:
+            UserError: the object is not in the frame.
+        """
+        selection, reason = self.follow(identity, number)
+        if selection is None:
+            raise UserError(
+                f"{identity.name} is not in frame {number} of the drive as opened: {reason}; "
+                "a report is about the drive as opened: ask about an object of the frame first"
+            )
+        answer = self.ask(number, (), selection)[0]
+        with self._lock:
+            kept = list(self._answers.items())
+        same = (
+            other
+            for (frame, settings, _), (_, other) in reversed(kept)
+            if (frame, settings, other.subject.key) == (number, (), answer.subject.key) and other.hints
+        )
+        return next(same, answer)
+
     def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
         """Return the answers about the drive as opened in a range of log times, newest first.
 

@@ -24,7 +24,8 @@ export function start(using) {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
     const set = isTried() ? state.set : []; // settings of the shown side
-    send({ type: "report", time: Number(state.time), set, text: $("words").value, ...range }, say("noted"));
+    const about = { time: Number(state.time), set, pick: state.pick };
+    send({ type: "report", ...about, text: $("words").value, ...range }, say("noted"));
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value }, say("noted"));
   $("strip").onclick = (event) => {
