@@ -151,9 +151,20 @@ def iterate_results(items: Iterable[T], processor: Processor[T, R]) -> Generator
     """Yield the result of each item, in order. Closing the iterator ends its threads."""
     with (
         ThreadPoolExecutor(1, "network") as network,
-        closing(map_ahead(items, lambda item: processor.perceive(item, network), LOOKAHEAD)) as perceived,
+        closing(_process(items, processor, network, LOOKAHEAD)) as results,
     ):
-        yield from map(processor.finish, perceived)
+        yield from results
+
+
+def _process(
+    items: Iterable[T], processor: Processor[T, R], network: Executor, depth: int
+) -> Generator[R, None, None]:
+    """Yield the result of each item, in order. ``perceive`` and ``finish`` have a thread each.
+
+    One of the ``depth`` items that are read ahead is in ``finish``.
+    """
+    with closing(map_ahead(items, lambda item: processor.perceive(item, network), depth - 1)) as perceived:
+        yield from map_ahead(perceived, processor.finish, 1, "finish")
 
 
 class _Loop(Generic[T, R]):
@@ -186,7 +197,6 @@ class _Loop(Generic[T, R]):
                 for result in stack.enter_context(closing(self._results(network))):
                     if self._stop.is_set():
                         break
-                    result = self._processor.finish(result)
                     for observe in observers:
                         observe(result)
                     self.frames += 1
@@ -196,14 +206,16 @@ class _Loop(Generic[T, R]):
             self.over.set()
 
     def _results(self, network: Executor) -> Generator[R, None, None]:
-        """Yield the result of ``perceive`` for each item, or for the newest ones."""
+        """Yield the result of each item, or of the newest ones."""
+        if self._dropping is None:
+            yield from _process(self._until_stopped(), self._processor, network, self._depth)
+            return
 
         def work(item: T) -> R:
             return self._processor.perceive(item, network)
 
-        if self._dropping is None:
-            return map_ahead(self._until_stopped(), work, self._depth)
-        return _newest(self._items, work, self._dropping, self._stop)
+        with closing(_newest(self._items, work, self._dropping, self._stop)) as perceived:
+            yield from map(self._processor.finish, perceived)
 
     def _until_stopped(self) -> Iterator[T]:
         """Yield the items until ``stop`` is set."""
@@ -249,10 +261,10 @@ class _Loop(Generic[T, R]):
             thread.join(PATIENCE)
 
 
-def map_ahead(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generator[R, None, None]:
+def map_ahead(
+    items: Iterable[T], work: Callable[[T], R], depth: int, name: str = "stages"
+) -> Generator[R, None, None]:
     """Yield the result of each item, in order. A thread works on it while the caller makes the next items.
-
-    One thread beside the caller's is faster than two, which would wait for Python's lock most of the time.
 
     An exception of the items is raised after the results of the items before it. Closing the iterator ends
     the thread.
@@ -261,11 +273,12 @@ def map_ahead(items: Iterable[T], work: Callable[[T], R], depth: int) -> Generat
         items: items, drawn in the caller's thread.
         work: function that runs in the other thread.
         depth: items drawn ahead of the result that is yielded.
+        name: name of the thread.
     """
     futures: deque[Future[R]] = deque()
     item_error: Exception | None = None
     source = iter(items)
-    worker = ThreadPoolExecutor(1, "stages")
+    worker = ThreadPoolExecutor(1, name)
     try:
         while item_error is None:
             try:
