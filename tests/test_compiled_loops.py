@@ -12,15 +12,16 @@ import numba
 import pytest
 
 from bevviz.support import progress
-from bevviz.support.numba_kernel import _CompileAnnouncer, common_clock, thread_clock
+from bevviz.support.compile_clock import common_clock, thread_clock
+from bevviz.support.numba_cache import _CompileAnnouncer
 
 NOWHERE = """
 from numba.core.caching import CacheImpl
 CacheImpl._locator_classes = []  # as where neither the package nor a home can be written
 import numpy as np
-from bevviz.support import numba_kernel
+from bevviz.support import numba_cache
 from bevviz.stages.clustering import dbscan
-assert not numba_kernel.CACHED
+assert not numba_cache.CACHED
 points = np.array([[0, 0, 0], [0.1, 0, 0], [9, 0, 0]], np.float32)
 print(dbscan(points, 0.5, 2).tolist())
 """

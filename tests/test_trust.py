@@ -26,7 +26,7 @@ from bevviz.errors import UserError
 from bevviz.live.requests import RosRequests
 from bevviz.recording.source_lookup import Origin, RecordingSource
 from bevviz.stages.user_stages import load_user_stage
-from bevviz.why.hints import with_changes
+from bevviz.why.changes import with_changes
 from tests.support import bags
 from tests.support.modules import forget_modules
 
@@ -472,11 +472,11 @@ def test_compiled_functions_beside_a_module_do_not_run(
     received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trusted: bool
 ) -> None:
     """A cache of numba is a pickle. Functions of users' modules are kept in bevviz's own folder."""
-    from bevviz.support import numba_kernel
+    from bevviz.support import numba_cache
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    numba_kernel._user_kernel_folder.cache_clear()
+    numba_cache._user_kernel_folder.cache_clear()
     write_project(received)
     (received / "drive_tools.py").write_text(KERNEL)
     (received / "__pycache__").mkdir()
@@ -499,16 +499,16 @@ def test_compiled_functions_beside_a_module_do_not_run(
         len(list(kernels.glob("*/drive_tools.count-*.nbi"))) == 1 and kernels.stat().st_mode & 0o777 == 0o700
     )
     kernels.chmod(0o777)  # Others could write there, so that nothing is read from there.
-    numba_kernel._user_kernel_folder.cache_clear()
-    assert numba_kernel._user_kernel_folder() != kernels
-    numba_kernel._user_kernel_folder.cache_clear()
+    numba_cache._user_kernel_folder.cache_clear()
+    assert numba_cache._user_kernel_folder() != kernels
+    numba_cache._user_kernel_folder.cache_clear()
 
 
 def test_numba_takes_no_settings_from_the_folder(received: Path) -> None:
     """Its .numba_config.yaml could name a cache, which holds pickles, for the stages of bevviz."""
     (received / ".numba_config.yaml").write_text("cache_dir: cache\ncache_locator_classes: evil.Locator\n")
     program = (
-        "from bevviz.support import numba_kernel\nfrom numba.core import config\n"
+        "from bevviz.support import numba_cache\nfrom numba.core import config\n"
         "config.reload_config()\nprint([config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES])\n"
     )
     environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}

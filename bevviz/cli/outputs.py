@@ -177,7 +177,7 @@ def _colored(text: str, code: str) -> str:
 
 def print_hints(scene: Scene, config: Config) -> None:
     """Tell the user which missing input or setting would give more."""
-    from bevviz.support.numba_kernel import CACHED
+    from bevviz.support.numba_cache import CACHED
 
     if not CACHED:
         say(

@@ -97,7 +97,7 @@ def import_module(name: str, folder: ModuleFolder) -> ModuleType:
     Raises:
         UserError: a file has changed since the user trusted it, or another module of this name is in use.
     """
-    from bevviz.support.numba_kernel import keep_user_kernels_apart  # numba takes a quarter of a second.
+    from bevviz.support.numba_cache import keep_user_kernels_apart  # numba takes a quarter of a second.
 
     keep_user_kernels_apart()
     hook = _hooks.setdefault(folder.root, _FolderHook(folder))

@@ -32,8 +32,8 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.perceive import perceive
 from bevviz.recording.provenance import model_path
 from bevviz.support import progress, table
+from bevviz.support.compile_clock import thread_clock
 from bevviz.support.json_form import LEFT_OUT, json_form
-from bevviz.support.numba_kernel import thread_clock
 
 if TYPE_CHECKING:
     from bevviz.pipeline.stage_loader import Stages

@@ -41,7 +41,7 @@ from bevviz.stages.opinions import opinions
 from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
-from bevviz.support.numba_kernel import common_clock, thread_clock
+from bevviz.support.compile_clock import common_clock, thread_clock
 
 LEAST_SCORE = 0.01  # of candidates that are decoded, so that configurations and runs can share them
 

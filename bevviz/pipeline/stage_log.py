@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from bevviz.config import Config
 from bevviz.errors import FunctionError, StageError, UserError, interrupt_in
 from bevviz.model.results import Failure
+from bevviz.support.compile_clock import thread_clock
 from bevviz.support.loggers import logger
-from bevviz.support.numba_kernel import thread_clock
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
