@@ -14,6 +14,7 @@ import pytest
 from bevviz.support import progress
 from bevviz.support.compile_clock import common_clock, thread_clock
 from bevviz.support.numba_cache import _CompileAnnouncer
+from bevviz.support.numba_kernel import kernel
 
 NOWHERE = """
 from numba.core.caching import CacheImpl
@@ -52,6 +53,19 @@ def test_loaded_loops_import_no_scipy() -> None:
 def test_without_a_cache_folder_loops_are_recompiled() -> None:
     done = subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr
+
+
+def test_a_kernel_takes_named_arguments_and_other_kernels_call_it() -> None:
+    @kernel
+    def scaled(x: float, factor: float = 2.0) -> float:
+        return factor * x
+
+    @kernel
+    def both(x: float) -> float:
+        return scaled(x) + scaled(x, factor=10.0)
+
+    assert scaled(3.0, factor=4.0) == 12.0
+    assert both(3.0) == 36.0
 
 
 def test_stage_times_exclude_compilation() -> None:

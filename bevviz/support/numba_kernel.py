@@ -22,9 +22,9 @@ class _Kernel:
         self._function, self._options = function, options
         self._dispatcher: Any = None
 
-    def __call__(self, *args: object) -> object:
+    def __call__(self, *args: object, **named: object) -> object:
         """Call the compiled function."""
-        return (self._dispatcher or self._compiled())(*args)
+        return (self._dispatcher or self._compiled())(*args, **named)
 
     @property
     def _numba_type_(self) -> Any:
