@@ -124,7 +124,7 @@ def perceive(
     first_labels = None if clusters is None else clusters.labels
     claims: Sequence[Claims | None] = [None] * len(cameras)
     if obstacles is not None and clusters is not None and _splits(config):
-        height = None if ground is None else ground.height.compress(~ground.mask)
+        height = None if ground is None else log.run("fusion", _obstacle_heights, ground)
         camera_results = tuple(cameras)
         sections = config.fusion, config.objects, config.clustering
         split_clusters = log.run(
@@ -248,6 +248,11 @@ def _ground(log: StageLog, frame: Frame, voxels: Voxels, config: Config, stages:
 def _obstacles(voxels: Voxels, ground: Ground) -> F32:
     """Return the voxels that are not ground."""
     return voxels.points.compress(~ground.mask, axis=0)
+
+
+def _obstacle_heights(ground: Ground) -> F32:
+    """Return the heights above the ground of the obstacle points."""
+    return ground.height.compress(~ground.mask)
 
 
 def _clusters(log: StageLog, frame: Frame, points: F32, config: Config, stages: Stages) -> Clusters | None:

@@ -6,13 +6,14 @@ import threading
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, TypeVar, TypeVarTuple, cast
 
 from pydantic import BaseModel
 
 from bevviz.config import Config
 from bevviz.errors import FunctionError, StageError, UserError, interrupt_in
-from bevviz.model.results import Failure
+from bevviz.model.results import CameraResult, Failure
 from bevviz.support.compile_clock import thread_clock
 from bevviz.support.loggers import logger
 
@@ -70,7 +71,14 @@ class Memo:
 
 
 def _identity(argument: object) -> object:
-    """Return a key that is equal for equal parameters, but for arrays only if they are the same object."""
+    """Return a key that is equal for equal parameters, but for arrays only if they are the same object.
+
+    Tuples and results of cameras are compared item by item: each run puts them together anew.
+    """
+    if isinstance(argument, tuple):
+        return tuple(map(_identity, argument))
+    if isinstance(argument, CameraResult):
+        return CameraResult, *(id(getattr(argument, field.name)) for field in fields(argument))
     if isinstance(argument, BaseModel) and not isinstance(argument, Config):
         return type(argument), argument.model_dump_json()
     return argument if isinstance(argument, str | int | float) else id(argument)

@@ -72,38 +72,10 @@ class IdealStages:
         return clusters
 
     def detections(self, camera: Camera, detections: Detections) -> Detections:
-        """Return the detections with an ideal one of each object in the image, in place of its own ones."""
+        """Return the detections with an ideal one of each object in the image."""
         if "detector" not in self._stages:
             return detections
-        boxes = self._image_boxes(camera)
-        shown = [row for row in self._rows if np.isfinite(boxes[row]).all()]
-        result, state = self._traces.camera(camera.name), detections.state.copy()
-        if result is not None and result.detections is not None and len(result.detections) == len(detections):
-            state[np.isin(self._traces.owners(result), shown)] = DetectionState.BELOW_THRESHOLD
-        count = len(shown)
-        return Detections(
-            np.concatenate([detections.xyxy, boxes[shown].astype(np.float32)]),
-            np.concatenate([detections.score, np.full(count, SURE, np.float32)]),
-            np.concatenate([detections.class_id, np.zeros(count, np.int32)]),
-            (*detections.names, *(self._name(row, detections) for row in shown)),
-            np.concatenate([state, np.full(count, DetectionState.KEPT, np.int32)]).astype(np.int32),
-            np.concatenate([detections.suppressed_by, np.full(count, -1, np.int32)]).astype(np.int32),
-            np.concatenate([detections.overlap, np.zeros(count, np.float32)]),
-        )
-
-    def _image_boxes(self, camera: Camera) -> F32:
-        """Return (K, 4) image boxes of the ground truth in a camera, NaN without a pose or out of view."""
-        truth = self._traces.labels_in_evaluate
-        assert truth is not None
-        if camera.camera_from_points is None or camera.intrinsics is None:
-            return np.full((len(truth.labels), 4), np.nan, np.float32)
-        return image_boxes_of(truth, camera)
-
-    def _name(self, row: int, detections: Detections) -> str:
-        """Return a class name that is right for an object, one that the detector uses if possible."""
-        subject = self._traces.truth[row]
-        known = (name for name in (*detections.names, *self._traces.classes) if subject.accepts(name))
-        return next(known, None) or min(subject.accepted, default=subject.label.lower())
+        return self._memo.call(_with_own_detections, self._traces, self._rows, camera, detections)
 
     def objects(self, obstacles: F32, cameras: Sequence[CameraResult], objects: Objects) -> Objects:
         """Return the objects with one for each object that has a detection and points.
@@ -124,7 +96,9 @@ class IdealStages:
         detections, subject = camera.detections, self._traces.truth[row]
         if detections is None or camera.uv is None:
             return -1
-        overlap = np.nan_to_num(geometry.iou(self._image_boxes(camera.camera)[[row]], detections.xyxy)[0])
+        overlap = np.nan_to_num(
+            geometry.iou(_image_boxes(self._traces, camera.camera)[[row]], detections.xyxy)[0]
+        )
         accepted = np.array([subject.accepts(name) for name in detections.names], np.bool_)
         overlap[~detections.kept | ~accepted] = 0
         return int(overlap.argmax()) if overlap.max(initial=0.0) >= LINK else -1
@@ -160,6 +134,43 @@ class IdealStages:
 def ideal_config(config: Config, stages: Container[str]) -> Config:
     """Return the configuration of a run with ideal stages: no limit removes an ideal cluster."""
     return with_changes(config, {"clustering.min_cluster_points": 1}) if "clustering" in stages else config
+
+
+def _with_own_detections(
+    traces: FrameIndex, rows: tuple[int, ...], camera: Camera, detections: Detections
+) -> Detections:
+    """Return the detections with an ideal one of each object in the image, in place of its own ones."""
+    boxes = _image_boxes(traces, camera)
+    shown = [row for row in rows if np.isfinite(boxes[row]).all()]
+    result, state = traces.camera(camera.name), detections.state.copy()
+    if result is not None and result.detections is not None and len(result.detections) == len(detections):
+        state[np.isin(traces.owners(result), shown)] = DetectionState.BELOW_THRESHOLD
+    count = len(shown)
+    return Detections(
+        np.concatenate([detections.xyxy, boxes[shown].astype(np.float32)]),
+        np.concatenate([detections.score, np.full(count, SURE, np.float32)]),
+        np.concatenate([detections.class_id, np.zeros(count, np.int32)]),
+        (*detections.names, *(_name(traces, row, detections) for row in shown)),
+        np.concatenate([state, np.full(count, DetectionState.KEPT, np.int32)]).astype(np.int32),
+        np.concatenate([detections.suppressed_by, np.full(count, -1, np.int32)]).astype(np.int32),
+        np.concatenate([detections.overlap, np.zeros(count, np.float32)]),
+    )
+
+
+def _image_boxes(traces: FrameIndex, camera: Camera) -> F32:
+    """Return (K, 4) image boxes of the ground truth in a camera, NaN without a pose or out of view."""
+    truth = traces.labels_in_evaluate
+    assert truth is not None
+    if camera.camera_from_points is None or camera.intrinsics is None:
+        return np.full((len(truth.labels), 4), np.nan, np.float32)
+    return image_boxes_of(truth, camera)
+
+
+def _name(traces: FrameIndex, row: int, detections: Detections) -> str:
+    """Return a class name that is right for an object, one that the detector uses if possible."""
+    subject = traces.truth[row]
+    known = (name for name in (*detections.names, *traces.classes) if subject.accepts(name))
+    return next(known, None) or min(subject.accepted, default=subject.label.lower())
 
 
 def _single(detections: Detections, row: int) -> Detections:
