@@ -32,6 +32,7 @@ SEEN = {
 }
 TELLS_APART = 20.0  # CIEDE2000 of two states; 1 is just noticeable side by side
 CLASS_FROM_STATE = 10.0  # of a class and a state: both may outline one object
+FAR_FROM_ALARM = 25.0  # of a found object and an alarm
 CLASSES_APART = 8.0  # of classes and fates, which are named beside their colours
 
 
@@ -66,7 +67,7 @@ def test_classes_and_fates_differ(sight: str) -> None:
         assert not {pair: round(away, 1) for pair, away in near.items() if away < CLASSES_APART}
 
 
-@pytest.mark.parametrize("sight", ["all", "Deuteranomaly"])
+@pytest.mark.parametrize("sight", SEEN)
 def test_no_class_looks_like_a_state(sight: str) -> None:
     near = {
         (name, state.name): distance(color, state.value, sight)
@@ -74,6 +75,15 @@ def test_no_class_looks_like_a_state(sight: str) -> None:
         for state in StateColor
     }
     assert not {pair: round(away, 1) for pair, away in near.items() if away < CLASS_FROM_STATE}
+
+
+def test_found_objects_are_calm() -> None:
+    """No class of traffic is near the red of missed or the yellow of false objects."""
+    loud = {
+        name: min(distance(color, state.value, "all") for state in (StateColor.BAD, StateColor.DOUBTFUL))
+        for name, color in CLASS_COLORS.items()
+    }
+    assert not {name: round(away, 1) for name, away in loud.items() if away < FAR_FROM_ALARM}
 
 
 def test_context_is_grey_and_contrasts() -> None:

@@ -1,8 +1,8 @@
 """The palette of all layouts, recordings and pages, and the meaning of each colour.
 
-Context is grey: ground, points, clusters without a name, tracks. A class has one hue. Any two
-states differ by at least 20 (CIEDE2000), a class and a state by at least 10, also for people without green
-cones.
+Context is grey: ground, points, clusters without a name, tracks. A class has one hue, far from the red of
+missed and the yellow of false objects: found is calm. Any two states differ by at least 20 (CIEDE2000), also
+for people without green cones; a class and a state by at least 10, whichever cones somebody lacks.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ Color: TypeAlias = tuple[int, int, int]
 # Colour-blind people can tell these apart, and from the states (after Okabe & Ito 2008), on dark and on light
 # backgrounds. A test checks it.
 CLASS_COLORS: dict[str, Color] = {
-    "person": (235, 120, 15),
-    "pedestrian": (235, 120, 15),
+    "person": (130, 170, 130),
+    "pedestrian": (130, 170, 130),
     "rider": (30, 240, 165),
     "cyclist": (30, 240, 165),
     "bicycle": (30, 240, 165),
     "motorcycle": (225, 140, 190),
-    "car": (86, 180, 233),
-    "van": (190, 235, 250),
+    "car": (86, 186, 245),
+    "van": (190, 229, 250),
     "truck": (20, 100, 190),
-    "bus": (120, 60, 130),
+    "bus": (120, 84, 130),
 }
 
 
