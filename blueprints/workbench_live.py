@@ -16,7 +16,7 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
     beside = (f"{entities.ROBOT.above}/**", f"{entities.WHY}/**")
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.spaces(scene, beside=beside),
+            views.spaces(scene, beside=beside, follow=entities.WHY_PART.path("place")),
             rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4],
         ),

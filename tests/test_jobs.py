@@ -23,7 +23,7 @@ def test_a_job_tells_how_it_ended() -> None:
 
     jobs.start(Job(0, ("voxel.size=0.2",), "overlay-1", total=3), count)
     until(lambda: not jobs.jobs[-1].going)
-    head = {"number": 0, "settings": ["voxel.size=0.2"], "asked_by": "overlay-1"}
+    head = {"number": 0, "settings": ["voxel.size=0.2"], "asked_by": "overlay-1", "cancelled_by": ""}
     assert jobs.jobs[0].as_dict() == {**head, "state": "over", "error": "", "done": 3, "total": 3}
     jobs.start(Job(1), fail)
     until(lambda: not jobs.jobs[-1].going)
@@ -46,6 +46,7 @@ def test_a_cancelled_job_ends_at_its_next_step() -> None:
     assert stepped.wait(10)
     with pytest.raises(UserError, match="it is counted: wait for it, or cancel it"):
         jobs.check_idle("it is counted")
+    jobs.cancel("overlay-2")
     jobs.end()
-    assert jobs.jobs[0].state == "cancelled"
+    assert (jobs.jobs[0].state, jobs.jobs[0].cancelled_by) == ("cancelled", "overlay-2")
     jobs.check_idle("it is counted")

@@ -32,6 +32,7 @@ def space(
     root: str = "",
     beside: Sequence[str] = (f"{entities.ROBOT.above}/**",),
     by: Quantity | None = None,
+    follow: str | None = None,
 ) -> rrb.Spatial3DView:
     """Return a 3D view of points, boxes, frustums and poses, seen from behind and above the robot.
 
@@ -48,6 +49,7 @@ def space(
         root: entity that the run is logged under.
         beside: further contents of the view.
         by: quantity that colours the raw points; None: ground or obstacle.
+        follow: entity that the eye goes to whenever it moves.
     """
     hidden = [entities.SET_ASIDE.path(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show the obstacles.
@@ -79,7 +81,11 @@ def space(
             target_frame=entities.space(root + entities.SENSOR.path(scene.lidar))
         ),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)
+            kind=rrb.Eye3DKind.Orbital,
+            position=position,
+            look_target=target,
+            eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=follow,
         ),
         overrides=overrides,
     )

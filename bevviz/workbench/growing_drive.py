@@ -102,6 +102,7 @@ class GrowingDrive(Closable):
 
     Attributes:
         scans: number of scans. 0 for a robot.
+        single_frames: the frames are unrelated, and their stamps are made up.
         findings: findings, grouped over frames.
         news: tells of each new frame and of all other news for the page.
         first: stamp that the page counts seconds from.
@@ -113,10 +114,10 @@ class GrowingDrive(Closable):
         self, title: str, pipeline: Session, truth_of: TruthLookup | None = None, newest: int = 0
     ) -> None:
         self.title, self.pipeline, self.truth_of = title, pipeline, truth_of
-        self.scans = 0
+        self.scans, self.single_frames = 0, False
         self.findings, self.news = FindingList(), News()
         self.opening: int | None = None
-        self._remarks: dict[tuple[int, str], str] = {}  # by frame and text of the selection
+        self._remarks: dict[tuple[int, str], Answer] = {}  # by frame and text of the selection
         self._remarking = threading.Lock()
         self.following = threading.Lock()  # guards the bag that the robot's chain is read from
         self._aside: FrameExplainer | None = None
@@ -310,8 +311,8 @@ class GrowingDrive(Closable):
     def wait_for_quiet(self) -> None:
         """Wait until no question is being answered, if background work can wait."""
 
-    def remark(self, number: int, pick: str) -> str:
-        """Return the sentence about the hints for a finding. Each is searched once.
+    def remark(self, number: int, pick: str) -> Answer:
+        """Return the answer about a finding, with hints. They are searched once.
 
         Raises:
             UserError: there is no such frame or object.
@@ -321,7 +322,7 @@ class GrowingDrive(Closable):
                 if self._aside is None or self._aside.traces.result.frame.index != number:
                     self._aside = self.explainer(self.look_aside(number))
                 answer = self._aside.about(Selection.parse(pick))
-                self._remarks[number, pick] = self._aside.with_hints(answer).remark
+                self._remarks[number, pick] = self._aside.with_hints(answer)
             return self._remarks[number, pick]
 
     def robot_questions(self, number: int) -> RobotQuestions | None:

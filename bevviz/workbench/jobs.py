@@ -18,6 +18,7 @@ class Job:
         number: number of the job among those of its kind, from 0.
         settings: settings that it is about.
         asked_by: name of the overlay of the page that asked for it. Empty: a page without one.
+        cancelled_by: name of the overlay of the page that cancelled it. Empty: none did.
         total: number of steps.
         state: waiting, running, over, cancelled or failed.
         error: reason of the failure.
@@ -28,6 +29,7 @@ class Job:
     number: int
     settings: tuple[str, ...] = ()
     asked_by: str = ""
+    cancelled_by: str = ""
     total: int = 0
     state: str = "running"
     error: str = ""
@@ -54,6 +56,7 @@ class Job:
             "number": self.number,
             "settings": list(self.settings),
             "asked_by": self.asked_by,
+            "cancelled_by": self.cancelled_by,
             "state": self.state,
             "error": self.error,
             "done": self.done,
@@ -100,9 +103,11 @@ class Jobs(Generic[J]):
         self._thread.start()
         self._tell()
 
-    def cancel(self) -> None:
-        """Cancel the newest job. It ends after its present step."""
+    def cancel(self, by: str = "") -> None:
+        """Cancel the newest job for a page. It ends after its present step."""
         if self.jobs:
+            if by and self.jobs[-1].going:
+                self.jobs[-1].cancelled_by = by
             self.jobs[-1].stop.set()
 
     def end(self) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError, first_line
+from bevviz.model.reasons import MEANINGS
 from bevviz.support.colors import class_color
 from bevviz.support.loggers import logger
 
@@ -106,10 +107,12 @@ class PageConnection:
             "bag": source.title,
             "scans": source.scans,
             "truth": source.truth_of is not None,
+            "single": source.single_frames,
             "detector": bool(self._opened.detector.model),
             "opened": opened_values(self._opened),
             "classes": {name: f"rgb{class_color(name)}" for name in LEGEND},
             "controls": self._controls,
+            "meanings": {kind.value: text for kind, text in MEANINGS.items()},
         }
 
     async def _tell(self, news: asyncio.Event) -> None:
@@ -344,21 +347,23 @@ class PageConnection:
         try:
             while self._rows:
                 frame, pick = self._rows.pop(0)
-                text = await asyncio.to_thread(self._remark, frame, pick)
-                await self._send({"type": "remark", "frame": frame, "pick": pick, "text": text})
+                remark = await asyncio.to_thread(self._remark, frame, pick)
+                await self._send({"type": "remark", "frame": frame, "pick": pick, **remark})
         finally:
             self._remarking = False
 
-    def _remark(self, frame: int, pick: str) -> str:
+    def _remark(self, frame: int, pick: str) -> dict[str, str]:
         """Return the remark on a row. The next one waits as long as this one took."""
+        from bevviz.workbench.page_messages import remark_dict
+
         self._source.wait_for_quiet()
         start = time.monotonic()
         try:
-            text = self._source.remark(frame, pick)
+            remark = remark_dict(self._source.remark(frame, pick))
         except UserError:  # The list has changed meanwhile.
-            text = ""
+            remark = {"remark": "", "chip": ""}
         time.sleep(min(time.monotonic() - start, 1.0))
-        return text
+        return remark
 
     async def _drive(self, number: int, message: Message) -> None:
         """Run the drive with other values."""
@@ -375,10 +380,10 @@ class PageConnection:
             return
         workbench = self._workbench
         if message["what"] == "report":
-            workbench.reports.cancel()
+            workbench.reports.cancel(self._name)
         else:
             tools = workbench.tools
-            (tools.fix if message["what"] == "fix" else tools.trials).cancel()
+            (tools.fix if message["what"] == "fix" else tools.trials).cancel(self._name)
 
     async def _report(self, number: int, message: Message) -> None:
         reports = self._workbench.reports

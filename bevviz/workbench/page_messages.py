@@ -41,7 +41,13 @@ def answer_tree(answer: Answer) -> dict[str, Any]:
 
 def hints_dict(answer: Answer) -> dict[str, Any]:
     """Return the hints of an answer with hints, and the sentence about them."""
-    return {"hints": answer_tree(answer)["hints"], "remark": answer.remark}
+    return {"hints": answer_tree(answer)["hints"], **remark_dict(answer)}
+
+
+def remark_dict(answer: Answer) -> dict[str, str]:
+    """Return the sentence about the hints of an answer with hints, and the same in two words for a row."""
+    chips = {"hint": answer.hints, "cannot tell": answer.likely, "tried in vain": answer.tried}
+    return {"remark": answer.remark, "chip": next((chip for chip, known in chips.items() if known), "")}
 
 
 def note_dict(note: Note) -> dict[str, Any]:

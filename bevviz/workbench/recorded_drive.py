@@ -69,6 +69,8 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     ) -> None:
         super().__init__(drive.scene.name, drive.session, truth_of)
         self.drive, self.again, self.scans = drive, again, len(drive)
+        recording = getattr(drive.frames, "recording", None)
+        self.single_frames = bool(getattr(recording, "single_frames", False))
         self._first, self._table = first, table
         self._is_listed = False  # whether the list is that of an earlier run
         self.recording = DriveRecording(drive.scene, drive.config, self.again.total)

@@ -74,8 +74,10 @@ PAGE = """() => {
       `${label.textContent}=${input.type === "checkbox" ? input.checked : input.value}`)),
     rows: [...document.querySelectorAll("#found li:not(.group) > button:first-child")].map((row) => ({
       time: row.querySelector(".time").innerText, kind: row.children[2].innerText,
-      text: row.querySelector(".what").firstChild.textContent,
-      small: [...row.querySelectorAll("small")].at(-1)?.innerText ?? "",
+      text: [["", ".name"], [" at ", ".away"], [": ", ".reason"]]
+        .map(([before, part]) => [before, row.querySelector(part).textContent])
+        .filter(([, text]) => text).flat().join(""),
+      small: row.title.split("\n").at(-1),
       current: row.getAttribute("aria-current") === "true",
     })),
     busy: $("answer").matches(".busy") || shown("hints").startsWith("Trying")
@@ -298,6 +300,7 @@ class Walk:
         page = watched_page(self.browser, 1100, 700)
         page.set_default_timeout(PATIENCE * 1000)
         page.goto(self.address)
+        page.keyboard.press("Shift")  # The page begins at a finding by itself unless the user acts.
         self.panes.append(Pane(page))
         run = self.wait(page.locator("#bar").is_hidden, OPENING)
         assert run, "the frames have not been run"

@@ -106,9 +106,11 @@ export function send(message, failed) {
   number += 1;
   if (failed) failures.set(number, failed);
   failures.delete(number - 100);
-  if (questions.readyState === WebSocket.OPEN) questions.send(JSON.stringify({ id: number, ...message }));
+  if (isConnected()) questions.send(JSON.stringify({ id: number, ...message }));
   return number;
 }
+
+export const isConnected = () => questions?.readyState === WebSocket.OPEN;
 
 // Whether another page asked for a job.
 export const isOthers = (job) => Boolean(overlay) && job.asked_by !== overlay;

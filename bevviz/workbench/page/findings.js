@@ -1,6 +1,6 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
-import { $, element, remember, seconds, state } from "./page_state.js";
+import { $, at, element, remember, state, stated } from "./page_state.js";
 import { away, cause, csv, hasCause, KINDS, matches, offerFilters, severity, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
@@ -54,11 +54,11 @@ export function notes(message) {
   draw();
 }
 
-// Show a hint, or that no tried change helps, in the row of an object. A sight keeps the sentence after its own text.
-export function explain(frame, pick, tried, sentence) {
+// Show in the row of an object whether a change helps. A sight keeps the sentence after its own text, and the chip last.
+export function explain({ frame, pick, remark, chip }, tried = false) {
   for (const { sights } of entries.values()) {
     const one = sights.find((sight) => sight[0] === frame && sight[3] === pick && sight[4] === tried);
-    if (one) one[6] = sentence;
+    if (one) [one[6], one[8]] = [remark || " ", chip];
   }
   draw();
 }
@@ -111,6 +111,7 @@ function redraw() {
   }));
   requestRemarks();
   does.drawn?.(rows);
+  begin();
 }
 
 // Replace the rows that differ. A row that is replaced while a mouse button is down on it misses the click.
@@ -162,15 +163,17 @@ function frames(entry) {
 
 function drawn(entry) {
   const one = entry.sights[entry.best];
-  const where = one[2] === null ? "" : ` at ${one[2]} m`;
-  const text = `${entry.name}${where}${one[5] ? `: ${one[5]}` : ""}`;
   const reasons = severity(entry);
   const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
   const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
   dots.title = reasons.join("; ") || "no reason to hurry";
-  const button = element("button", "", "", dots, element("span", "time", seconds(one[1])),
-    element("span", entry.what.replace(" ", "-"), entry.what),
-    element("span", "what", text, ...[frames(entry), one[6]].filter(Boolean).map((more) => element("small", "", more))));
+  const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one[2] === null ? "" : `${one[2]} m`),
+    element("span", "reason", one[5])];
+  const button = element("button", "", "", dots, element("span", "time", at(one[1], one[0])),
+    element("span", entry.what.replace(" ", "-"), entry.what), name, away, reason);
+  reason.title = state.meanings[one[5]] ?? one[5];
+  button.title = [frames(entry), one[6]].filter((more) => more?.trim()).join("\n");
+  if (one[8]) button.append(element("span", `chip ${one[8].replaceAll(" ", "-")}`, one[8]));
   const isChosen = isSubject && entry.key === current;
   button.setAttribute("aria-current", isChosen);
   button.onclick = () => choose(entry, isChosen ? sight + 1 : entry.best);
@@ -214,6 +217,22 @@ function save() {
 
 // --- choosing -----------------------------------------------------------------------------------
 
+// A page that shows nothing yet begins at the worst row that has a hint, once the rows above it are known to have none.
+let hasBegun = Boolean(stated.get("at"));
+for (const sign of ["pointerdown", "keydown"]) window.addEventListener(sign, () => { hasBegun = true; }, true);
+function begin() {
+  if (hasBegun || !does.remarks || state.pick || state.time === null) return;
+  for (const entry of rows.slice(0, REMARKED)) {
+    const one = entry.sights[entry.best];
+    if (one[8] === "hint") {
+      hasBegun = true;
+      choose(entry, entry.best, false);
+      return;
+    }
+    if (one[3] && !one[4] && !one[6]) return;
+  }
+}
+
 export function step(by) {
   if (!rows.length) return;
   const at = rows.findIndex((entry) => entry.key === current);
@@ -221,19 +240,33 @@ export function step(by) {
   choose(entry, entry.best);
 }
 
-export function choose(entry, which) {
+export function choose(entry, which, scrolls = true) {
   current = entry.key;
   isSubject = true;
   sight = which % entry.sights.length;
   const [, stamp, , pick, tried] = entry.sights[sight];
   redraw();
-  [...$("found").children].find((item) => item.dataset.key === String(current))?.scrollIntoView({ block: "nearest" });
+  showRow(scrolls);
   if (tried || entry.what.endsWith("gone")) does.tryOut(tried);
   const from = { time: Number(stamp), set: tried ? does.tryOut.settings() : [] }; // The pick is valid there.
+  remember(Boolean(state.pick));
+  [state.pick, state.from] = [pick, from];
   seek(stamp);
   showSide();
-  state.pick = "";
   remember();
   if (pick) does.ask({ pick, from });
   else does.forget();
+}
+
+// Scroll the list to the chosen row, and a narrow page to the answer below the list.
+function showRow(scrolls) {
+  const [list, item] = [$("found"), [...$("found").children].find((one) => one.dataset.key === String(current))];
+  if (!item) return;
+  const top = item.offsetTop - list.offsetTop;
+  if (top < list.scrollTop) list.scrollTop = top;
+  else if (top + item.offsetHeight > list.scrollTop + list.clientHeight) list.scrollTop = top + item.offsetHeight - list.clientHeight;
+  document.documentElement.style.setProperty("--list-height", `${$("list").offsetHeight}px`);
+  if (!scrolls) return;
+  if (matchMedia("(max-width: 800px)").matches) $("answer").scrollIntoView({ block: "start" });
+  else $("list").parentElement.scrollTop = Math.min($("list").parentElement.scrollTop, $("list").previousElementSibling.offsetTop);
 }

@@ -1,6 +1,6 @@
 // Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
-import { $, element, seconds, state } from "./page_state.js";
+import { $, at, element, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
 import { follow, isOthers, send } from "./connection.js";
 
@@ -15,7 +15,11 @@ const shownRun = () => trials.find(isShown) ?? trials.at(-1);
 
 export function start(using) {
   use = using;
-  const say = (id) => ({ text }) => { $(id).textContent = text; $(id).className = "alarm"; };
+  const say = (id) => ({ text }) => {
+    $(id).textContent = text;
+    $(id).className = "alarm";
+    $(id).closest("section").hidden = false;
+  };
   $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
   $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
   $("fix").onclick = () => send({ type: "fix" }, say("fix-text"));
@@ -67,7 +71,7 @@ export function showRuns() {
   $("trial").hidden = !message;
   if (!message) return;
   for (const run of trials.filter(isShown)) follow(run.lane);
-  $("runs").replaceChildren(...(trials.length > 1 ? [row(["", "values", "F1", "better", "worse"], "th"), ...trials.map(runRow)] : []));
+  $("runs").replaceChildren(...(trials.length > 1 ? [row(["", "values", "F1", ...kindsOf(trials)], "th"), ...trials.map(runRow)] : []));
   const going = message.state === "waiting" || message.state === "running";
   $("trial-bar").max = message.total || 1;
   $("trial-bar").value = message.done;
@@ -92,23 +96,28 @@ function runRow(run) {
   button.onclick = () => use(run.settings);
   const f1 = run.f1 ? run.f1.map((one) => one ?? "–").join(" → ") : "–";
   const ended = { over: "", cancelled: " (cancelled)", failed: " (failed)" }[run.state] ?? " ...";
-  const made = row([isShown(run) ? "▸" : "", button, f1 + ended, String(run.better), String(run.worse)]);
+  const made = row([isShown(run) ? "▸" : "", button, f1 + ended, ...kindsOf(trials).map((kind) => String(run.counts[kind] ?? 0))]);
   made.setAttribute("aria-current", isShown(run));
   return made;
 }
+
+const KINDS = ["fixed", "broken", "new false", "false gone", "new", "gone"];
+const kindsOf = (runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
 
 function summary(message) {
   const parts = [];
   if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
   const frames = message.state === "running" ? `${message.done} of ${message.total} frames` : `${message.done} frames`;
-  parts.push(message.f1 ? `${frames}: ${message.better} better, ${message.worse} worse` : frames);
+  parts.push(frames);
   for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
-  if (message.state === "cancelled") parts.push("cancelled");
+  if (message.state === "cancelled") parts.push(cancelled(message));
   if (isOthers(message)) parts.push(OTHERS);
   return parts.join("; ");
 }
 
-// Draw one bar per frame: improvements upwards, deteriorations downwards.
+const cancelled = (job) => (job.cancelled_by && isOthers({ asked_by: job.cancelled_by }) ? "cancelled on another page" : "cancelled");
+
+// Draw one bar per frame: fixed and false gone upwards, broken and new false downwards.
 function strip(frames) {
   const canvas = $("strip");
   const [width, height] = [canvas.clientWidth || 360, 36];
@@ -128,7 +137,7 @@ function strip(frames) {
   draw.fillStyle = style.getPropertyValue("--line");
   draw.fillRect(0, height / 2, width, 1);
   const worst = frames.reduce((a, b) => (b[2] - b[1] > a[2] - a[1] ? b : a));
-  canvas.title = `each frame: better upwards, worse downwards; the worst is at ${seconds(worst[0])}`;
+  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst[0])}`;
 }
 
 // --- search of a fix ----------------------------------------------------------------------------
@@ -138,10 +147,11 @@ function showFix(fix) {
   const by = isOthers(fix) ? ` (${OTHERS})` : "";
   const steps = (fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...") + by;
   $("fix").disabled = going;
+  $("fix-section").hidden = !fix.state;
   for (const id of ["fix-bar", "fix-cancel"]) $(id).hidden = !going;
   $("fix-bar").max = fix.total || 1;
   $("fix-bar").value = fix.done;
-  $("fix-text").textContent = { "": "", running: steps, cancelled: "Cancelled." }[fix.state] ?? fix.text;
+  $("fix-text").textContent = { "": "", running: steps, cancelled: `${cancelled(fix).replace("c", "C")}.` }[fix.state] ?? fix.text;
   $("fix-text").className = fix.state === "failed" ? "alarm" : "faint";
   $("fix-use").hidden = going || !fix.settings.length;
   $("fix-use").textContent = `try ${fix.settings.join(", ")}`;
@@ -166,7 +176,7 @@ function report(one) {
     });
     item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
       element("span", "faint", [` in ${one.folder}`, one.settings.join(", "),
-        one.state === "cancelled" ? "cancelled" : "", isOthers(one) ? OTHERS : ""].filter(Boolean).join("; ")));
+        one.state === "cancelled" ? cancelled(one) : "", isOthers(one) ? OTHERS : ""].filter(Boolean).join("; ")));
   }
   return item;
 }

@@ -3,7 +3,10 @@
 export const $ = (id) => document.getElementById(id);
 
 export const state = {
-  bag: "", run: "", time: null, pick: "", set: [], undo: [], flipped: false,
+  bag: "", run: "", meanings: {}, // texts of the reasons
+  truth: false, // whether there is ground truth
+  single: false, // whether the frames are unrelated
+  time: null, pick: "", from: null, set: [], undo: [], redo: [], flipped: false,
   opening: null, // stamp of the frame that is shown first
   over: false, // the server has all frames
   first: 0, // stamp that seconds are counted from
@@ -48,17 +51,23 @@ export function neighbour(by) {
 export const asked = { released: 0, at: 0, sent: 0 };
 export const stated = new URLSearchParams(location.hash.slice(1));
 
-export function remember() {
+// Keep the state in the address. A new subject is a new step of the browser's history.
+export function remember(isNew = false) {
   const parts = new URLSearchParams({ bag: state.bag });
   if (state.time !== null) parts.set("at", state.time);
   if (state.pick) parts.set("pick", state.pick);
   for (const one of state.set) parts.append("set", one);
   if (state.set.length && state.flipped) parts.set("side", "before");
-  history.replaceState(null, "", `${location.pathname}${location.search}#${parts}`);
+  const address = `${location.pathname}${location.search}#${parts}`;
+  if (isNew) history.pushState({ own: true }, "", address);
+  else history.replaceState({ own: true }, "", address);
 }
 
 export const seconds = (stamp) => (
   state.opening === null ? "" : `${((Number(stamp) - Number(state.first)) / 1e9).toFixed(2)} s`);
+
+// When a frame is, for the user: single frames have made up times.
+export const at = (stamp, frame) => (state.single ? `frame ${frame ?? frames[rowAt(stamp)]?.[1]}` : seconds(stamp));
 
 export function element(name, className, text, ...children) {
   const made = document.createElement(name);

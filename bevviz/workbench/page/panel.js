@@ -1,13 +1,13 @@
 // The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
-import { connect, on, send, want, withPieces } from "./connection.js";
+import { connect, isConnected, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
-import { $, addFrames, asked, element, neighbour, remember, seconds, shownFrame, state, stated } from "./page_state.js";
+import { $, addFrames, asked, element, frameTimes, neighbour, remember, seconds, shownFrame, state, stated } from "./page_state.js";
 import * as parameters from "./parameters.js";
 import * as share from "./share.js";
 import * as timeline from "./timeline.js";
-import { drawnThen, isTried, kind, onViewer, seek, showSide } from "./viewer.js";
+import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from "./viewer.js";
 
 const REQUESTS = 300; // ms between two requests of frames while the time goes on
 
@@ -24,8 +24,22 @@ const shownKey = () => [shownFrame() ?? state.time, ...shownSet()].join();
 const frameName = (frame) => (frame === null ? `the frame at ${seconds(state.time)}` : `frame ${frame}`);
 const withValues = (set) => (set.length ? ` with ${set.join(", ")}` : "");
 
+// A question that was asked while the server was away is asked when it is back, by this page or the reloaded one.
+function askUnsent() {
+  const unsent = JSON.parse(sessionStorage.getItem("unsent") ?? "null");
+  sessionStorage.removeItem("unsent");
+  if (unsent && unsent.bag === state.bag && unsent.key === shownKey()) ask(unsent.what);
+  else return false;
+  return true;
+}
+
 function ask(what) {
   if (state.time === null) return;
+  if (!isConnected()) {
+    sessionStorage.setItem("unsent", JSON.stringify({ bag: state.bag, key: shownKey(), what }));
+    clear("", "The server is away: this is asked when it is back.");
+    return;
+  }
   asked.at = "entity" in what ? asked.released : performance.now();
   asked.sent = performance.now();
   $("answer").classList.add("busy");
@@ -40,11 +54,16 @@ function ask(what) {
 
 function askOther(what) {
   list.leave();
+  remember(Boolean(state.pick));
+  if ("pick" in what) [state.pick, state.from] = [what.pick, what.from];
   ask(what);
 }
 
 // Row numbers differ between frames and values. The address of an answer's object is valid in all of them.
-const askAgain = () => { if (state.pick) ask({ pick: state.pick }); };
+// Until it has come, the row number goes with its frame and values.
+const askAgain = () => {
+  if (state.pick) ask({ pick: state.pick, ...(state.pick.startsWith("{") || !state.from ? {} : { from: state.from }) });
+};
 
 // Show a sentence in place of an answer. Nothing of the former answer stays.
 function clear(className, text, where = "") {
@@ -52,7 +71,7 @@ function clear(className, text, where = "") {
   $("answer").className = className;
   $("verdict").textContent = text;
   $("where").textContent = where;
-  for (const id of ["chain", "beside", "hints", "robot-chain"]) $(id).replaceChildren();
+  for (const id of ["chain", "beside", "hints", "robot-chain", "further"]) $(id).replaceChildren();
   for (const id of ["beside-title", "robot-title"]) $(id).hidden = true;
   freshness();
 }
@@ -76,7 +95,7 @@ function requestOften() {
 function freshness() {
   const frame = shownFrame();
   const making = state.demand && frame !== null && !made.has(frame) ? ", being made ..." : "";
-  const at = seconds(state.time); // empty beside a robot
+  const at = state.single ? "" : seconds(state.time); // empty beside a robot
   $("shown").textContent = frame === null ? at : `Frame ${frame}${at && ` at ${at}`}${making}`;
   const { answer } = state;
   const isOther = frame === null ? askedFor !== shownKey() : answer?.frame !== frame;
@@ -103,22 +122,32 @@ function answer(message) {
   $("answer").dataset.subject = message.pick;
   $("verdict").textContent = message.verdict;
   const parts = [message.name, `frame ${message.frame}`];
-  if (message.distance !== null) parts.push(`${message.distance} m away`);
+  if (message.distance !== null && !message.name.includes(" m")) parts.push(`${message.distance.toFixed(1)} m away`);
   if (message.found) parts.push(`found ${message.found}`);
   $("where").textContent = `${parts.join(" · ")} · answered in ${(took / 1000).toFixed(2)} s`;
   $("chain").replaceChildren(...message.chain.map((step) => (
     element("li", "", "", element("b", "", `${step.stage}: `), step.text))));
   $("robot-chain").replaceChildren();
   $("robot-title").hidden = true;
+  $("further").replaceChildren(...further(message).map((text) => element("p", "", text)));
   const from = { time: Number(state.time), set: message.set };
   $("beside").replaceChildren(...message.beside.map((other) => {
     const button = element("button", other.reported ? "" : "missed", `${other.name}: ${other.reason}`);
+    button.title = state.meanings[other.reason] ?? "";
     button.onclick = () => askOther({ pick: other.pick, from });
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
   freshness();
+}
+
+// Say what the verdict leaves open: two reasons of which nothing tells which one mattered, and stages that bring it back.
+function further({ likely, restored_by: restored }) {
+  const texts = [];
+  if (likely.length) texts.push(`Either of two reasons may have lost it: ${likely.join(" or ")}.`);
+  if (restored.length) texts.push(`It comes back with ideal results of ${restored.map((stages) => stages.join(" and ")).join(", or of ")}.`);
+  return texts;
 }
 
 function nothing(message) {
@@ -167,31 +196,36 @@ function hints(message) {
   freshness();
   if (!message.remark) return;
   if (!message.hints.length) $("hints").textContent = message.remark;
-  list.explain(message.frame, message.row_pick, askedTried, message.remark);
+  list.explain({ ...message, pick: message.row_pick }, askedTried);
 }
 
 // Describe the effects of other values on a frame. Hints and tried values use the same words.
 function effects(effect) {
   const rest = (all, some) => all.filter((name) => !some.includes(name));
   const parts = Object.entries({
-    fixes: effect.fixed, adds: rest(effect.added, effect.false), "wrongly adds": effect.false,
-    loses: effect.right, drops: rest(effect.lost, effect.right),
-  }).filter(([, names]) => names.length).map(([what, names]) => `${what} ${names.join(", ")}`);
-  if (effect.changed) parts.push(`changes ${effect.changed}`);
+    fixed: effect.fixed, broken: effect.right, "new false": effect.false,
+    [state.truth ? "false gone" : "gone"]: rest(effect.lost, effect.right), new: rest(effect.added, effect.false),
+  }).filter(([, names]) => names.length).map(([what, names]) => `${what}: ${names.join(", ")}`);
+  if (effect.changed) parts.push(`${effect.changed} changed`);
   return parts.join("; ");
 }
 
 // --- other values -------------------------------------------------------------------------------
 
-function change(settings) {
+function use(settings) {
   state.undo.push(state.set);
+  state.redo = [];
+  state.set = settings;
+  state.flipped = false;
+  changed();
+}
+
+function change(settings) {
   const keys = new Set(settings.map((one) => one.split("=")[0]));
   // The parameters of a method are removed with it.
   const gone = [...keys].filter((key) => key.endsWith(".method")).map((key) => key.replace(/method$/, "params."));
   const stays = (key) => !keys.has(key) && !gone.some((start) => key.startsWith(start));
-  state.set = [...state.set.filter((one) => stays(one.split("=")[0])), ...settings];
-  state.flipped = false;
-  changed();
+  use([...state.set.filter((one) => stays(one.split("=")[0])), ...settings]);
 }
 
 function changed() {
@@ -217,7 +251,8 @@ function attempt() {
   $("effect").className = "";
   if (state.set.length || kind === "live") tryHere(); // A robot needs empty settings, too.
   else {
-    trying = 0;
+    if (trying) send({ type: "cancel", what: "try" });
+    tryOver();
     triedFor = "";
     valid = [];
     $("effect").textContent = "As it was opened.";
@@ -305,11 +340,7 @@ function tellSide() {
 // Show the side of a listed finding: with the settings of the newest trial, or as opened.
 function tryOut(withThem) {
   const wanted = jobs.settings();
-  if (wanted && wanted.join() !== state.set.join()) {
-    state.undo.push(state.set);
-    state.set = wanted;
-    changed();
-  }
+  if (wanted && wanted.join() !== state.set.join()) use(wanted);
   if (state.flipped === withThem) flip();
 }
 
@@ -326,16 +357,17 @@ function open({ stamp, first, demand }) {
   if (!same) return;
   state.set = stated.getAll("set");
   state.pick = stated.get("pick") ?? "";
+  state.from = { time: Number(state.opening), set: state.set };
   if (state.set.length) {
     state.undo.push([]);
     changed();
     if (stated.get("side") === "before") flip();
-  } else askAgain();
+  } else if (!askUnsent()) askAgain();
 }
 
 function welcome(message) {
   state.bag = message.bag;
-  state.run = message.run;
+  for (const key of ["run", "meanings", "truth", "single"]) state[key] = message[key];
   document.title = `${message.bag} · bevviz`;
   $("bag").textContent = message.bag;
   opened = message.controls;
@@ -346,6 +378,7 @@ function welcome(message) {
   $("detector").hidden = message.detector;
   if (kind === "live") $("changed-title").textContent = "In force on the robot, from the next frame on";
   parameters.offer(opened);
+  if (state.opening !== null) askUnsent();
 }
 
 function legend(classes) {
@@ -359,7 +392,7 @@ function legend(classes) {
 on({
   welcome, controls: (message) => parameters.offer(message.controls), answer, robot: robotChain, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
   tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, notes: list.notes, noted: jobs.noted,
-  remark: ({ frame, pick, text }) => list.explain(frame, pick, false, text),
+  remark: (message) => list.explain(message),
   made: (frame) => { made.add(frame); freshness(); },
   // The viewer frees nothing, and loses its layout where a recording is closed. The address shows the same again.
   full: () => { remember(); location.reload(); },
@@ -383,9 +416,34 @@ onViewer({
 
 function undo() {
   if (!state.undo.length) return;
+  state.redo.push(state.set);
   state.set = state.undo.pop();
   changed();
 }
+
+function redo() {
+  if (!state.redo.length) return;
+  state.undo.push(state.set);
+  state.set = state.redo.pop();
+  changed();
+}
+
+// Back and Forward of the browser walk through the subjects.
+window.addEventListener("popstate", (event) => {
+  if (!event.state || !new URLSearchParams(location.hash.slice(1)).get("at")) return;
+  const parts = new URLSearchParams(location.hash.slice(1));
+  list.leave();
+  const set = parts.getAll("set");
+  [state.pick, state.from] = [parts.get("pick") ?? "", { time: Number(parts.get("at")), set }];
+  state.flipped = parts.get("side") === "before";
+  seek(parts.get("at"));
+  if (set.join() !== state.set.join()) {
+    state.undo.push(state.set);
+    state.set = set;
+    changed();
+  } else if (state.pick) askAgain();
+  else forget();
+});
 
 function stepFrame(by) {
   const stamp = neighbour(by);
@@ -396,7 +454,16 @@ function stepFrame(by) {
   }
 }
 
+const toEnd = (isLast) => {
+  const times = frameTimes();
+  if (times.length) seek(frameTimes.stamp(isLast ? times.length - 1 : 0));
+};
 const actions = {
+  " ": playOrPause,
+  ArrowLeft: () => stepFrame(-1),
+  ArrowRight: () => stepFrame(1),
+  Home: () => toEnd(false),
+  End: () => toEnd(true),
   ",": () => stepFrame(-1),
   ".": () => stepFrame(1),
   "?": () => { if ($("help").open) $("help").close(); else $("help").showModal(); },
@@ -409,7 +476,7 @@ const actions = {
 };
 $("undo").onclick = undo;
 $("flip").onclick = flip;
-$("reset").onclick = () => { state.undo.push(state.set); state.set = []; state.flipped = false; changed(); };
+$("reset").onclick = () => use([]);
 $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `--set '${one}'`).join(" "));
 $("try-cancel").onclick = cancelTry;
 $("keys").onclick = actions["?"];
@@ -418,7 +485,15 @@ window.addEventListener("keydown", (event) => {
   const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
   const typing = inPanel && event.target.matches("input:not([type=range], [type=checkbox]), select");
   if (typing && event.key === "Escape") event.target.blur();
+  const isText = event.target.matches?.("#words, #mark-text, [type=search], #found input");
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !isText) {
+    event.preventDefault();
+    event.stopPropagation();
+    (event.shiftKey ? redo : undo)();
+  }
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
+  if (event.key.length > 1 && event.target.matches?.("[type=range]")) return; // Arrows, Home and End move the slider.
+  if (event.key === " " && event.target.matches?.("[type=checkbox], summary")) return;
   event.preventDefault();
   event.stopPropagation();
   actions[event.key]();
@@ -442,10 +517,6 @@ parameters.start(change);
 timeline.start(list.choose);
 share.start();
 jobs.start((settings) => {
-  if (settings.join() === state.set.join()) return;
-  state.undo.push(state.set);
-  state.set = settings;
-  state.flipped = false;
-  changed();
+  if (settings.join() !== state.set.join()) use(settings);
 });
 connect();

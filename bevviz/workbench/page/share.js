@@ -13,8 +13,8 @@ export function start() {
     await navigator.clipboard.writeText(`${location.origin}/shared#${parts}`);
     $("shared").textContent = `Copied. It opens wherever 'bevviz open' shows ${state.bag}.`;
   };
-  // A link was put into the address. Ours is only a sign to the viewer.
-  window.addEventListener("hashchange", (event) => event.isTrusted && location.reload());
+  // A link was put into the address. Ours is only a sign to the viewer, or a step of the history, which has a state.
+  window.addEventListener("hashchange", (event) => event.isTrusted && !history.state && location.reload());
 }
 
 export const welcomed = (message) => { opened = message.opened; };

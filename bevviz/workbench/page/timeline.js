@@ -1,13 +1,13 @@
 // Timeline under the viewer: one lane for each sort of finding, the shown time, and a click that goes there.
 
-import { $, frameTimes, seconds, state } from "./page_state.js";
+import { $, at, frameTimes, state } from "./page_state.js";
 import { kind, seek } from "./viewer.js";
 
 const LANES = [
   ["missed", "--bad", ["missed", "lost", "unmatched", "broken"]],
   ["false", "--doubtful", ["false", "doubtful", "contradicted", "new false"]],
   ["unnamed", "--unknown", ["unnamed", "new", "gone"]],
-  ["better", "--good", ["fixed", "false gone"]],
+  ["fixed", "--good", ["fixed", "false gone"]],
   ["anomaly", "--other", ["anomaly"]],
   ["note", "--subject", ["note"]],
 ];
@@ -27,7 +27,7 @@ export function start(choosing) {
   $("events").onclick = clicked;
   $("events").onpointermove = (event) => {
     const mark = markAt(event);
-    $("events").title = mark ? `${mark.entry.what} ${mark.entry.name} at ${seconds(mark.entry.sights[mark.row][1])}` : "";
+    $("events").title = mark ? `${mark.entry.what} ${mark.entry.name} at ${at(mark.entry.sights[mark.row][1])}` : "";
     showThumbnail(event, rowAt(event));
   };
   $("events").onpointerleave = () => { $("thumbnail").hidden = true; };
@@ -131,7 +131,7 @@ function showThumbnail(event, row) {
   const path = `/thumbnail/${frameTimes.number(row)}`;
   figure.style.left = `${Math.max(112, Math.min(event.clientX, canvas.clientWidth - 112))}px`;
   figure.style.bottom = `${document.documentElement.clientHeight - canvas.getBoundingClientRect().top + 4}px`;
-  figure.dataset.at = seconds(frameTimes.stamp(row));
+  figure.dataset.at = at(frameTimes.stamp(row));
   if (figure.firstChild.getAttribute("src") !== path) figure.firstChild.src = path;
   else figure.hidden = !figure.firstChild.naturalWidth;
 }

@@ -1,13 +1,14 @@
 // Rerun's viewer, as its notebook widget. The widget wraps the viewer of its version; this page acts as the notebook.
 
 import { nextPicture, wake } from "./idle_drawing.js";
-import { $, asked, state } from "./page_state.js";
+import { $, asked, shownFrame, state } from "./page_state.js";
 
 console.debug = () => {}; // The viewer logs 50,000 lines at its start, which takes seconds.
 const version = $("viewer").dataset.version;
 export const kind = $("viewer").dataset.kind; // page (of a drive) or live (of a robot)
-keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
-const widget = (await import(`/viewer/${version}/widget.js`)).default;
+const hasGraphics = Boolean(document.createElement("canvas").getContext("webgl2"));
+if (hasGraphics) keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
+const widget = hasGraphics ? (await import(`/viewer/${version}/widget.js`)).default : cameraOnly();
 
 // Results of the run and results with other values are on two timelines of the same recording.
 const OPENED = "stamp";
@@ -30,6 +31,26 @@ export const viewerReady = new Promise((ready) => {
     el: $("viewer"),
   });
 });
+// Without WebGL Rerun's viewer draws nothing. Show the camera of the frame instead, and go at once where the page goes.
+function cameraOnly() {
+  const [text, image] = [document.createElement("p"), new Image()];
+  text.textContent = "This browser has no WebGL, so there are no views in space. The camera is shown, and the list answers.";
+  image.alt = "camera of the frame";
+  const show = () => { const frame = shownFrame(); if (frame !== null) image.src = `/thumbnail/${frame}`; };
+  return { render: ({ model, el }) => {
+    el.append(Object.assign(document.createElement("figure"), { id: "no-graphics" }));
+    el.firstChild.append(text, image);
+    model.on("msg:custom", (message) => {
+      if (message.type !== "time_ctrl") return;
+      setTimeout(() => {
+        model.send(JSON.stringify({ type: "timeline_change", timeline: message.timeline, time: Number(message.timestamp_nanos) }));
+        show();
+      });
+    });
+    setTimeout(() => model.send("ready"));
+  } };
+}
+
 function begun(ready) {
   performance.mark("viewer");
   ready();
@@ -52,7 +73,12 @@ function keepCompiled(url) {
   const { fetch } = window;
   const compile = WebAssembly.compileStreaming.bind(WebAssembly);
   const module = compile(fetch(url));
-  window.fetch = (what, ...more) => (String(what) === url ? Promise.resolve(new Response()) : fetch(what, ...more));
+  // The viewer looks for a newer one of itself, which the page does not allow.
+  const isForeign = (what) => /^https?:/.test(what.url ?? what) && new URL(what.url ?? what).origin !== location.origin;
+  window.fetch = (what, ...more) => {
+    if (isForeign(what)) return Promise.resolve(new Response("{}"));
+    return String(what) === url ? Promise.resolve(new Response()) : fetch(what, ...more);
+  };
   WebAssembly.compileStreaming = () => module;
 }
 
@@ -101,6 +127,12 @@ export function goTo(stamp, play) {
   toViewer({ type: "time_ctrl", timeline: OPENED, timestamp_nanos: stamp, play });
 }
 
+let isPlaying = false;
+export function playOrPause() {
+  target = null;
+  toViewer({ type: "time_ctrl", timeline: timeline(), timestamp_nanos: state.time, play: !isPlaying });
+}
+
 // Show the same time on the chosen side, as opened or as tried.
 export const showSide = () => { if (kind !== "live" && state.time !== null) seek(state.time); };
 
@@ -112,6 +144,7 @@ function viewerEvent(event) {
   wake();
   window.dispatchEvent(new CustomEvent("viewer-event", { detail: event }));
   if (event.type === "recording_open" && state.time !== null) seek(state.time); // The user may have chosen another.
+  if (event.type === "play" || event.type === "pause") isPlaying = event.type === "play";
   if (event.type === "time_update" || event.type === "timeline_change") moved(event);
   if (event.type === "selection_change") {
     const item = event.items.find((one) => one.type === "entity");
