@@ -149,6 +149,7 @@ def _show_missed(options: DemoOptions) -> int:
         say(f"{BAG} is there already and is opened again; remove it for a new one")
     else:
         _make_bag(simulator, BAG, number + FURTHER)
+    say(f"looking at frame {number}, for what is missed there")
     with BagSource([BAG], config) as source:
         frame = source.frame(min(number, len(source.scans) - 1))
         if frame is None:

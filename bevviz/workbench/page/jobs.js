@@ -57,6 +57,7 @@ export function progress(message) {
   const text = message.over ? `${message.done} frames` : run;
   $("run").textContent = [text, message.error, ...message.warnings].filter(Boolean).join(" · ");
   $("run").className = message.error ? "alarm" : "faint";
+  $("run").title = $("run").textContent;
   trials = message.trials;
   showRuns();
   if (message.fix) showFix(message.fix);
