@@ -18,22 +18,22 @@ class Job:
         number: number of the job among those of its kind, from 0.
         settings: settings that it is about.
         asked_by: name of the overlay of the page that asked for it. Empty: a page without one.
-        cancelled_by: name of the overlay of the page that cancelled it. Empty: none did.
         total: number of steps.
         state: waiting, running, over, cancelled or failed.
         error: reason of the failure.
         done: number of finished steps.
+        cancelled_by: name of the overlay of the page that cancelled it. Empty: none did.
         stop: cancels the job when it is set.
     """
 
     number: int
     settings: tuple[str, ...] = ()
     asked_by: str = ""
-    cancelled_by: str = ""
     total: int = 0
     state: str = "running"
     error: str = ""
     done: int = 0
+    cancelled_by: str = ""
     stop: threading.Event = field(default_factory=threading.Event)
 
     @property

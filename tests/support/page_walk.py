@@ -77,7 +77,7 @@ PAGE = """() => {
       text: [["", ".name"], [" at ", ".away"], [": ", ".reason"]]
         .map(([before, part]) => [before, row.querySelector(part).textContent])
         .filter(([, text]) => text).flat().join(""),
-      small: row.title.split("\n").at(-1),
+      small: row.title.split("\\n").at(-1),
       current: row.getAttribute("aria-current") === "true",
     })),
     busy: $("answer").matches(".busy") || shown("hints").startsWith("Trying")

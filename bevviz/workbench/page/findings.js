@@ -162,7 +162,8 @@ function frames(entry) {
 }
 
 function drawn(entry) {
-  const one = entry.sights[entry.best];
+  const isChosen = isSubject && entry.key === current;
+  const one = entry.sights[isChosen ? Math.min(sight, entry.sights.length - 1) : entry.best];
   const reasons = severity(entry);
   const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
   const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
@@ -174,7 +175,6 @@ function drawn(entry) {
   reason.title = state.meanings[one[5]] ?? one[5];
   button.title = [frames(entry), one[6]].filter((more) => more?.trim()).join("\n");
   if (one[8]) button.append(element("span", `chip ${one[8].replaceAll(" ", "-")}`, one[8]));
-  const isChosen = isSubject && entry.key === current;
   button.setAttribute("aria-current", isChosen);
   button.onclick = () => choose(entry, isChosen ? sight + 1 : entry.best);
   const item = element("li", entry.handled ? "handled" : "", "", button);
