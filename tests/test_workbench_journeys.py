@@ -547,3 +547,10 @@ def test_a_phone_has_the_panel_below_the_viewer(browser: Browser, address: str) 
         assert viewer["width"] == panel["width"] == 390
         assert viewer["height"] > 300 and panel["y"] >= viewer["y"] + viewer["height"]
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        until(lambda: listed(page))
+        page.locator("#found button", has=page.locator(".missed")).first.click()
+        until(lambda: verdict(page) and page.locator("#chain li").count())
+        findings, answer = (page.locator(name).bounding_box() for name in ("#findings", "#verdict"))
+        assert findings is not None and answer is not None
+        assert findings["y"] == pytest.approx(0, abs=2)
+        assert findings["height"] - 2 <= answer["y"] < 700

@@ -258,15 +258,24 @@ export function choose(entry, which, scrolls = true) {
   else does.forget();
 }
 
-// Scroll the list to the chosen row, and a narrow page to the answer below the list.
+const isNarrow = () => matchMedia("(max-width: 800px)").matches;
+let scrollsToAnswer = false; // once it has come
+
+// Scroll a narrow page to the answer about a chosen row, below the list.
+export function showAnswer() {
+  if (scrollsToAnswer) $("answer").scrollIntoView({ block: "start" });
+  scrollsToAnswer = false;
+}
+
+// Scroll the list to the chosen row, and a wide panel to the list.
 function showRow(scrolls) {
   const [list, item] = [$("found"), [...$("found").children].find((one) => one.dataset.key === String(current))];
   if (!item) return;
   const top = item.offsetTop - list.offsetTop;
   if (top < list.scrollTop) list.scrollTop = top;
   else if (top + item.offsetHeight > list.scrollTop + list.clientHeight) list.scrollTop = top + item.offsetHeight - list.clientHeight;
-  document.documentElement.style.setProperty("--list-height", `${$("list").offsetHeight}px`);
+  document.documentElement.style.setProperty("--list-height", `${$("findings").offsetHeight}px`);
   if (!scrolls) return;
-  if (matchMedia("(max-width: 800px)").matches) $("answer").scrollIntoView({ block: "start" });
-  else $("list").parentElement.scrollTop = Math.min($("list").parentElement.scrollTop, $("list").previousElementSibling.offsetTop);
+  scrollsToAnswer = isNarrow();
+  if (!isNarrow()) $("findings").parentElement.scrollTop = Math.min($("findings").parentElement.scrollTop, $("findings").previousElementSibling.offsetTop);
 }

@@ -140,6 +140,7 @@ function answer(message) {
   $("beside-title").hidden = !message.beside.length;
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
   freshness();
+  list.showAnswer();
 }
 
 // Say what the verdict leaves open: two reasons of which nothing tells which one mattered, and stages that bring it back.
