@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/architecture.md").read_text()
 EXTRAS = sorted(path.parent.name for path in ROOT.glob("bevviz/extras/*/__init__.py"))
 MAX_NAME = 60  # characters of the name of a test
-TESTS_OF_BENCHMARKS = ("test_benchmarks.py", "test_torture_benchmark.py")
+TESTS_OF_BENCHMARKS = ("test_benchmarks.py", "test_ideal_benchmark.py", "test_torture_benchmark.py")
 
 
 def contract() -> list[set[str]]:

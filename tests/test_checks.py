@@ -154,7 +154,7 @@ def test_a_right_extrinsic_is_not_doubted(results: list[FrameResult]) -> None:
         assert not judged(results, pose, detector=False)
 
 
-def test_the_vertical_tells_of_a_wrong_extrinsic_without_a_detector(results: list[FrameResult]) -> None:
+def test_the_vertical_tells_of_a_wrong_extrinsic(results: list[FrameResult]) -> None:
     camera = results[0].cameras[0].camera
     assert camera.camera_from_points is not None
     right = geometry.inverse(camera.camera_from_points)

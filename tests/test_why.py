@@ -163,7 +163,7 @@ def test_two_losses_without_truth_are_both_named() -> None:
     explainer = FrameExplainer(blind, classes=CLASSES)
     subject = next(a.subject for a in explainer.ask(Selection()) if a.subject.kind == "detection")
     evidence = collect_evidence(subject, explainer.traces)
-    lost = replace(evidence, ground=np.zeros(30, np.float32), noise=25, main=-1, parts=())
+    lost = replace(evidence, ground=np.full(30, 0.3, np.float32), noise=25, main=-1, parts=())
     reasons = likely_reasons(subject, lost, explainer.traces, ReasonKind.GROUND)
     assert reasons == (ReasonKind.GROUND, ReasonKind.NOISE)
     few = replace(lost, noise=5)

@@ -185,7 +185,7 @@ def test_without_ground_truth_doubtful_objects_are_false_ones(asked: dict[str, A
             rows = [answer.subject.row for answer in blind.false_objects()]
             doubtful += len(rows)
             right += sum(partner[row] >= 0 for row in rows)
-    assert doubtful >= 4 and right <= 1
+    assert doubtful >= 3 and right <= 1
 
 
 def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None:

@@ -20,7 +20,8 @@ from bevviz.extras.robot_chain.messages import FollowedObject
 from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
-from bevviz.workbench.held_seconds import DeliveredFrame, HeldSeconds
+from bevviz.workbench.growing_drive import FrameFacts
+from bevviz.workbench.held_seconds import HeldSeconds
 from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support import bags, chained_robot, documented_json
 from tests.support.live_sessions import live_bench
@@ -255,7 +256,7 @@ def test_the_nodes_of_a_running_robot_are_named() -> None:
         assert sum(len(frame.robot_boxes) for frame in frames) < len(frames), "the results came in time"
         messages = raw.messages()
     with HeldSeconds(messages, {}) as held:
-        delivered = [DeliveredFrame.of(FrameResult.unprocessed(frame, config)) for frame in frames]
+        delivered = [FrameFacts.of(FrameResult.unprocessed(frame, config)) for frame in frames]
         place = chained_robot.PLACES[chained_robot.DROPPED].astype(np.float64)
         texts = []
         for frame, facts in zip(frames, delivered, strict=True):
