@@ -55,7 +55,7 @@ def test_without_a_cache_folder_loops_are_recompiled() -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "[0, 0, -1]"), done.stderr
 
 
-def test_a_kernel_takes_named_arguments_and_other_kernels_call_it() -> None:
+def test_kernels_take_named_arguments_and_call_each_other() -> None:
     @kernel
     def scaled(x: float, factor: float = 2.0) -> float:
         return factor * x

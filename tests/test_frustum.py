@@ -113,7 +113,7 @@ def test_the_points_decide_how_wide_a_person_is(width: float, least: float, most
     assert least < across < most
 
 
-def test_a_low_wall_in_front_is_not_the_car_that_stands_behind_it() -> None:
+def test_a_low_wall_in_front_is_not_the_car_behind_it() -> None:
     """The lower edge of the image box meets the ground at the car. At the wall it is above the ground."""
     far, wall = car(24, 0, math.pi / 2), slab(14, 0, -0.75, 2.2, 1.5)
     points = np.concatenate([far, wall])

@@ -216,7 +216,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 LINES = {  # what is said of the field in a sentence on the message
     "renamed": "{field}'?( \\(of {field}\\))?(;| is missing)",
     "retyped": "the field '{field}' (is|cannot be used)",
-    "emptied": "is missing|there are none|has no header|SerdeError: Could not deserialize",
+    "emptied": (
+        "is missing|there are none|has no header|SerdeError: Could not deserialize|the bag does not say what"
+    ),
 }
 READ_AS_BYTES = ("/livox/lidar", "/velodyne_packets")  # whatever the bag says that they are made of
 LEFT_OUT = {  # these are left out before their content is looked at: no sensor of its own, or no picture

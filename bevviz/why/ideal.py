@@ -254,8 +254,8 @@ def restoring_stages(
 ) -> dict[int, tuple[StageSet, ...]]:
     """Return the smallest sets of stages whose ideal results bring each missed object back.
 
-    All objects get their ideal results in one run. A larger set is tried for those that no smaller one brings
-    back.
+    All objects get their ideal results in one run. Pairs are tried for those that no single stage brings
+    back, and all stages together for the rest.
 
     Args:
         traces: index of the frame's result, with ground truth.
@@ -281,7 +281,7 @@ def restoring_stages(
     stages_to_try = STAGES if _on_ground(traces, rows) else STAGES[1:]
     curable = found(stages_to_try)
     left = [row for row in rows if curable[row]]
-    for size in range(1, len(stages_to_try)):
+    for size in (1, 2):
         for chosen in combinations(stages_to_try, size) if left else ():
             is_found = found(chosen)
             for row in left:
