@@ -33,7 +33,7 @@ def test_an_item_that_is_drawn_twice_has_one_address() -> None:
     assert not writer.rows, "the next frame has not drawn it"
 
 
-def test_frustums_of_all_cameras_have_the_rows_of_their_detections() -> None:
+def test_frustums_have_the_rows_of_their_detections() -> None:
     frame = SyntheticSource(frames=12).snapshot(8).frame
     result = Session(load(settings=["detector.model=demo"])).run_single(frame)
     [first] = result.cameras

@@ -275,6 +275,13 @@ TURN = geometry.transform(np.zeros(3), np.array([0, 0, np.sin(np.radians(4)), np
 TF = "tf2_msgs/msg/TFMessage"
 
 
+def pose_of(frame: Frame) -> F64:
+    """Return the transform into the first camera."""
+    pose = frame.cameras[0].camera_from_points
+    assert pose is not None
+    return pose
+
+
 def read(path: Path, *settings: str) -> tuple[Frame, Sequence[str]]:
     """Return the last frame of a bag, and the doubts about the bag."""
     with BagSource([path], load(settings=list(settings))) as source:
@@ -299,12 +306,10 @@ def test_a_transform_that_is_stated_twice_is_said(tmp_path: Path, topic: str, co
     where = "twice on /tf_static" if topic == "/tf_static" else "on /tf_static and on /tf"
     what = f"'{bags.LIDAR_FRAME}' -> '{bags.CAMERA_FRAME}' is stated {where}, 8.0 degrees and 0.01"
     assert what in doubt and "the newer one is used" in doubt
-    np.testing.assert_allclose(
-        frame.cameras[0].camera_from_points, geometry.inverse(TURN @ OPTICAL), atol=1e-6
-    )
+    np.testing.assert_allclose(pose_of(frame), geometry.inverse(TURN @ OPTICAL), atol=1e-6)
     (setting,) = re.findall(r"--set (source.extrinsics)='(.*)'", doubt)
     frame, doubts = read(bag, "=".join(setting))
-    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-5)
+    np.testing.assert_allclose(pose_of(frame), geometry.inverse(OPTICAL), atol=1e-5)
     assert not doubts
 
 
@@ -357,13 +362,13 @@ def test_the_optical_frame_is_that_of_image_or_camera_info(
 ) -> None:
     bag = bags.write(tmp_path / "drive", framed(image, info, *edges))
     frame, doubts = read(bag)
-    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-9)
+    np.testing.assert_allclose(pose_of(frame), geometry.inverse(OPTICAL), atol=1e-9)
     assert frame.cameras[0].image is not None and frame.cameras[0].image.frame_id.endswith("optical")
     assert bool(doubts) == bool(said) and all(re.search(said, doubt) for doubt in doubts)
     for setting in re.findall(r"--set source.frames='(.*)'", " ".join(doubts)):
         other, doubts = read(bag, f"source.frames={setting}")
         assert not doubts
-        np.testing.assert_allclose(other.cameras[0].camera_from_points, geometry.inverse(FORWARD), atol=1e-9)
+        np.testing.assert_allclose(pose_of(other), geometry.inverse(FORWARD), atol=1e-9)
 
 
 def test_a_frame_can_be_stated_for_a_recorded_bag(tmp_path: Path) -> None:
@@ -373,7 +378,7 @@ def test_a_frame_can_be_stated_for_a_recorded_bag(tmp_path: Path) -> None:
             item.message.header.frame_id = ""
     bag = bags.write(tmp_path / "drive", items)
     frame, _ = read(bag, f"source.frames={{{bags.IMAGE}: camera_optical, {bags.CLOUD}: velodyne}}")
-    np.testing.assert_allclose(frame.cameras[0].camera_from_points, geometry.inverse(OPTICAL), atol=1e-9)
+    np.testing.assert_allclose(pose_of(frame), geometry.inverse(OPTICAL), atol=1e-9)
 
 
 # --- calibrations and robots -------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
-from bevviz.model.frame import F64
+from bevviz.model.frame import F64, Camera
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.session import Session
@@ -244,10 +245,10 @@ def test_the_method_for_a_flat_cloud_is_offered(results: list[FrameResult]) -> N
         for result in results:
             (cloud,) = result.frame.clouds
             chest = np.abs(cloud.xyz[:, 2] + 0.6) < 0.05
-            flat = replace(cloud, xyz=cloud.xyz[chest] * np.float32([1, 1, 0]), fields={})
+            flat = replace(cloud, xyz=cloud.xyz[chest] * np.array([1, 1, 0], np.float32), fields={})
             frame = replace(result.frame, points=flat.xyz, clouds=(flat,), fields={})
             detections = result.cameras[0].detections
-            session = Session(config, lambda image, detections=detections: detections)
+            session = Session(config, partial(_known, detections))
             checks.observe(session.run_single(frame))
         (finding,) = [finding for finding in checks.findings if finding.kind == "fusion"]
     assert finding.remedy is not None and finding.remedy.settings == ("fusion.method=centroid",)
@@ -260,3 +261,8 @@ def test_a_cloud_with_heights_is_not_flat(results: list[FrameResult]) -> None:
         for result in results:
             checks.observe(result)
     assert not checks.findings
+
+
+def _known(detections: Detections | None, _: Camera) -> Detections | None:
+    """Return detections that are known already."""
+    return detections

@@ -860,7 +860,7 @@ def reacting(path: Path, rows: NDArray[Any]) -> str:
     return save(path, nodes, arrays, {"output0": ([1, 300, 6], FLOAT)}, [image_input(1, 3, H, W)], NAMES)
 
 
-def test_scores_that_share_the_quantisation_of_boxes_are_refused(tmp_path: Path) -> None:
+def test_scores_quantised_like_boxes_are_refused(tmp_path: Path) -> None:
     step = 640 / 255  # pixels, and units of the score
     y, x = np.mgrid[0:20, 0:20] * 32 + 16
     boxes = np.stack([x, y, 0 * x + 32, 0 * x + 32]).reshape(4, 400)

@@ -435,7 +435,7 @@ def test_a_batch_is_evaluated_against_the_truth(
     assert ElementTree.parse(junit).getroot()[0].get("failures") == "1"
 
 
-def test_two_labels_of_one_cyclist_are_one_and_racks_need_not_be_found() -> None:
+def test_two_labels_of_one_cyclist_are_one() -> None:
     """View of Delft labels the rider in the box of the cyclist, and racks that no detector knows."""
     labels = ("Cyclist", "rider", "rider", "bicycle_rack")
     center = np.array([[10, 0, 0], [10.2, 0, 0.2], [15, 3, 0], [12, -4, 0]], np.float32)

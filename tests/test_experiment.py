@@ -37,7 +37,7 @@ def truth(frame: Frame) -> Truth:
     return truth_of(frame, frame.truth)
 
 
-def test_the_table_has_the_state_of_each_object_under_each_configuration() -> None:
+def test_the_table_has_each_object_and_configuration() -> None:
     frames, loader = drive()
     configurations = {"default": load(), "strict": load(settings=["detector.conf_threshold=0.9"])}
     table = Experiment(truth, Variants(loader)).table(frames, configurations, reasons=True)

@@ -49,9 +49,7 @@ def newly_missed(*settings: str) -> list[MissedObject]:
         ("fusion.max_depth=10", "fusion"),
     ],
 )
-def test_the_ideal_of_the_mistuned_stage_restores_an_object_and_no_other_stage_does(
-    setting: str, stage: str
-) -> None:
+def test_only_the_mistuned_stage_restores_an_object(setting: str, stage: str) -> None:
     missed = newly_missed(setting)
     assert len(missed) >= 2
     for one in missed:
@@ -67,7 +65,7 @@ def test_two_mistuned_stages_need_both_ideals() -> None:
     assert all(answer == ([], [("detection", "fusion")]) for answer in found)
 
 
-def test_all_ideal_stages_restore_an_object_unless_its_points_are_far_from_its_centre() -> None:
+def test_all_ideal_stages_restore_an_object_of_near_points() -> None:
     data, memo = drive(), Memo()
     labelled, config = data.frames[ASKED], ideal.configuration("reference", ())
     stages = data.loader.load(config)
@@ -98,7 +96,7 @@ def test_an_ideal_cluster_is_the_object_and_is_kept() -> None:
     assert np.array_equal(np.unique(made.labels[made.labels >= 0]), np.arange(len(made)))
 
 
-def test_alternatives_of_an_answer_are_read_from_words_and_lists() -> None:
+def test_alternatives_are_read_from_words_and_lists() -> None:
     assert ideal.alternatives(None) == []
     assert ideal.alternatives("fusion") == [["fusion"]]
     assert ideal.alternatives(["detector", "ground and clustering"]) == [
@@ -111,7 +109,7 @@ def test_alternatives_of_an_answer_are_read_from_words_and_lists() -> None:
     ]
 
 
-def test_a_planted_value_that_is_set_back_cures_an_object_and_its_neighbours() -> None:
+def test_a_planted_value_set_back_cures_an_object() -> None:
     data, memo = drive(), Memo()
     frame = ideal.FrameBenchmark(data, ASKED, "depth+nms", memo)
     cured = [miss for miss in frame.misses(3) if miss.cured]

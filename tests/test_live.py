@@ -508,9 +508,9 @@ def test_a_mark_outlives_its_frame(run: Run, frames: list[Frame], drive: Synthet
             UserMark("never", 9, 0),
         )
 
-        def marks(self, index: int) -> list[UserMark]:
+        def marks(self, index: int) -> tuple[UserMark, ...]:
             """As of a source that has left out the frames 1 to 3 in front of the fourth."""
-            found = [mark for mark in self.waiting if mark.index <= index and index >= 4]
+            found = tuple(mark for mark in self.waiting if mark.index <= index and index >= 4)
             self.waiting = [mark for mark in self.waiting if mark not in found]
             return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -137,7 +138,8 @@ def test_objects_missed_against_the_truth_are_listed(result: FrameResult) -> Non
     assert frame.truth is not None
     assert result.objects is not None
     truth = truth_of(frame, frame.truth)
-    missed = {find.selection.truth for find in find_findings(FrameExplainer(result)) if find.what == "missed"}
+    found = find_findings(FrameExplainer(result))
+    missed = {find.selection.truth for find in found if find.what == "missed" and find.selection is not None}
     assert missed
     for row, (label, must) in enumerate(zip(truth.labels, truth.must, strict=True)):
         near = [
@@ -175,14 +177,15 @@ def test_a_click_on_a_frame_with_other_values_is_about_these(bag: Path) -> None:
         opened, tried = bench.look(0), bench.look(0, settings)
         assert opened.objects and tried.clusters is not None and not tried.clusters.kept.any()
         aside, last = entities.SET_ASIDE.path(opened.frame.lidar), len(tried.clusters) - 1
-        clicks = [
+        clicks: list[tuple[Any, ...]] = [
             ((), entities.FUSED, 1, Selection(object=1)),
             (settings, entities.TRUTH, 2, Selection(truth=2)),
             (settings, aside, last, Selection(cluster=last)),
             (settings, entities.FUSED, 1, None),
         ]
         for _ in ("as drawn", "drawn again, because the rows of the frame were dropped"):
-            assert [bench.select(0, *click, ()) for *click, _ in clicks] == [one[-1] for one in clicks]
+            for settings_then, path, row, selection in clicks:
+                assert bench.select(0, settings_then, path, row, ()) == selection
             bench.recording._rows = RowCache()
         same = (f"clustering.eps={drive.config.clustering.eps}",)
         assert bench.look(0, same) is opened, "nothing is changed"

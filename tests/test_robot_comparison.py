@@ -588,7 +588,7 @@ def test_the_list_contains_doubtful_objects() -> None:
     found = find_findings(FrameExplainer(result, classes=KNOWN))
     [denied] = [find for find in found if find.what == "contradicted"]
     assert (denied.name, denied.selection) == ("car", Selection(object=1)) and abs(denied.distance - 12) < 0.1
-    lost = [find.selection for find in found if find.what == "lost"]
+    lost = [find.selection for find in found if find.what == "lost" and find.selection is not None]
     fused, missed = result.opinions.fused, result.opinions.missed
     questioner = FrameExplainer(result, classes=KNOWN)
     rows = [(int(fused.detection[row]), fused.camera[row]) for row in np.flatnonzero(missed)]

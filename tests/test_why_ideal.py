@@ -36,7 +36,7 @@ def explained(*settings: str) -> FrameExplainer:
         ("fusion.min_rating=0.97", "fusion"),
     ],
 )
-def test_the_stage_with_the_planted_value_brings_the_objects_back(planted: str, stage: str) -> None:
+def test_the_stage_of_a_planted_value_brings_objects_back(planted: str, stage: str) -> None:
     sound = explained()
     assert sound.traces.matches is not None
     found = set(np.flatnonzero(~sound.traces.matches.missed).tolist())
@@ -73,7 +73,7 @@ def test_ideal_results_leave_the_other_objects_alone() -> None:
     assert np.flatnonzero(new.missed != traces.matches.missed).tolist() == [row]
 
 
-def test_the_road_in_the_box_of_a_detection_is_no_loss_to_the_ground() -> None:
+def test_the_road_in_an_image_box_is_no_loss_to_the_ground() -> None:
     """Nine voxels of the road, and one of the feet: an image box that is wider than its person holds both."""
     asked = explained()
     subject = next(a.subject for a in asked.ask(Selection()) if a.subject.kind != "detection")
@@ -84,7 +84,7 @@ def test_the_road_in_the_box_of_a_detection_is_no_loss_to_the_ground() -> None:
     assert ground_lost(subject, lost) == 10
 
 
-def test_without_truth_a_hint_tells_the_stage_that_brings_an_object_back() -> None:
+def test_without_truth_a_hint_tells_the_stage() -> None:
     result = explained("fusion.min_rating=0.97").traces.result
     blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)), classes=CLASSES)
     lost = [a for a in blind.ask(Selection()) if a.subject.kind == "detection" and not a.verdict.reported]

@@ -183,6 +183,7 @@ def missed_line(bag: Path) -> tuple[str, tuple[float, float], str]:
         str(find.selection): [float(p) for p in box]
         for find in find_findings(FrameExplainer(result))
         if find.what == "missed"
+        and find.selection is not None
         and find.selection.truth is not None
         and (box := projected_box(single_box(boxes, find.selection.truth), camera)) is not None
     }
@@ -338,13 +339,14 @@ def test_keys_step_through_frames_and_findings(page: Page) -> None:
     first = current()
     page.keyboard.press("n")
     until(lambda: current() != first)
-    asked_second = until(lambda: verdict(page) and subject(page))
+    until(lambda: verdict(page) and subject(page))
+    asked_second = subject(page)
     page.keyboard.press("p")
     until(lambda: current() == first and verdict(page))
     page.go_back()
-    until(lambda: verdict(page) and subject(page).get("id") == asked_second.get("id"))
+    until(lambda: verdict(page) and subject(page)["id"] == asked_second["id"])
     page.go_forward()
-    until(lambda: verdict(page) and subject(page).get("id") != asked_second.get("id"))
+    until(lambda: verdict(page) and subject(page)["id"] != asked_second["id"])
     page.keyboard.press("?")
     until(page.locator("#help").is_visible)
     text = page.inner_text("#help")

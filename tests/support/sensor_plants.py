@@ -24,7 +24,7 @@ def pixels(result: FrameResult) -> U8:
 def noisy(bgr: U8, sigma: float, seed: int = 0) -> U8:
     """Add noise of ``sigma`` grey values."""
     noise = np.rint(np.random.default_rng(seed).normal(0, sigma, bgr.shape)).astype(np.int16)
-    return np.clip(bgr.astype(np.int16) + noise, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(bgr.astype(np.int16) + noise, 0, 255), np.uint8)
 
 
 def recompressed(bgr: U8, quality: int) -> U8:
@@ -52,9 +52,9 @@ def muddy(bgr: U8, seed: int) -> U8:
         place = int(random.uniform(0, width)), int(random.uniform(0.2 * height, height))
         size = int(random.uniform(0.03, 0.1) * width), int(random.uniform(0.03, 0.1) * width)
         cv2.ellipse(mud, place, size, float(random.uniform(0, 180)), 0, 360, 1.0, -1)
-    mud = 0.95 * np.asarray(cv2.GaussianBlur(mud, (0, 0), 0.008 * width))[..., None]
+    share = 0.95 * np.asarray(cv2.GaussianBlur(mud, (0, 0), 0.008 * width))[..., None]
     blots = 0.4 * cv2.GaussianBlur(bgr, (0, 0), 0.03 * width) + 0.6 * np.array([40, 60, 80])
-    return noisy((bgr * (1 - mud) + mud * blots).astype(np.uint8), 2)
+    return noisy((bgr * (1 - share) + share * blots).astype(np.uint8), 2)
 
 
 def without_image(result: FrameResult) -> FrameResult:
