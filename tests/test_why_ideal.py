@@ -9,11 +9,13 @@ import pytest
 
 from bevviz.config import load
 from bevviz.evaluate import judge
+from bevviz.model.reasons import ReasonKind
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.why import FrameExplainer, Selection
+from bevviz.why.changes import changes_for
 from bevviz.why.collect import collect_evidence
 from bevviz.why.ideal import IdealStages
 from bevviz.why.verdict import ground_lost
@@ -93,3 +95,12 @@ def test_without_truth_a_hint_tells_the_stage() -> None:
     assert cured
     assert all(answer.verdict.restored_by == () for answer in cured)
     assert ("fusion",) in [answer.restored_by[0] for answer in cured]
+
+
+def test_a_height_of_the_sensor_is_tried_against_a_roof() -> None:
+    """It is that of the lowest points, so that no ceiling or roof is the ground."""
+    asked = explained("ground.distance_threshold=2.5")
+    answer = next(a for a in asked.missed() if a.verdict.kind is ReasonKind.GROUND)
+    changes = list(changes_for(answer.evidence, answer.verdict.reason, asked.traces))
+    heights = [change["ground.sensor_height"] for change in changes if "ground.sensor_height" in change]
+    assert len(heights) == 1 and heights[0] == pytest.approx(1.8, abs=0.4)

@@ -19,6 +19,7 @@ from bevviz.why.subject import NOISE
 
 Change = Mapping[str, Any]  # dotted key -> value
 
+LOWEST = 2  # percent of the points of a scan that may be lower than the floor
 STEPS = (0.5, 2.0)  # factors of a number
 FAR_STEPS = (0.25, 4.0)
 _GRID: Mapping[str, tuple[str, ...]] = {  # numbers of each stage that are stepped, the most telling first
@@ -165,7 +166,10 @@ def changes_for(
     if not traces.origin("objects").ours:
         return
     config = result.config
-    for change in _our_changes(evidence, reason, config, is_false=is_false):
+    for change in (
+        *_our_changes(evidence, reason, config, is_false=is_false),
+        *_stated_height(reason, result),
+    ):
         if all(_has_effect(key, traces) for key in change):
             yield change
 
@@ -241,6 +245,18 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif best is not None:
         yield from _detection_changes(kind, best, config)
+
+
+def _stated_height(reason: Reason, result: FrameResult) -> Iterator[Change]:
+    """Yield the height of the sensor above the lowest points, where the ground was estimated.
+
+    It helps where a ceiling, a table or a roof was taken for the ground.
+    """
+    points = result.frame.points
+    if reason.kind is ReasonKind.GROUND and result.config.ground.sensor_height is None and len(points):
+        height = -round(float(np.percentile(points[:, 2], LOWEST)), 2)
+        if height > 0:
+            yield {"ground.sensor_height": height}
 
 
 def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:

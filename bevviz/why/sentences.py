@@ -186,8 +186,11 @@ def _ground(reason: Reason, subject: Subject) -> str:
     highest = reason["highest"]
     if not subject.is_place:
         removed = f"{reason['removed']} of its {reason['voxels']} voxels"
-        height = max(0.0, float(np.nan_to_num(highest)))
-        return f"it was taken for ground: {removed}, up to {height:.2f} m high {_by(reason)}"
+        height = float(np.nan_to_num(highest))
+        where = (
+            f"up to {height:.2f} m high" if height > -0.005 else f"{-height:.2f} m or more below that ground"
+        )
+        return f"it was taken for ground: {removed}, {where.replace('-0.00', '0.00')} {_by(reason)}"
     number, points = reason["ground_points"], reason["points"]
     all_of_it = number == points
     whole = "all ground" if all_of_it else f"{number} of them ground"

@@ -268,9 +268,7 @@ class RunningRobot(GrowingDrive):
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
         """Return the questions about the robot's chain in the held seconds, see ``GrowingDrive``."""
-        with self._lock:
-            frames = [result.frame for result in self._shown_results().values()]
-        if self.live.raw is None or len({one.topic for frame in frames for one in frame.robot_boxes}) < 2:
+        if self.live.raw is None or len(self.live.raw.object_topics) < 2:
             return None
         frame = self.look(number).frame
         end = frame.received + AFTER
