@@ -133,15 +133,15 @@ class HintFinder:
         tried: list[TriedChange] = []
         faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
         left = 0  # changes that are still tried after one that helps this frame alone
-        for change in self._changes(question, restored_by, likely):
+        for number, change in enumerate(self._changes(question, restored_by, likely)):
+            if number >= TRIES and self._stays_missed(question, change):
+                tried.append(TriedChange(_settings(change), MISSED))
+                continue
             after = self._runs.with_change(change)
             if after is None:
                 continue
             if is_false:
                 self._try_on_false(subject, change, after, hints, tried)
-            elif self._stays_missed(question, after):
-                tried.append(TriedChange(_settings(change), MISSED))
-                continue
             else:
                 self._try_on_missed(question, change, after, hints, tried, faulty)
             if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
@@ -224,12 +224,12 @@ class HintFinder:
         """Return whether the objects come from our fusion."""
         return self._traces.origin("objects").ours
 
-    def _stays_missed(self, question: _Question, after: FrameIndex) -> bool:
-        """Return whether a missed object of the ground truth is missed in another result, too."""
-        subject, matches = question.subject, after.matches
-        if subject.kind != "truth" or question.reported or matches is None:
+    def _stays_missed(self, question: _Question, change: Change) -> bool:
+        """Return whether a missed object of the ground truth is missed with a change, too."""
+        subject, matches = question.subject, self._traces.matches
+        if subject.kind != "truth" or matches is None or not matches.missed[subject.row]:
             return False
-        return not bool((matches.partner == subject.row).any()) and len(self._runs) > TRIES
+        return not self._runs.is_found(subject.row, change, ())
 
     def _try_on_missed(
         self,

@@ -22,7 +22,8 @@ from bevviz.why.changes import Change, with_changes
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.ideal import IdealStages, StageSet, ideal_config, restoring_stages
 
-RUNS = 80  # runs in the cache, for other subjects of the frame
+RUNS = 12  # whole results in the cache, for other subjects of the frame
+STAGE_RESULTS = 60  # results of single stages in the cache; one of a large cloud takes some megabytes
 
 
 class FrameRuns:
@@ -35,7 +36,7 @@ class FrameRuns:
 
     def __init__(self, traces: FrameIndex, loader: StageLoader) -> None:
         self._traces, self._result = traces, traces.result
-        self._loader, self._memo = loader, Memo()
+        self._loader, self._memo = loader, Memo(STAGE_RESULTS)
         self._runs: dict[tuple[tuple[str, Any], ...], FrameIndex | None] = {}
         self._found: dict[tuple[object, ...], frozenset[int]] = {}
 
@@ -54,9 +55,6 @@ class FrameRuns:
             while len(self._runs) > RUNS:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]
-
-    def __len__(self) -> int:
-        return len(self._runs)
 
     def is_found(self, row: int, change: Change, ideal: StageSet) -> bool:
         """Return whether a missed object is found with a change, if other stages have their ideal results."""
