@@ -133,7 +133,8 @@ def test_a_report_is_cut_from_the_held_seconds(robot: RunningRobot, drive: Drive
     session.equip(ReportMaker(session, robot.bag_of, tmp_path))
     number, stamp = FIRST + 2, drive.results[2].frame.stamp
     (answer, *_) = session.ask(number, (), Selection(object=0))
-    report = session.reports.begin(robot.number_at(stamp), (), 0.2, 0.2, "odd")
+    identity = session.identity(number, (), Selection(object=0), answer, None)
+    report = session.reports.begin(robot.number_at(stamp), (), 0.2, 0.2, "odd", identity)
     until(lambda: report.state != "running")
     assert report.state == "over", report.error
     page = next(path for path in report.files if path.suffix == ".html").read_text()

@@ -276,7 +276,7 @@ def map_ahead(
         name: name of the thread.
     """
     futures: deque[Future[R]] = deque()
-    item_error: Exception | None = None
+    item_error: BaseException | None = None
     source = iter(items)
     worker = ThreadPoolExecutor(1, name)
     try:
@@ -285,7 +285,7 @@ def map_ahead(
                 futures.append(worker.submit(work, next(source)))
             except StopIteration:
                 break
-            except Exception as error:
+            except (Exception, KeyboardInterrupt) as error:  # a stage may raise both
                 item_error = error
             if len(futures) > depth:
                 yield futures.popleft().result()
