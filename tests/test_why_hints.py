@@ -13,6 +13,7 @@ from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.hints import Hint, HintSearch, TriedChange
+from bevviz.why.neighbours import NeighbourRuns
 from tests.support.planted_faults import at, run
 
 CLASSES = ("car", "person", "cyclist")
@@ -140,3 +141,19 @@ def test_values_are_not_tried_twice() -> None:
     first = asked.ask(Selection(truth=answer.subject.row))[0]
     assert asked.with_hints(first).verdict.text == answer.verdict.text
     assert np.isfinite(answer.distance)
+
+
+def test_a_change_that_harms_the_frames_beside_is_no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each change that helps is run there, also those that come after the first one."""
+    config = load(None, ["detector.model=demo", "fusion.min_rating=0.9"])
+    result = Session(config).run(at("flat_car").frame)
+    asked = FrameExplainer(result, classes=CLASSES)
+    answer = asked.missed()[0]
+    assert asked.with_hints(answer).hints
+    monkeypatch.setattr(NeighbourRuns, "balance", lambda self, change: -1)
+    after = FrameExplainer(result, classes=CLASSES).with_hints(answer)
+    assert not after.hints
+    assert any("breaks more than it fixes in the frames before and after" in t.text for t in after.tried)
+    monkeypatch.setattr(NeighbourRuns, "balance", lambda self, change: 2)
+    hints = FrameExplainer(result, classes=CLASSES).with_hints(answer).hints
+    assert hints and all(hint.beside == 2 for hint in hints)

@@ -111,6 +111,7 @@ class HintFinder:
 
     def __init__(self, traces: FrameIndex, runs: FrameRuns, neighbours: NeighbourRuns) -> None:
         self._traces, self._runs, self._neighbours = traces, runs, neighbours
+        self._change_of: dict[tuple[str, ...], Change] = {}  # by settings, of the hints
 
     def search(
         self,
@@ -145,7 +146,7 @@ class HintFinder:
             else:
                 self._try_on_missed(question, change, after, hints, tried, faulty)
             if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
-                hints[-1] = replace(hints[-1], beside=self._neighbours.balance(change))
+                hints[-1] = self._with_beside(hints[-1])
                 if hints[-1].beside is None or hints[-1].beside > 0:
                     break
                 left = left or LATER
@@ -159,9 +160,17 @@ class HintFinder:
                 for change in tried
                 if faulty.get(change) not in hints
             ]
-        best = sorted(hints, key=lambda hint: (-(hint.beside or 0), -hint.balance))
+        likely_hints = sorted(hints, key=lambda hint: -hint.balance)
+        best = [*map(self._with_beside, likely_hints[: 2 * OFFERED]), *likely_hints[2 * OFFERED :]]
+        best.sort(key=lambda hint: (-(hint.beside or 0), -hint.balance))
         tried += [TriedChange(hint.settings, hint.objection) for hint in best if not hint.is_good]
         return HintSearch(tuple(hint for hint in best if hint.is_good)[:OFFERED], tuple(tried))
+
+    def _with_beside(self, hint: Hint) -> Hint:
+        """Return a good hint with its effect on the frames before and after."""
+        if hint.beside is not None or hint.balance <= 0:
+            return hint
+        return replace(hint, beside=self._neighbours.balance(self._change_of[hint.settings]))
 
     def _changes(
         self, question: _Question, restored_by: Sequence[StageSet], likely: Sequence[ReasonKind]
@@ -259,6 +268,7 @@ class HintFinder:
     def _hint(self, change: Change, text: str, after: FrameIndex, asked: int = -1, own: int = -1) -> Hint:
         """Return a hint with its effects on all objects of the frame, as ``evaluate`` counts them."""
         before = self._traces
+        self._change_of[_settings(change)] = change
         more = 0 if before.truth else len(false_reasons(after)) - len(false_reasons(before))
         objects, then_objects = before.result.objects, after.result.objects
         changed = effects(objects, then_objects, before.truth, asked, own, more)
