@@ -236,7 +236,9 @@ def test_every_kind_is_counted_and_told_by_info_and_bag(
     both = [str(drive), str(bad), "--set", LIDARS]
     assert main(["info", *both]) == 0
     out, err = capfd.readouterr()
-    assert not err
+    assert not [
+        line for line in err.splitlines() if "re_sdk::" not in line
+    ]  # the SDK may log for another test
     assert_told(" ".join(out.split()), how)
     assert main(["bag", *both, "--save", str(tmp_path / "out.rrd")]) == 0
     out, err = capfd.readouterr()
