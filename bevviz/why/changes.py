@@ -42,7 +42,6 @@ _GRID: Mapping[str, tuple[str, ...]] = {  # numbers of each stage that are stepp
     ),
 }
 _STAGE_OF = {"voxel": "clustering", "objects": "fusion"}  # section -> stage, where their names differ
-_SECTIONS = {"voxel", "ground", "clustering", "detector", "fusion"}
 _METHODS: Mapping[str, tuple[Change, ...]] = {  # other methods of each stage
     "ground": ({"ground.method": "polar", "ground.distance_threshold": 0.2}, {"ground.method": "plane"}),
     "fusion": ({"fusion.method": "frustum"}, {"fusion.split": True}, {"fusion.split": False}),
@@ -92,6 +91,10 @@ _OTHER_OWNER = {  # another subject has the detection or the cluster
     ReasonKind.MISNAMED,
 }
 
+_TUNED = {key for keys in _GRID.values() for key in keys} | {  # parameters that decide, unlike names of files
+    key for changes in _METHODS.values() for change in changes for key in change
+}
+
 
 def with_changes(config: Config, change: Change) -> Config:
     """Return the configuration with other values."""
@@ -114,9 +117,7 @@ def stages_of(settings: Iterable[str]) -> tuple[str, ...]:
 
 def restored_values(config: Config) -> Iterator[Change]:
     """Yield the preset's values of all parameters that have another value, together."""
-    restored = {
-        key: value for key, value in preset_differences(config).items() if key.partition(".")[0] in _SECTIONS
-    }
+    restored = {key: value for key, value in preset_differences(config).items() if key in _TUNED}
     if restored:
         yield restored
 
@@ -125,7 +126,7 @@ def stage_changes(stage: str, config: Config) -> Iterator[Change]:
     """Yield changes of one of our stages: the preset's values, other methods, and steps of its numbers."""
     present, differing = values(config), preset_differences(config)
     prefixes = ("clustering.", "voxel.") if stage == "clustering" else (f"{stage}.",)
-    restored = {key: value for key, value in differing.items() if key.startswith(prefixes)}
+    restored = {key: value for key, value in differing.items() if key in _TUNED and key.startswith(prefixes)}
     if restored:
         yield restored
     yield from ({key: value} for key, value in restored.items() if len(restored) > 1)

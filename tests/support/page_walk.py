@@ -105,7 +105,10 @@ class Oracle:
     def _explainer(self, number: int, values: Values) -> FrameExplainer:
         loader = self.drive.session.loader
         session = Session(changed_config(self.drive.config, values), loader=loader)
-        return FrameExplainer(session.run_single(self.frames[number]), loader, session.stages.class_names)
+        names, beside = session.stages.class_names, self.frames[max(number - 1, 0) : number + 2]
+        neighbours = [frame for frame in beside if frame is not self.frames[number]]
+        result = session.run_single(self.frames[number])
+        return FrameExplainer(result, loader, names, neighbours=lambda: neighbours)
 
     def answers(self, number: int, values: Values, wanted: Callable[[Subject], bool]) -> list[Answer]:
         """Return the answers about the wanted objects, clusters, detections and labels of a frame."""
