@@ -516,7 +516,6 @@ def _limited(outcome: Outcome) -> bool:
 def _load_and_run(case: Case) -> None:
     from bevviz.config import load
     from bevviz.pipeline.stage_loader import StageLoader
-    from bevviz.stages.user_stages import UserStage
 
     rng = np.random.default_rng(0)
     config = load(settings=list(case.settings))
@@ -526,9 +525,10 @@ def _load_and_run(case: Case) -> None:
         for size in ((H, W, 3), (120, 50, 3)):
             stages.detector(rng.integers(0, 255, size, np.uint8))
     else:
-        assert stages.objects is not None and not isinstance(stages.objects, UserStage)
-        for count in (500, 20):
-            stages.objects(rng.uniform((0, -8, -3), (24, 8, 1), (count, 3)).astype(np.float32))
+        assert stages.objects is not None
+        for number, count in enumerate((500, 20)):
+            points = rng.uniform((0, -8, -3, 0), (24, 8, 1, 1), (count, 4)).astype(np.float32)
+            stages.objects(points, stamp=0, number=number, sensor="top")
 
 
 def _command(case: Case) -> str:
