@@ -41,6 +41,25 @@ def test_a_run_names_the_sensor_and_its_fault(tmp_path: Path, capsys: pytest.Cap
     assert (finding.kind, finding.subject) == ("sensor", "camera camera: frozen image")
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "command",
+    [
+        "compare --set-b clustering.eps=0.7 --save OUT/compared.rrd",
+        "sweep --set clustering.eps=0.5,0.7",
+        "export --output OUT/exported",
+    ],
+)
+def test_tables_name_the_fault_of_a_sensor_once(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = frozen_after(2.0, tmp_path / "drive")
+    name, *words = command.replace("OUT", str(tmp_path)).split()
+    main([name, str(path), *words])
+    printed = capsys.readouterr().err
+    assert printed.count("bevviz: warning: camera camera: frozen image since 2.0 s") == 1, printed
+
+
 def test_a_finding_reads_as_one_sentence() -> None:
     assert str(InputFinding("clock", "/scan", "/scan is 0.5 s late")) == "/scan is 0.5 s late"
     remedy = Remedy("sync.offsets={/scan: -0.5}", tried="pairs 50 of 50 frames")

@@ -23,7 +23,7 @@ from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import apply as move
 from bevviz.model.geometry import corners, project
-from bevviz.model.results import Objects
+from bevviz.model.results import FrameResult, Objects
 from bevviz.sweep import Parameter, Sweep, combine, parse
 from bevviz.sweep.log import HEIGHT, WIDTH, axis_scale
 from tests.support import bags
@@ -309,7 +309,7 @@ def test_an_interrupted_sweep_tells_what_it_has(
 ) -> None:
     perceive = Sweep.perceive
 
-    def interrupted(self: Sweep, frame: Frame, network: Any = None) -> int:
+    def interrupted(self: Sweep, frame: Frame, network: Any = None) -> FrameResult:
         if self.outcomes["0.5",].frames:
             raise KeyboardInterrupt
         return perceive(self, frame, network)

@@ -112,18 +112,21 @@ def _run(
     configs: tuple[Config, Config],
     options: CompareOptions,
 ) -> int:
-    from bevviz.compare.sides import ComparisonRecorder, SideFailures
+    from bevviz.checks import InputChecks
+    from bevviz.compare.sides import ComparisonRecorder, FirstSide, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
 
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
+    checks = InputChecks(source, configs[0])
 
     def observers(recording: RecordingStream) -> list[Observer[ComparedFrame]]:
         print_hints(source.scene, config)
-        return [ComparisonRecorder(recording, *configs, summary), summary, failures]
+        return [ComparisonRecorder(recording, *configs, summary), summary, failures, FirstSide(checks)]
 
     def finish() -> None:
-        warn(failures.warnings)
+        printed = source.warnings
+        warn([*(text for text in checks.warnings if text not in printed), *failures.warnings])
         if summary.without:
             say(f"{summary.without} frames for which the robot published nothing are left out")
         print_result(output.json, "compare", summary.result(), summary.table)

@@ -109,6 +109,7 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
     The table is printed before a recording is served.
     """
     from bevviz.anomalies import FailureSummary
+    from bevviz.checks import InputChecks
     from bevviz.evaluate.log import EvaluationRecorder
     from bevviz.findings.marks import MarkRecorder
     from bevviz.findings.run_table import list_keeper
@@ -118,11 +119,14 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
     # The workbench takes stated labels for the frames' own. This run has them apart.
     truth = options.truth
     keeper = None if truth.truth or truth.kitti_labels else list_keeper(frames, session)
-    judges: list[Observer[FrameResult]] = [evaluation, failures, *([] if keeper is None else [keeper])]
+    checks = InputChecks(frames, config)
+    judges: list[Observer[FrameResult]] = [evaluation, failures, checks]
+    if keeper is not None:
+        judges.append(keeper)
     if not outputs:
         print_hints(frames.scene, config)
         end = run_with_progress(frames, session, judges)
-        warn([*frames.warnings, *failures.warnings])
+        warn([*checks.warnings, *failures.warnings])
         return table_status(end)
     from bevviz.recording.recorder import Recorder
 
@@ -133,7 +137,8 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
         return [recorder, *judges, EvaluationRecorder(recording, evaluation), marks]
 
     def finish() -> None:
-        warn(failures.warnings)
+        printed = frames.warnings
+        warn([*(text for text in checks.warnings if text not in printed), *failures.warnings])
         if options.output.json != STDOUT:
             print(evaluation.table(), flush=True)
 

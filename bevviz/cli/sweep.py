@@ -38,6 +38,7 @@ class SweepOptions:
     "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
 )
 def _sweep(options: SweepOptions) -> int:
+    from bevviz.checks import InputChecks
     from bevviz.config import flatten
     from bevviz.pipeline.session import common_frames
     from bevviz.sweep import Sweep, combine, parse
@@ -56,8 +57,9 @@ def _sweep(options: SweepOptions) -> int:
             opened = outputs.opened(source.scene, source.config, layout(sweep)) if outputs else nullcontext()
             sinks = stack.enter_context(opened)
             print_hints(source.scene, config)
-            end = run_with_progress(source, sweep, [])
-            warn(source.warnings)
+            checks = InputChecks(source, config)
+            end = run_with_progress(source, sweep, [checks])
+            warn(checks.warnings)
             print_result(outputs.json, "sweep", sweep.result(), sweep.table)
             if outputs.csv is not None:
                 sweep.write_csv(outputs.csv)

@@ -50,6 +50,18 @@ class ComparedFrame:
         return differences(a.frame.index, a.frame.stamp, seen(a), seen(b), judged)
 
 
+class FirstSide(Observer[ComparedFrame]):
+    """Observer that shows the results of A to observers of a single run."""
+
+    def __init__(self, *observers: Observer[FrameResult]) -> None:
+        self._observers = observers
+
+    def observe(self, result: ComparedFrame) -> None:
+        """Show A's result of a frame."""
+        for observer in self._observers:
+            observer.observe(result.a)
+
+
 class SideFailures(Observer[ComparedFrame]):
     """Observer that collects the stages that failed on either side."""
 

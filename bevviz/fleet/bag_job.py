@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from bevviz.checks import InputChecks
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
@@ -115,10 +116,11 @@ def _fill(
             keeper = None if job.truth else list_keeper(source, session, job.config)
             marks = MarkRecorder(sinks.recording)
             collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, marks, keeper)
-            watchers = [*observers, collector, DiskWatch(sinks)]
+            checks = InputChecks(source, job.config)
+            watchers = [*observers, checks, collector, DiskWatch(sinks)]
             if run_frames(source, session, watchers).interrupted:
                 raise KeyboardInterrupt
-        warnings = tuple(source.warnings)
+        warnings = tuple(checks.warnings)
         if not rows:
             raise UserError("; ".join([f"{job.bag.name}: no frame in it", *warnings]))
         return RunInfo(

@@ -22,6 +22,7 @@ from bevviz.evaluate.f1_change import f1_change
 from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
+from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
@@ -237,15 +238,18 @@ class Sweep:
         for config in configs.values():
             self._experiment.variants.check(config)
 
-    def perceive(self, frame: Frame, network: Executor | None = None) -> int:
-        """Run every combination on the frame. Return the index of the frame."""
+    def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
+        """Run every combination on the frame. Return the result of the first one."""
+        results = []
         for values, config in self.configs.items():
-            self.outcomes[values].add(self._experiment.outcome(frame, config, network=network))
-        return frame.index
+            outcome = self._experiment.outcome(frame, config, network=network)
+            self.outcomes[values].add(outcome)
+            results.append(outcome.result)
+        return results[0]
 
-    def finish(self, index: int) -> int:
-        """Return the index unchanged; ``perceive`` did all the work."""
-        return index
+    def finish(self, result: FrameResult) -> FrameResult:
+        """Finish the result of the first combination in frame order."""
+        return self._experiment.variants.session(next(iter(self.configs.values()))).finish(result)
 
     @property
     def best(self) -> Values | None:

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from bevviz.anomalies import FailureSummary
+from bevviz.checks import InputChecks
 from bevviz.config import (
     TUTORIAL_NAMES,
     Config,
@@ -90,16 +91,18 @@ class AskedDrive:
 
 
 class RunFindings(Observer[FrameResult]):
-    """Findings, anomalies and failures of a run."""
+    """Findings, failures and warnings of a run."""
 
     def __init__(self, asked: AskedDrive) -> None:
         self._asked = asked
         self.list, self.failures, self.frames = FindingList(), FailureSummary(), 0
+        self.checks = InputChecks(asked.drive.frames, asked.drive.config)
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
         self.list.add(find_findings(self._asked.session.source.explainer(result)))
         self.failures.observe(result)
+        self.checks.observe(result)
         self.frames += 1
 
 

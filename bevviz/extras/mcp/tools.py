@@ -127,7 +127,7 @@ class AgentTools:
                 "frames": found.frames,
                 "frames_by_cause": dict(causes.most_common()),
                 "failures": found.failures.warnings,
-                "warnings": list(asked.source.warnings),
+                "warnings": found.checks.warnings,
                 "findings": shown[:limit],
                 "not_shown": max(0, len(shown) - limit),
             }
