@@ -34,6 +34,7 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import Dependency, Provenance
 from bevviz.report.check import CheckResult
 from bevviz.report.fingerprints import StageDigest, compare, detections_of, pack, unpack
+from bevviz.report.make import ReportRequest, make
 from bevviz.report.page import spans
 from bevviz.report.pictures import marked_pictures, ticks
 from bevviz.report.report_subject import cause_of, explain_subject
@@ -524,3 +525,18 @@ def test_weights_beside_the_model_are_in_the_report(tmp_path: Path, small: Path)
     weights.unlink()
     model.unlink()
     assert main(["report", "--check", "bug.rrd"]) == 0
+
+
+def test_a_report_tells_scans_of_equal_log_time_apart(tmp_path: Path) -> None:
+    """The page hands over the result that its user saw."""
+    clouds = [item for item in bags.small_items(scans=4) if item.topic == bags.CLOUD]
+    bag = bags.write(tmp_path / "drive", [item._replace(received=bags.START) for item in clouds])
+    out = tmp_path / "bug.rrd"
+    with bevviz.open(bag) as drive:
+        seen = list(drive)[2]
+        request = ReportRequest(
+            paths=[bag], config=drive.config, at="0", output=out, note="lost here", result=seen
+        )
+    assert make(request).frames == 4
+    log = Recording(out).at["/explain/log"]["TextLog:text"]
+    assert [frame for frame, text in log.items() if "note: lost here" in str(text)] == [2]

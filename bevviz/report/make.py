@@ -205,9 +205,14 @@ def make(
         )
         recording = sinks.recording
         written.files.insert(0, rrd)
-        summary = WindowSummary(window.at, source.total, len(whole_bag.scene.cameras))
+        summary = WindowSummary(
+            window.at,
+            None if request.result is None else request.result.frame.stamp,
+            source.total,
+            len(whole_bag.scene.cameras),
+        )
         recorder = _ReportRecorder(
-            recording, public, summary, window.at, request.note, notes, answers, session.stages.provider
+            recording, public, summary, request.note, notes, answers, session.stages.provider
         )
         watchers = [recorder, DiskWatch(sinks), Progress("run"), *observers]
         outcome = run(source, session, watchers, stop=stop)
@@ -298,21 +303,20 @@ class _ReportRecorder(Recorder):
         recording: rr.RecordingStream,
         config: Config,
         summary: WindowSummary,
-        at: int,
         note: str,
         notes: Sequence[Note],
         answers: Sequence[Answer],
         network: str,
     ) -> None:
         super().__init__(recording, config, network)
-        self._summary, self._at, self._note, self._notes = summary, at, note, notes
+        self._summary, self._note, self._notes = summary, note, notes
         self._answers = answers
 
     def observe(self, result: FrameResult) -> None:
         frame = result.frame
         lines = [f"note: {note}" for note in self._notes if note.received == frame.received]
         states: dict[str, str] = {}
-        is_reported = frame.received == self._at
+        is_reported = self._summary.is_about(frame)
         if is_reported:
             lines += [answer.text for answer in self._answers[:1]]
             if self._note:
@@ -330,7 +334,7 @@ class _ReportRecorder(Recorder):
             else:
                 clear_answers(self.logger)
 
-        self.logger.sequences = {entities.REPORTED: frame.index} if frame.received <= self._at else {}
+        self.logger.sequences = {entities.REPORTED: frame.index} if frame.received <= self._summary.at else {}
         self.logger.log(result, notes=[("INFO", line) for line in lines], states=states, log_more=mark)
         lines, block = pack(digest(result))
         self.recording.log(entities.DIGEST, rr.AnyValues(stages=lines, arrays=block))

@@ -35,16 +35,18 @@ class WindowSummary:
 
     Args:
         at: receive time, in nanoseconds, of the scan that the report is about.
+        stamp: stamp of that scan, which tells it from others of the same receive time. None: it is unknown.
         total: expected number of frames.
         cameras: number of cameras.
     """
 
     at: int
+    stamp: int | None
     total: int
     cameras: int
     frames: list[FrameSummary] = field(default_factory=list)
     strip: list[tuple[FrameSummary, dict[str, bytes]]] = field(default_factory=list)  # JPEGs by sensor
-    result: FrameResult | None = None  # scan nearest to ``at``
+    result: FrameResult | None = None  # of the scan, or of the nearest one to it
     tracebacks: Counter[tuple[str, str]] = field(default_factory=Counter)  # by stage and traceback
     _last: Frame | None = None
     _rates: FrameRates = field(default_factory=FrameRates)
@@ -88,11 +90,19 @@ class WindowSummary:
         )
         if self._is_for_strip(len(self.frames)):
             self.strip.append((summary, strip_pictures(result)))
-        if self.result is None or abs(frame.received - self.at) < abs(self.result.frame.received - self.at):
+        if self.result is None or self._distance(frame) < self._distance(self.result.frame):
             self.result = result
         self.frames.append(summary)
         self._last = frame
         return summary
+
+    def is_about(self, frame: Frame) -> bool:
+        """Return whether the report is about this frame."""
+        return self._distance(frame) == (0, False)
+
+    def _distance(self, frame: Frame) -> tuple[int, bool]:
+        """Return the nanoseconds to the scan that the report is about, and whether it is another scan."""
+        return abs(frame.received - self.at), self.stamp not in (None, frame.stamp)
 
     def _is_for_strip(self, number: int) -> bool:
         """Return whether the strip shows a frame. Its frames are spread evenly over the window."""
