@@ -155,7 +155,7 @@ def test_a_late_publisher_may_restart_with_other_qos() -> None:
             live = frames(source)
             first = next(live)
         until(lambda: f"{LIDAR_TOPIC} has no publisher" in "".join(said), "the publisher's end is told")
-        assert any(text.startswith("/tf_static has no publisher") for text in source.warnings)
+        assert any(text.startswith("/tf_static has no publisher") for text in source.problems.sentences)
         with playing(replace(PLAY, best_effort=True, focal=1.25)):
             until(lambda: any("calibration" in text for text in said), "the new calibration is told")
             told = time.time_ns()  # what nobody took before is still handed out
@@ -176,7 +176,7 @@ def test_incompatible_publisher_is_told(robot: str) -> None:
     ):
         frame = next(frames(source))
         told = "/tf_static: /volatile is not heard, its quality of service does not fit (Volatile publisher"
-        until(lambda: any(text.startswith(told) for text in source.warnings), "the mismatch")
+        until(lambda: any(text.startswith(told) for text in source.problems.sentences), "the mismatch")
         assert any(text.startswith(told) for text in said)
         assert frame.cameras[0].camera_from_points is not None
 

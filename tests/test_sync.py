@@ -853,7 +853,7 @@ def test_the_baseline_of_a_stereo_pair_is_used() -> None:
         matrix = made.cameras[1].camera_from_points
         assert matrix is not None
         places[frame] = matrix
-        assert any("'right_optical' is taken as its own" in t for t in feed.sync.report.doubts()) == (
+        assert any("'right_optical' is taken as its own" in str(t) for t in feed.sync.report.doubts()) == (
             frame == "right_optical"
         )
     np.testing.assert_allclose(places["optical"], places["right_optical"], atol=1e-9)

@@ -285,6 +285,22 @@ def test_a_page_says_that_no_frame_comes(
     assert bench.progress()["error"] == ""
 
 
+def test_a_page_lists_the_current_problems(bench: RunningRobot) -> None:
+    problems = bench.live.problems
+    problems.set("silent", "/camera", "no message on /camera for 1.5 s", "/camera is back")
+    problems.set("clock", "/lidar", "its clock is ahead", remedy="--set sync.by=received")
+    texts = [(row["text"], row["seconds"]) for row in bench.progress()["problems"]]
+    assert texts == [
+        ("no message on /camera for 1.5 s", 0),
+        ("its clock is ahead: --set sync.by=received", 0),
+    ]
+    problems.set("silent", "/camera", "")
+    assert [row["text"] for row in bench.progress()["problems"]] == [texts[1][0]]
+    (silent, clock) = bench.live.summary[:2]
+    assert re.fullmatch(r"no message on /camera .* \(\d\d:\d\d:\d\d to \d\d:\d\d:\d\d\)", silent)
+    assert re.fullmatch(r"its clock is ahead.* \(since \d\d:\d\d:\d\d\)", clock)
+
+
 def test_a_held_frame_can_be_asked_with_other_values(bench: RunningRobot, results: list[FrameResult]) -> None:
     for result in results[:2]:
         bench.observe(result)

@@ -173,7 +173,7 @@ class BagSource(Closable):
             return []
         report = self._state.sync.report
         robots = [self.roles.robots] if self.roles.robots else []
-        return [*robots, *self._damage, *report.losses(), *report.doubts()]
+        return [*robots, *self._damage, *map(str, [*report.losses(), *report.doubts()])]
 
     @property
     def span(self) -> tuple[int, int]:

@@ -324,7 +324,7 @@ def _watch(
         if comparison.late_images:
             late = f"{comparison.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")
-    warn(live.checks.warnings)
+    warn(live.summary)
     written_paths = [
         saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths
     ]

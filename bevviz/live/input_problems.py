@@ -297,6 +297,7 @@ class InputProblems:
                 self._counts[kind, name] = count, now
             holds = count >= least and now - rose < within
             self._problems.set(kind, name, sentence(name) if holds else "", over(name))
+            self._problems.count(kind, name, count)
 
 
 def merged_robots(topics: Mapping[str, PublishedTopic], frame_ids: Mapping[str, str]) -> str:

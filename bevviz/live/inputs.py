@@ -101,8 +101,10 @@ class TopicWatch:
         """Record a message that cannot be used. The reason names the topic."""
         arrivals = self._topics[topic]
         arrivals.row += 1
-        if self.damage.add(topic, reason) == 1 or arrivals.row == AGAIN:
+        count = self.damage.add(topic, reason)
+        if count == 1 or arrivals.row == AGAIN:
             self._problems.set("unusable", topic, f"a message cannot be used: {reason}")
+        self._problems.count("unusable", topic, count)
 
     def silent_for(self, topic: str, least: float = SILENCE) -> float:
         """Return the seconds since the last message of a stream, or 0 if that is a usual time.

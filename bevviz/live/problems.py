@@ -1,4 +1,4 @@
-"""The one list of what is wrong now in a live run. Terminal, /diagnostics, lanes and page are its views."""
+"""The one list of what is wrong in a live run. Terminal, /diagnostics, lanes, page and exit are its views."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 
 from bevviz.model.input_findings import InputFinding, Remedy
 
@@ -25,8 +26,30 @@ class Problem:
         return str(self.finding)
 
 
+@dataclass(slots=True)
+class PastProblem:
+    """Times at which a problem held. It may hold still."""
+
+    finding: InputFinding  # as it was last
+    begin: float  # of the first time, seconds since 1970
+    times: int = 0
+    seconds: float = 0.0  # of the times that are over
+    end: float | None = None  # of the last time, seconds since 1970; None: it holds
+    cases: int = 0  # messages or frames, where they are counted
+
+    def __str__(self) -> str:
+        """Return one sentence with begin and end."""
+        begin = _clock(self.begin)
+        span = f"since {begin}" if self.end is None else f"{begin} to {_clock(self.end)}"
+        if self.times > 1:
+            span = f"{span}, {self.times} times, {self.seconds:.0f} s"
+        if self.cases:
+            span = f"{span}, {self.cases:,} case{'s' if self.cases != 1 else ''}"
+        return f"{self.finding} ({span})"
+
+
 class CurrentProblems:
-    """List of the current problems. The user is told when one begins, changes or ends. Any thread may use it.
+    """List of the problems. The user is told when one begins, changes or ends. Any thread may use it.
 
     Args:
         tell: called with one sentence.
@@ -36,6 +59,7 @@ class CurrentProblems:
         self.tell = tell
         self._lock = threading.Lock()
         self._problems: dict[tuple[str, str], Problem] = {}
+        self._past: dict[tuple[str, str], PastProblem] = {}
         self._events: set[str] = set()
 
     def set(
@@ -62,17 +86,31 @@ class CurrentProblems:
         """
         remedy = Remedy(remedy) if isinstance(remedy, str) else remedy
         finding = InputFinding(kind, subject, text, remedy)
+        key, now = (kind, subject), time.time()
         with self._lock:
-            before = self._problems.pop((kind, subject), None)
+            before = self._problems.pop(key, None)
             if text:
-                since = time.time() if before is None else before.since
+                since = now if before is None else before.since
                 over = over or f"{subject}: over: {text}"
-                self._problems[kind, subject] = Problem(finding, since, over)
+                self._problems[key] = Problem(finding, since, over)
+                past = self._past.setdefault(key, PastProblem(finding, now))
+                past.finding, past.end = finding, None
+                past.times += before is None
+            elif before is not None:
+                past = self._past[key]
+                past.end = now
+                past.seconds += now - before.since
         if not text:
             if before is not None:
                 self.tell(over or before.over)
         elif before is None or not (quiet or _without_values(str(finding)) == _without_values(str(before))):
             self.tell(str(finding))
+
+    def count(self, kind: str, subject: str, cases: int) -> None:
+        """Set the number of cases of a problem, if it has ever held."""
+        with self._lock:
+            if (past := self._past.get((kind, subject))) is not None:
+                past.cases = cases
 
     def tell_once(self, text: str) -> None:
         """Tell about an event the first time, and never again. It is no lasting problem."""
@@ -96,6 +134,16 @@ class CurrentProblems:
     def of(self, subject: str) -> list[Problem]:
         """Return the current problems of a topic, sensor, viewer or stage."""
         return [problem for problem in self.current if problem.finding.subject == subject]
+
+    @property
+    def past(self) -> dict[tuple[str, str], PastProblem]:
+        """All problems of the run by kind and subject, also those that hold, in order of their begin."""
+        with self._lock:
+            return {key: replace(past) for key, past in self._past.items()}
+
+
+def _clock(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds).strftime("%H:%M:%S")
 
 
 def _without_values(text: str) -> str:

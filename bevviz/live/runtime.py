@@ -188,6 +188,13 @@ class Live:
         return f"no frame comes: {', '.join(silent) or 'every topic is late'}"
 
     @property
+    def summary(self) -> list[str]:
+        """Sentences for the end: each problem with begin and end, and what only the whole run tells."""
+        past = self.problems.past
+        findings = [f for f in self.checks.findings if (f.kind, f.subject) not in past]
+        return [*map(str, past.values()), *map(str, findings)]
+
+    @property
     def scene(self) -> Scene:
         """Names of the sensors."""
         return self._source.scene

@@ -34,7 +34,6 @@ TICK = 0.05  # seconds between two checks for clouds that have waited long enoug
 SETTLE = 1.0  # seconds without a change of roles after which the scene is complete
 PATIENCE = 3.0  # seconds that missing topics may delay the scene
 CHANGING = "the topics are still changing"
-COUNTED = frozenset({"clock", "lost", "order", "stamp", "image", "transform", "unusable"})  # see ``warnings``
 
 
 class LiveSource(Closable):
@@ -175,15 +174,10 @@ class LiveSource(Closable):
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Sentences about current problems, and what was counted since the start."""
+        """Sentences about what was counted since the start and is no problem of ``problems``."""
         with self._lock:
-            lost = [
-                f"{count} message(s) of {topic} were lost on the way, see docs/live.md"
-                for topic, count in self.lost.items()
-            ]
-            current = [str(p) for p in self.problems.current if p.finding.kind not in COUNTED]
-            report = self._inputs.sync.report
-            return [*current, *self._watch.damage.sentences, *lost, *report.warnings()]
+            findings, past = list(self._inputs.sync.report.findings()), self.problems.past
+        return [str(finding) for finding in findings if (finding.kind, finding.subject) not in past]
 
     @property
     def received(self) -> Counter[str]:

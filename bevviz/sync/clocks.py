@@ -20,7 +20,7 @@ from bevviz.model.frame import F64
 
 APART = 0.6  # seconds; a larger difference between the lags of two topics is hardly a usual delay
 ENOUGH, LAST = 3, 50  # least and most messages of a topic for its lag
-LIVE = 15  # the most beside a robot, so that a clock that jumps is told within two seconds
+LIVE = 9  # the most beside a robot: at 5 Hz half of them come in a second, and two looks take another
 TRIED = 500  # most messages of a topic on which a remedy is tried
 TAI = 37.0  # seconds that TAI is ahead of UTC since 2017
 BY_RECEIPT = "--set sync.by=received goes by the time of receipt"

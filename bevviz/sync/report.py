@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -12,6 +12,7 @@ from bevviz.config import Config, SyncConfig
 from bevviz.config.plugins import TOPIC
 from bevviz.messages.roles import Roles
 from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.input_findings import InputFinding
 from bevviz.sync.clocks import BY_RECEIPT, Clocks
 from bevviz.sync.transform_tree import TransformBuffer
 
@@ -144,68 +145,78 @@ class SyncReport:
         """Return whether the dropped messages would be frames by their time of receipt."""
         return self.stale > LARGE_LOSS * self.queued and self.clocks.differ_from_receipt(self.driver)
 
-    def doubts(self) -> tuple[str, ...]:
-        """Return a sentence for each fault that may affect every frame, as of clocks and units."""
-        clocks = self.clocks.doubts(self.clocked)
-        return (*clocks, *self.tf.conflicts, *self.oddities.values(), *self.upright.values())
+    def doubts(self) -> Iterator[InputFinding]:
+        """Yield a finding for each fault that may affect every frame, as of clocks and units."""
+        for text in self.clocks.doubts(self.clocked):
+            yield InputFinding("clock", text.partition(": ")[0], text)
+        for text in (*self.tf.conflicts, *self.oddities.values(), *self.upright.values()):
+            yield InputFinding("oddity", text, text)
 
-    def losses(self) -> list[str]:
-        """Return a sentence for each camera and topic with content that could not be used."""
-        images = [
-            f"camera '{camera}': an image could not be decoded {_times(n)}, the first: "
-            f"{self.first_undecodable[camera]}"
-            for camera, n in self.undecodable.items()
-        ]
-        return [*images, *self.damage.sentences, *self.boxes.sentences]
+    def losses(self) -> Iterator[InputFinding]:
+        """Yield a finding for each camera and topic with content that could not be used."""
+        for camera, n in self.undecodable.items():
+            first = self.first_undecodable[camera]
+            text = f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}"
+            yield InputFinding("image", camera, text)
+        for text in (*self.damage.sentences, *self.boxes.sentences):
+            yield InputFinding("unusable", text, text)
 
-    def warnings(self) -> tuple[str, ...]:
-        """Return all sentences."""
-        remedy = f"; {BY_RECEIPT}" if self.receipt_helps() else ""
-        counted = [
-            (self.reordered, "{} came out of order and {} put back in order"),
-            (self.late, "{} came after a newer one had gone on and {} dropped" + remedy),
-            (self.duplicates, "{} had the stamp of another one and {} dropped" + remedy),
-            (self.unwaited, "{} went on early because sync.queue was full"),
-        ]
-        sentences = [
-            text.format(f"1 {self.noun}" if n == 1 else f"{n} {self.noun}s", "was" if n == 1 else "were")
-            for n, text in counted
-            if n
-        ]
-        if self.resets:
-            sentences.append(f"the stamps of the {self.noun}s jumped back {_times(self.resets)}")
-        if self.gaps:
-            gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
-            sentences.append(
-                f"the stamps of the {self.noun}s have {gaps}, the longest {self.longest_gap:.2f} s"
-            )
-        if self.idle:
-            setting = "source.lidar_topics" if self.noun == "cloud" else "source.camera_topics"
-            sentences.append(
-                f"no {self.noun} on {self.idle}, which should drive: set {setting}, the driving one first"
-            )
-        for topic, n in self.unstamped.items():
-            sentences.append(f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead")
-        for topic, n in (+self.repeated).items():
-            sentences.append(
-                f"{topic}: {n} of its messages had the stamp of another one, whose place they took"
-            )
-        for topic, n in self.overtaken.items():
-            sentences.append(
-                f"{topic}: {n} result{'' if n == 1 else 's'} came when the frame of that time had gone on, "
-                f"{_describe_delay(self.slowest[topic])}: shown at that stamp"
-            )
-        for camera, n in self.without_image.items():
-            sentences.append(f"{n} of {self.frames} frames have no image of camera '{camera}'")
-        sentences += self.losses()
+    def findings(self) -> Iterator[InputFinding]:
+        """Yield everything that is worth a line at the end of a run."""
+        yield from self.doubts()
+        for kind, subject, text in self._counted():
+            yield InputFinding(kind, subject, text)
+        yield from self.losses()
         for (topic, codec), n in self.untold.items():
             gaps = "1 gap" if n == 1 else f"{n} gaps"
-            sentences.append(
+            text = (
                 f"{topic}: {gaps} between the stamps of its {codec.upper()} video, whose packets do not tell "
                 "whether one is lost: pictures from a lost one to the next key frame are wrong"
             )
-        sentences += [f"{text} ({n} of {self.frames} frames)" for text, n in self.problems.items()]
-        return (*self.doubts(), *sentences, *self.tf.problems)
+            yield InputFinding("video", topic, text)
+        for problem, n in self.problems.items():
+            yield InputFinding("transform", problem, f"{problem} ({n} of {self.frames} frames)")
+        for text in self.tf.problems:
+            yield InputFinding("oddity", text, text)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return all findings as sentences."""
+        return tuple(map(str, self.findings()))
+
+    def _counted(self) -> Iterator[tuple[str, str, str]]:
+        """Yield kind, subject and sentence of what was counted in stamps and frames."""
+        driver, remedy = self.driver, f"; {BY_RECEIPT}" if self.receipt_helps() else ""
+        for n, kind, text in (
+            (self.reordered, "count", "{} came out of order and {} put back in order"),
+            (self.late, "order", "{} came after a newer one had gone on and {} dropped" + remedy),
+            (self.duplicates, "order", "{} had the stamp of another one and {} dropped" + remedy),
+            (self.unwaited, "count", "{} went on early because sync.queue was full"),
+        ):
+            if n:
+                clouds = f"1 {self.noun}" if n == 1 else f"{n} {self.noun}s"
+                yield kind, driver, text.format(clouds, "was" if n == 1 else "were")
+        if self.resets:
+            yield "count", driver, f"the stamps of the {self.noun}s jumped back {_times(self.resets)}"
+        if self.gaps:
+            gaps = "1 gap" if self.gaps == 1 else f"{self.gaps} gaps"
+            longest = f"the longest {self.longest_gap:.2f} s"
+            yield "count", driver, f"the stamps of the {self.noun}s have {gaps}, {longest}"
+        if self.idle:
+            setting = "source.lidar_topics" if self.noun == "cloud" else "source.camera_topics"
+            why = f"no {self.noun} on {self.idle}, which should drive"
+            yield "driver", self.idle, f"{why}: set {setting}, the driving one first"
+        for topic, n in self.unstamped.items():
+            text = f"{topic}: no stamp in the header {_times(n)}, time of receipt used instead"
+            yield "stamp", topic, text
+        for topic, n in (+self.repeated).items():
+            text = f"{topic}: {n} of its messages had the stamp of another one, whose place they took"
+            yield "count", topic, text
+        for topic, n in self.overtaken.items():
+            results = f"{n} result{'' if n == 1 else 's'} came when the frame of that time had gone on"
+            text = f"{topic}: {results}, {_describe_delay(self.slowest[topic])}: shown at that stamp"
+            yield "count", topic, text
+        for camera, n in self.without_image.items():
+            yield "count", camera, f"{n} of {self.frames} frames have no image of camera '{camera}'"
 
 
 def _describe_delay(seconds: float) -> str:

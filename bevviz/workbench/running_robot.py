@@ -107,6 +107,10 @@ class RunningRobot(GrowingDrive):
             "over": True,
             "error": self.live.silence,
             "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
+            "problems": [
+                {"text": str(problem), "seconds": max(0, round(time.time() - problem.since))}
+                for problem in self.live.problems.current
+            ],
             # Frames that are kept from before the held seconds, and the first frame of these.
             "held": [str(stamp) for stamp, _ in self.frame_times() if stamp <= self._start],
         }

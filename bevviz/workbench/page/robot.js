@@ -22,7 +22,8 @@ function say(text, wrong) {
 // The slider has one step for each frame of the held seconds, which go on. While it is held, they stay.
 let sliding = null; // times of the frames when the slider was taken
 const ago = (times, row) => `${((times.at(-1) - times[row]) / 1e9).toFixed(1)} s ago`;
-export function progress({ held }) {
+export function progress({ held, problems }) {
+  showProblems(problems);
   if (held.length) dropFrames(held);
   const times = frameTimes();
   $("past").disabled = times.length < 2;
@@ -48,6 +49,16 @@ $("past").onchange = () => {
   say("Holding the frame ...");
   send({ type: "hold", time: wanted });
 };
+
+// What is wrong with the robot's data now, and for how long.
+function showProblems(problems) {
+  $("problems").hidden = !problems.length;
+  $("problems").replaceChildren(...problems.map(({ text, seconds }) => {
+    const row = document.createElement("li");
+    row.textContent = `${text} (for ${seconds} s)`;
+    return row;
+  }));
+}
 
 function mark() {
   if (time !== null) send({ type: "mark", time, text: $("mark-text").value });

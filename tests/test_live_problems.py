@@ -1,0 +1,184 @@
+"""Each known problem of a robot's data is told within two seconds of its begin and of its end.
+
+The messages are handed over inside this process, and the test turns the clock.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevviz.messages.encode import encode_camera_info, encode_cloud, encode_image, encode_transforms
+from bevviz.model.frame import Cloud, Image, Intrinsics
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
+
+from tests.support.fed_graph import FedGraph, Session, fed_graph, joined
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+IMAGE = "sensor_msgs/msg/Image"
+TF = "tf2_msgs/msg/TFMessage"
+INFO = "sensor_msgs/msg/CameraInfo"
+TOPICS = {"/a": CLOUD, "/b": CLOUD, "/camera/image": IMAGE, "/camera/camera_info": INFO, "/tf": TF}
+FRAMES = [("map", "base_link"), *(("base_link", sensor) for sensor in ("a", "b", "camera"))]
+K = np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]])
+SOON = 2.0  # seconds
+STEP = 0.1  # seconds between two clouds
+
+
+def make_cloud(frame: str, stamp: int, points: int | None = None) -> Any:
+    """Return the message of a flat square, or of its first points."""
+    square = np.mgrid[-15:15:1, -15:15:1, -1.8:-1.7:1].reshape(3, -1).T.astype(np.float32)
+    return encode_cloud(Cloud(stamp, frame, square[:points]))
+
+
+@dataclass
+class Robot:
+    """LiDARs /a and /b, a camera and transforms. A fault is a change of one of the fields."""
+
+    graph: FedGraph
+    silent: frozenset[str] = frozenset()
+    ahead: float = 0.0  # seconds, stamps of /a
+    blind: bool = False  # /a
+    unreadable: str = ""  # topic whose messages have no content
+    publishers: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for topic, kind in TOPICS.items():
+            self.publishers[topic] = self.graph.advertise(topic, kind)
+
+    def play(self, seconds: float = STEP, stamp: int | None = None) -> None:
+        """Publish each topic once in ``STEP``. ``stamp``: of all messages, nanoseconds."""
+        for i in range(round(seconds / STEP)):
+            now = self.graph.time_ns() if stamp is None else stamp + round(i * STEP * 1e9)
+            edges = [(parent, child, np.eye(4)) for parent, child in FRAMES]
+            self._publish("/tf", bytes_of(TF, encode_transforms(now, edges)))
+            image = Image(now, "camera", np.zeros((4, 4, 3), np.uint8))
+            self._publish("/camera/image", encode_image(image))
+            self._publish("/camera/camera_info", encode_camera_info(image, Intrinsics(4, 4, K)))
+            ahead = round(self.ahead * 1e9)
+            self._publish("/a", make_cloud("a", now + ahead, 0 if self.blind else None))
+            self._publish("/b", make_cloud("b", now))
+            self.graph.advance(STEP)
+
+    def _publish(self, topic: str, message: Any) -> None:
+        publisher = self.publishers.get(topic)
+        if publisher is not None and topic not in self.silent:
+            self.graph.publish(publisher, b"\0\1\0\0" if topic == self.unreadable else message)
+
+    def withdraw(self) -> None:
+        """Let the camera vanish."""
+        self.graph.withdraw(self.publishers.pop("/camera/image"))
+
+    def advertise(self) -> None:
+        """Let the camera come back."""
+        self.publishers["/camera/image"] = self.graph.advertise("/camera/image", IMAGE)
+
+    def set(self, **fields: Any) -> None:
+        """Change fields."""
+        for name, value in fields.items():
+            setattr(self, name, value)
+
+
+def bytes_of(kind: str, message: Any) -> bytes:
+    from bevviz.messages.definitions import typestore
+
+    return bytes(typestore().serialize_cdr(message, kind))
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    with fed_graph() as graph:
+        yield Robot(graph)
+
+
+def until_told(session: Session, robot: Robot, text: str) -> float:
+    """Play until a text is told. Return the seconds that it took."""
+    session.said.clear()
+    begun = robot.graph.now
+    while not session.told(text):
+        robot.play()
+        assert robot.graph.now - begun < 10, f"{text}: not among {session.said}"
+    return robot.graph.now - begun
+
+
+Change = Callable[[Robot], None]
+
+
+def change(**fields: Any) -> Change:
+    return lambda robot: robot.set(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fault", "begin", "mended", "end"),
+    [
+        (
+            change(silent=frozenset({"/camera/image"})),
+            "no message on /camera/image for 1.5 s",
+            change(silent=frozenset()),
+            "/camera/image is back",
+        ),
+        (
+            change(silent=frozenset({"/a", "/b"})),
+            "no cloud for 1.5 s on /a, /b",
+            change(silent=frozenset()),
+            "the clouds are back",
+        ),
+        (
+            Robot.withdraw,
+            "/camera/image has no publisher any more",
+            Robot.advertise,
+            "/camera/image is published again",
+        ),
+        (change(ahead=37.0), "/a: its clock is 37 s ahead", change(ahead=0.0), "/a: its clock agrees with"),
+        (change(ahead=-90.0), "/a: its clock is 90.0", change(ahead=0.0), "/a: its clock agrees with"),
+        (change(blind=True), "LiDAR /a sees nothing: 0 points", change(blind=False), "/a sees points again"),
+        (
+            change(unreadable="/a"),
+            "a message cannot be used: /a",
+            change(unreadable=""),
+            "/a: its messages can be used again",
+        ),
+        (
+            change(silent=frozenset({"/tf"})),
+            "no transform from",
+            change(silent=frozenset()),
+            "over: ",
+        ),
+    ],
+)
+def test_begin_and_end_are_told_soon(
+    robot: Robot, fault: Change, begin: str, mended: Change, end: str
+) -> None:
+    with joined(robot.graph) as session:
+        robot.play(4.0)
+        assert session.frames and not session.source.problems.current, session.said
+        fault(robot)
+        began = until_told(session, robot, begin)
+        assert session.source.problems.current
+        robot.play(1.0)
+        mended(robot)
+        ended = until_told(session, robot, end)
+        assert (began <= SOON, ended <= SOON) == (True, True), (began, ended)
+        robot.play(2.0)
+        assert not session.source.problems.current
+        texts = [str(past) for past in session.source.problems.past.values() if begin in str(past)]
+        span = re.compile(r"\(\d\d:\d\d:\d\d to \d\d:\d\d:\d\d")
+        assert texts and all(span.search(text) for text in texts)
+
+
+def test_a_bag_in_a_loop_gives_no_advice_about_clocks(robot: Robot) -> None:
+    """The stamps are those of the recording. Each loop begins three seconds after the last one ended."""
+    recorded = 1_600_000_000 * 10**9
+    with joined(robot.graph) as session:
+        for _ in range(4):
+            robot.play(5.0, stamp=recorded)
+            robot.graph.advance(3.0)
+        assert len(session.frames) > 100
+        advice = [text for text in session.said if "clock" in text or "sync." in text]
+        assert not advice and session.told("the stamps of the clouds jumped back")
