@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import rerun as rr
 
 from bevviz.config import load
@@ -33,6 +34,7 @@ def test_an_item_that_is_drawn_twice_has_one_address() -> None:
     assert not writer.rows, "the next frame has not drawn it"
 
 
+@pytest.mark.long
 def test_frustums_have_the_rows_of_their_detections() -> None:
     frame = SyntheticSource(frames=12).snapshot(8).frame
     result = Session(load(settings=["detector.model=demo"])).run_single(frame)

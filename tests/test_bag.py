@@ -378,6 +378,7 @@ def test_a_part_outside_the_recording_is_told(tmp_path: Path) -> None:
 # --- damage ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "compression"),
     [("mcap", ""), ("mcap", "storage"), ("sqlite3", ""), ("ros1", ""), ("ros1", "lz4")],
@@ -406,6 +407,7 @@ def test_a_cut_bag_gives_all_before_the_cut(
         assert any(f"read {found} messages" in w for w in warnings)
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True))
 @example(share=0.9546)  # in the index behind the only chunk of the MCAP: all its messages were lost
@@ -445,6 +447,7 @@ def test_a_cut_compressed_file_yields_what_precedes_the_cut(tmp_path: Path) -> N
         assert any("are lost" in w and "metadata.yaml counts 241 messages" in w for w in source.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "compression", "magic"),
     [
@@ -596,6 +599,7 @@ def test_a_bag_without_a_lidar_is_one_line(tmp_path: Path) -> None:
 # --- the whole ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     def peak(bag: Path) -> int:
         tracemalloc.start()
@@ -664,6 +668,7 @@ def test_a_source_can_be_read_twice(tmp_path: Path) -> None:
 # --- single frames -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("form", "compression"), FORMATS)
 def test_a_single_frame_is_that_of_the_run(tmp_path: Path, form: str, compression: str) -> None:
     bag = make(tmp_path, form, compression)

@@ -33,6 +33,7 @@ def test_notes_are_kept_in_order_and_found_by_time(bag: Path) -> None:
     assert not list(bag.parent.iterdir())
 
 
+@pytest.mark.long
 @given(text=st.text(min_size=1, max_size=50).filter(str.strip))
 def test_any_text_of_a_note_is_read_back(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     notes = Notes([tmp_path_factory.mktemp("notes") / "drive.mcap"])

@@ -58,6 +58,7 @@ def late(items: list[bags.Item], seconds: float, *topics: str) -> list[bags.Item
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [0.0, 0.45, 0.55, 0.65, 1.5, 2.4])
 def test_a_late_lidar_has_its_images_in_a_run_and_alone(tmp_path: Path, seconds: float) -> None:
     bag = bags.write(tmp_path / "drive", late(bags.small_items(scans=40), seconds, bags.CLOUD))
@@ -71,6 +72,7 @@ def test_a_late_lidar_has_its_images_in_a_run_and_alone(tmp_path: Path, seconds:
 LATE = [(bags.IMAGE, 0.3), (bags.IMAGE, 1.2), ("/tf", 0.4), ("/tf", 1.0), (bags.CLOUD, 0.6), (bags.CLOUD, 3)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [[], ["sync.max_wait=0.1"], ["sync.queue=2"], ["sync.tolerance=0.04"]])
 @pytest.mark.parametrize(("topic", "seconds"), LATE)
 def test_single_frames_pair_as_the_run_does(
@@ -135,6 +137,7 @@ def test_equal_log_times_and_stamps_keep_the_numbers(tmp_path: Path) -> None:
         assert [(f.index, f.points[0, 0]) for f in source] == [(0, 3), (2, 5), (4, 7)]
 
 
+@pytest.mark.long
 def test_single_frames_of_other_bags_are_those_of_the_run(tmp_path: Path, shared: Path) -> None:
     """The drive that ships with bevviz, one of Foxglove's messages, and one of KITTI."""
     assert_as_in_the_run([kept_drives.BAG])
@@ -498,6 +501,7 @@ def test_two_sensor_heads_of_one_robot_are_no_robots(tmp_path: Path) -> None:
 # --- log times ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("early", [0, 2, 5])
 @pytest.mark.parametrize("clock", ["zero", "wall", "start"])
 def test_a_jump_of_the_log_clock_is_said_and_set_right(tmp_path: Path, clock: str, early: int) -> None:

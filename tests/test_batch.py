@@ -124,6 +124,7 @@ def jobs_of(batch: Batch, model: str, **settings: Any) -> list[Job]:
 # --- what is done ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_dead_workers_and_bad_bags_cost_nothing_else(batch: Batch) -> None:
     assert batch.killed
     assert batch.status == 1

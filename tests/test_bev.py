@@ -100,6 +100,7 @@ def test_a_point_outside_the_image_is_left_out(x: float, y: float) -> None:
 CHANNELS = ("density", "height", "intensity", "occupancy")
 
 
+@pytest.mark.long
 @given(clouds, st.data())
 @settings(max_examples=40, deadline=None)
 def test_channels_equal_plain_numpy(points: F32, data: st.DataObject) -> None:

@@ -152,6 +152,7 @@ def test_the_correction_undoes_the_error(drive: Drive, late_and_rolled: Calibrat
     )
 
 
+@pytest.mark.long
 def test_the_gradient_equals_differences_of_the_score(drive: Drive) -> None:
     shots = []
     for shot in gather(drive.planted(offsets(ry=0.1)), ["zed"], drive.pose)["zed"].shots[:2]:
@@ -360,6 +361,7 @@ def changed(drive: Drive, change: object) -> Iterator[Frame]:
         yield replace(frame, cameras=(replace(camera, image=replace(camera.image, bgr=bgr)),))
 
 
+@pytest.mark.long
 def test_images_without_edges_give_no_answer(drive: Drive) -> None:
     grey = changed(drive, lambda number, bgr: np.full_like(bgr, 90))
     result = calibrate(gather(grey, ["zed"], drive.pose)["zed"])
@@ -437,6 +439,7 @@ def turned(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_command_reports_and_records_the_calibration(turned: Path, capsys: Capture) -> None:
     arguments = ["calib", str(turned), "--save", "calib.rrd", "--write", "fixed.yaml"]
     assert main(arguments) == 0

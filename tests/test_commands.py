@@ -110,6 +110,7 @@ def port_of(address: str) -> str:
     return found[1]
 
 
+@pytest.mark.long
 def test_demo_is_saved_where_asked(tmp_path: Path) -> None:
     assert main(["demo", "--save", "demo.rrd"]) == 0
     recording = Recording(tmp_path / "demo.rrd")

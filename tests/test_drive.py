@@ -124,6 +124,7 @@ def test_parameters_may_be_a_mapping_or_settings(bag: Path, tmp_path: Path) -> N
         assert len(list(drive)) == 7
 
 
+@pytest.mark.long
 def test_a_saved_drive_is_that_of_the_command(drive: bevviz.Drive, bag: Path, tmp_path: Path) -> None:
     path = drive.save(tmp_path / "api.rrd")
     verify(path)
@@ -134,6 +135,7 @@ def test_a_saved_drive_is_that_of_the_command(drive: bevviz.Drive, bag: Path, tm
         assert repr(ours.rows[entity]) == repr(theirs.rows[entity])
 
 
+@pytest.mark.long
 def test_results_are_exported_as_tables(drive: bevviz.Drive) -> None:
     pytest.importorskip("pandas")
     result = drive.at(0.5)
@@ -195,6 +197,7 @@ def test_errors_in_python_name_arguments(bag: Path) -> None:
         bevviz.open(bag, set={"clustering.epz": 1})
 
 
+@pytest.mark.long
 def test_the_synthetic_drive_can_be_opened() -> None:
     with bevviz.simulate(frames=5, seed=2, set={"voxel.size": 0.2}) as drive:
         assert len(drive) == 5

@@ -133,6 +133,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bags.write(tmp_path_factory.mktemp("hostile") / "drive", items)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "status"),
     [

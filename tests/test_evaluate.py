@@ -196,6 +196,7 @@ def test_a_perfect_result_is_perfect(drive: Path) -> None:
     assert evaluation.metrics["ap_3d_0.7.car"] == pytest.approx(min(few, 40) / 40)
 
 
+@pytest.mark.long
 def test_the_gate_passes_and_fails_by_its_limits(drive: Path, tmp_path: Path, capsys: Capture) -> None:
     files = ["--json", str(tmp_path / "e.json"), "--junit", str(tmp_path / "e.xml")]
     saved = tmp_path / "e.rrd"

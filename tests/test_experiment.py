@@ -37,6 +37,7 @@ def truth(frame: Frame) -> Truth:
     return truth_of(frame, frame.truth)
 
 
+@pytest.mark.long
 def test_the_table_has_each_object_and_configuration() -> None:
     frames, loader = drive()
     configurations = {"default": load(), "strict": load(settings=["detector.conf_threshold=0.9"])}

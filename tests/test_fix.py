@@ -121,6 +121,7 @@ def test_frequent_reasons_name_the_parameters() -> None:
     assert keys_for(Counter({"ground": 5, "below threshold": 9}))[0] == "detector.conf_threshold"
 
 
+@pytest.mark.long
 def test_wrong_arguments_are_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / "drive.mcap"
     assert main(["demo", "--frames", "1", "-o", str(bag)]) == 0

@@ -410,6 +410,7 @@ def test_people_in_real_frames_have_their_place_and_size(shared: Path) -> None:
     assert sum(verdict.iou >= 0.5 for verdict in people) >= 9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factors", [(1.38, 1.2, 1.2), (1.35, 1.3, 1.5)])
 def test_full_size_cars_are_found_and_sized(shared: Path, factors: tuple[float, ...]) -> None:
     """Real cars, made as large as American ones: their points, labels and image boxes are stretched."""

@@ -120,6 +120,7 @@ def test_frames_without_messages_are_forgotten(robot: RunningRobot, drive: Drive
     assert [number for _, number in robot.frame_times()] == [FIRST + FRAMES - 1]
 
 
+@pytest.mark.long
 def test_the_held_seconds_are_listed(robot: RunningRobot) -> None:
     said = robot.commands["list"]({})
     assert said["text"] == "Listing the held seconds, each frame ..."
@@ -128,6 +129,7 @@ def test_the_held_seconds_are_listed(robot: RunningRobot) -> None:
     assert {frame.frame for _, _, frames in groups for frame in frames} >= {FIRST, FIRST + FRAMES - 1}
 
 
+@pytest.mark.long
 def test_a_report_is_cut_from_the_held_seconds(robot: RunningRobot, drive: Drive, tmp_path: Path) -> None:
     session = WorkbenchSession(robot)
     session.equip(ReportMaker(session, robot.bag_of, tmp_path))

@@ -33,6 +33,7 @@ def drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return bags.write(Path("drive"), bags.small_items(scans=3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -53,6 +54,7 @@ def test_hostile_configurations_are_one_line(content: bytes, said: str, capsys: 
     assert not Path("out.rrd").exists()
 
 
+@pytest.mark.long
 def test_a_setting_that_is_nested_too_deep_is_one_line(capsys: Capture) -> None:
     assert "too deep" in error_of(capsys, "bag", "drive", "--set", f"voxel.size={NESTED}")
 
@@ -64,6 +66,7 @@ def test_a_pipe_is_not_waited_for(name: str, capsys: Capture) -> None:
     assert "it is no file" in error_of(capsys, *call)
 
 
+@pytest.mark.long
 def test_file_names_that_are_no_text_are_shown(tmp_path: Path) -> None:
     (source,) = Path("drive").glob("*.mcap")
     odd = Path(os.fsdecode(b"\xff\xfe\x1b[2J.mcap"))
@@ -115,6 +118,7 @@ def test_a_table_that_is_a_pipe_is_refused(capsys: Capture) -> None:
     assert "scene.json: cannot be read: it is no file" in error_of(capsys, "info", "set")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("calibration", "said"),
     [

@@ -62,6 +62,7 @@ def causes(text: str) -> Causes:
     return find_causes(Findings(pa.Table.from_pylist([found], schema=SCHEMA), Path()))
 
 
+@pytest.mark.long
 @given(st.one_of(st.text(max_size=40), st.just(EVIL)))
 def test_no_name_becomes_markup(name: str) -> None:
     shown, plain = Page(batch(name)), Page(batch("plain"))

@@ -99,6 +99,7 @@ def seen(frame: Frame) -> FrameResult:
     return perceive(frame, CONFIG, StageLoader().load(CONFIG))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tell", [by_base, by_fixed_frame, by_gravity, by_ground])
 @pytest.mark.parametrize("mounting", list(MOUNTINGS))
 def test_ground_and_clusters_are_those_of_an_upright_lidar(

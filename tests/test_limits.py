@@ -40,6 +40,7 @@ def drive(tmp_path: Path) -> Path:
     return bags.write(tmp_path / "drive", bags.small_items(scans=3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "ros1"])
 def test_files_with_too_many_topics_are_refused(
     tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture
@@ -97,6 +98,7 @@ def test_too_many_sensors_are_refused(kind: str, key: str) -> None:
     assert (roles.lidars or (roles.cameras[0].topic,)) == ("/s1/data",)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", ["lidar_topics", "camera_topics"])
 def test_settings_with_too_many_names_are_refused(drive: Path, key: str, capsys: Capture) -> None:
     path = drive.parent / "many.yaml"

@@ -206,6 +206,7 @@ def test_simultaneous_scans_wait_and_slow_runs_get_the_newest() -> None:
     assert queue.dropped == 30 - len(taken) - len(queue)
 
 
+@pytest.mark.long
 def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Session.perceive
 
@@ -326,6 +327,7 @@ class Stalled(Replay):
         self._over.wait()
 
 
+@pytest.mark.long
 def test_what_is_said_while_no_frame_comes_is_logged(
     run: Run, frames: list[Frame], drive: SyntheticSource
 ) -> None:
@@ -530,6 +532,7 @@ def test_a_mark_outlives_its_frame(run: Run, frames: list[Frame], drive: Synthet
 # --- the flight recorder -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_flight_recorder_holds_the_last_seconds(
     results: list[FrameResult], drive: SyntheticSource, tmp_path: Path
 ) -> None:
@@ -704,6 +707,7 @@ def test_a_trigger_pauses_after_it_fired(frames: list[Frame]) -> None:
     assert [bool(watch(r)) for r in results] == [True, False, False]
 
 
+@pytest.mark.long
 def test_a_trigger_saves_the_last_seconds(run: Run) -> None:
     asked = ["live.triggers=[stage]", "anomalies.stage_time=1 us", "live.flight_folder=flights"]
     outcome = run(asked, total=20)
@@ -741,6 +745,7 @@ def test_without_a_frame_there_is_no_file(results: list[FrameResult], drive: Syn
     assert said == ["none.rrd: no frame came, so there is no recording"]
 
 
+@pytest.mark.long
 def test_parts_open_on_their_own_and_lack_nothing_together(
     results: list[FrameResult], drive: SyntheticSource, tmp_path: Path
 ) -> None:
@@ -764,6 +769,7 @@ def test_a_run_is_saved_in_parts(run: Run) -> None:
     assert [number for part in outcome.live.saver.paths for number in numbers(part)] == list(range(5))
 
 
+@pytest.mark.long
 def test_a_full_disk_is_said_once_and_nothing_else_ends(run: Run) -> None:
     Path("full.rrd").symlink_to("/dev/full")
     saved: list[Path] = []
@@ -817,6 +823,7 @@ def test_an_output_that_is_no_recording_is_refused(run: Run) -> None:
 # --- changes while it runs -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
     file = Path("c.yaml")
     file.write_text("clustering: {eps: 0.5}\n")

@@ -73,6 +73,7 @@ def robot() -> Iterator[FaultyRobot]:
         yield robot
 
 
+@pytest.mark.long
 def test_a_lost_sensor_stops_no_frame_and_is_named(robot: FaultyRobot) -> None:
     robot.set("/a", kind="PointCloud2", frame="a")
     robot.set("/camera", kind="Image")
@@ -90,6 +91,7 @@ def test_a_lost_sensor_stops_no_frame_and_is_named(robot: FaultyRobot) -> None:
         session.until_frames()
 
 
+@pytest.mark.long
 def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> None:
     robot.set("/a", kind="String", node="stranger")
     robot.set(FUSED, kind="String")
@@ -113,6 +115,7 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
         assert TOPICS.keys() - publisher.topics == {FUSED, OBSTACLES, TRANSFORMS}
 
 
+@pytest.mark.long
 def test_no_result_goes_to_a_topic_of_the_robot(robot: FaultyRobot) -> None:
     robot.set(OBSTACLES, kind="PointCloud2", node="detector")
     with running() as session:
@@ -140,6 +143,7 @@ def test_no_result_goes_to_a_topic_of_the_robot(robot: FaultyRobot) -> None:
 SOON = 12.0  # seconds until a problem is told: two, and the rest for a busy machine
 
 
+@pytest.mark.long
 def test_a_clock_apart_is_named_and_nobody_waits_for_it(robot: FaultyRobot) -> None:
     """The LiDAR that drives the frames by its name gets a clock that is ahead, and then a right one again."""
     for name in ("a", "b"):
@@ -159,6 +163,7 @@ def test_a_clock_apart_is_named_and_nobody_waits_for_it(robot: FaultyRobot) -> N
         assert not session.source.problems.of("/a")
 
 
+@pytest.mark.long
 def test_a_blind_lidar_is_named(robot: FaultyRobot) -> None:
     robot.set("/a", kind="PointCloud2", frame="a")
     with running() as session:
@@ -172,6 +177,7 @@ def test_a_blind_lidar_is_named(robot: FaultyRobot) -> None:
             assert session.source.states["/a"] == "ok"
 
 
+@pytest.mark.long
 def test_slow_transforms_are_named_with_the_setting(robot: FaultyRobot) -> None:
     robot.set("/a", kind="PointCloud2", frame="a")
     robot.set("/tf", kind="TFMessage", frame="a")
@@ -183,6 +189,7 @@ def test_slow_transforms_are_named_with_the_setting(robot: FaultyRobot) -> None:
         session.until_told("frames do not wait any more")
 
 
+@pytest.mark.long
 def test_two_robots_with_equal_names_are_named(robot: FaultyRobot) -> None:
     robot.set("/van/points", kind="PointCloud2")
     robot.set("/truck/points", kind="PointCloud2")
@@ -195,6 +202,7 @@ def test_two_robots_with_equal_names_are_named(robot: FaultyRobot) -> None:
         session.until_told("one robot is received")
 
 
+@pytest.mark.long
 def test_transforms_come_by_two_subscriptions_and_count_once(robot: FaultyRobot) -> None:
     """Best effort is sooner beside large clouds, and reliable brings the rest."""
     robot.set("/a", kind="PointCloud2", frame="a")

@@ -108,6 +108,7 @@ def stamped(message: Any, at: int) -> Any:
     return replace(message, header=replace(message.header, stamp=stamp, frame_id="rslidar"))
 
 
+@pytest.mark.long
 def test_boxes_of_other_messages_are_received(packages: None) -> None:
     stores: Mapping[str, bags.Messages] = {
         "autoware_perception_msgs": made("autoware_perception_msgs", AUTOWARE),
@@ -176,6 +177,7 @@ rclpy.spin(node)
 STRANGE = "source.boxes={topic: /things, center: pose.position, size: pose.position, label: header.frame_id}"
 
 
+@pytest.mark.long
 def test_who_publishes_a_type_is_asked_what_it_is_made_of(
     packages: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -123,6 +123,7 @@ class Digests(Observer[FrameResult]):
         self.results.append(result)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bag", ["snap.mcap", "all.mcap"])
 def test_the_saved_messages_give_identical_results(flight: Flight, bag: str) -> None:
     config = load()
@@ -138,6 +139,7 @@ def test_the_saved_messages_give_identical_results(flight: Flight, bag: str) -> 
     assert last.world_frame == "map" and last.cameras[0].intrinsics is not None
 
 
+@pytest.mark.long
 def test_other_libraries_read_it(flight: Flight) -> None:
     path = flight.folder / "snap.mcap"
     verify_when_indexed(path.with_suffix(".rrd"))

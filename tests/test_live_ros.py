@@ -114,6 +114,7 @@ def test_frames_are_those_of_the_drive(robot: str) -> None:
         assert 0 < time.time_ns() - frame.received < PATIENCE * 1e9
 
 
+@pytest.mark.long
 def test_info_shows_the_graph(robot: str) -> None:
     made = info.describe(load(), seconds=1.0)
     topics = {topic.name: topic for topic in made.topics}
@@ -146,6 +147,7 @@ def test_wrong_arguments_are_refused() -> None:
         LiveSource(load(), arguments=["-p", "no value"])
 
 
+@pytest.mark.long
 def test_a_late_publisher_may_restart_with_other_qos() -> None:
     said: list[str] = []
     with LiveSource(load(), tell=said.append) as source:
@@ -167,6 +169,7 @@ def test_a_late_publisher_may_restart_with_other_qos() -> None:
         assert f"{LIDAR_TOPIC} is published again" in said
 
 
+@pytest.mark.long
 def test_incompatible_publisher_is_told(robot: str) -> None:
     said: list[str] = []
     only_static = tuple(TYPES.keys() - {"/tf_static"})
@@ -369,6 +372,7 @@ def live(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         run.communicate()
 
 
+@pytest.mark.long
 def test_a_run_is_killed_started_again_and_ordered(
     robot: str, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -478,6 +482,7 @@ def without_its_end(recording: Path, folder: Path) -> Path:
     return copy
 
 
+@pytest.mark.long
 def test_commands_work_before_the_robot_starts(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

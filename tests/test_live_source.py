@@ -64,6 +64,7 @@ def test_the_newest_frame_wins(graph: FedGraph) -> None:
     assert source.dropped - dropped == frame.index - before.index - 1 > 5
 
 
+@pytest.mark.long
 def test_frames_do_not_wait_for_the_robots_results(graph: FedGraph) -> None:
     """One detector stamps its boxes a little after the scan, another one takes 0.7 s for them."""
     kind = "vision_msgs/msg/Detection3DArray"
@@ -228,6 +229,7 @@ def test_the_first_frame_waits_for_its_calibration(graph: FedGraph) -> None:
     assert camera.intrinsics is not None and camera.camera_from_points is not None, session.said
 
 
+@pytest.mark.long
 def test_a_mounting_that_never_comes_is_not_waited_for_long(graph: FedGraph) -> None:
     player = Player(graph, without=("/tf_static",))
     with joined(graph) as session:
@@ -236,6 +238,7 @@ def test_a_mounting_that_never_comes_is_not_waited_for_long(graph: FedGraph) -> 
     assert session.frames[-1].cameras[0].camera_from_points is None
 
 
+@pytest.mark.long
 def test_topics_that_cannot_be_received_are_reported(
     graph: FedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -318,6 +321,7 @@ def test_what_helps_against_losses_depends_on_the_size() -> None:
     assert "segment" not in remedy(300, 300) and "queue" in remedy(300, 300)
 
 
+@pytest.mark.long
 def test_a_topic_of_an_unknown_type_is_named_as_not_saved(graph: FedGraph) -> None:
     graph.advertise("/arm/state", "arm_msgs/msg/State")
     player = Player(graph)

@@ -258,6 +258,7 @@ def test_a_plan_is_shown_where_it_is(flight: Flight) -> None:
     assert placed and placed[-1].frame_id == "map"
 
 
+@pytest.mark.long
 def test_a_bag_gives_the_same_surroundings(flight: Flight) -> None:
     with BagSource([flight.folder / "snap.mcap"], load()) as source:
         frames = list(source)

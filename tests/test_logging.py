@@ -98,6 +98,7 @@ def record(tmp_path: Path) -> Callable[..., Recording]:
 # --- entities and values -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
     path = tmp_path / "drive.rrd"
     with open_recording(SCENE, load(), save=path) as sinks:
@@ -109,6 +110,7 @@ def test_a_drive_with_gaps_is_a_valid_recording(tmp_path: Path) -> None:
     assert Recording(path).blueprints == 1
 
 
+@pytest.mark.long
 def test_late_results_of_the_robot_are_at_their_own_stamp(tmp_path: Path) -> None:
     row = np.ones((1, 3), np.float32)
     three = LabelledBoxes3D(
@@ -471,6 +473,7 @@ def test_the_health_of_a_run_is_logged(record: Callable[..., Recording]) -> None
     }
 
 
+@pytest.mark.long
 def test_batched_numbers_are_logged_unchanged(tmp_path: Path) -> None:
     """Also across a frame without a time of receipt, and where the run ends with an error."""
     results = [make(0), make(1), nothing(2, received=0), make(3), make(4)]
@@ -719,6 +722,7 @@ def test_anomalies_are_logged(record: Callable[..., Recording]) -> None:
 # --- sinks -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_several_outputs_get_the_same_data(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -734,6 +738,7 @@ def test_several_outputs_get_the_same_data(tmp_path: Path) -> None:
     assert Recording(path).blueprints == 1
 
 
+@pytest.mark.long
 def test_an_error_on_the_way_leaves_a_readable_file(tmp_path: Path) -> None:
     path = tmp_path / "broken.rrd"
     with pytest.raises(KeyboardInterrupt), open_recording(SCENE, load(), save=path) as sinks:
@@ -746,6 +751,7 @@ def test_an_error_on_the_way_leaves_a_readable_file(tmp_path: Path) -> None:
     assert sorted(Recording(path).at["/world/lidar/points"]["Points3D:positions"]) == [0, 1]
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_killed_process_leaves_what_it_had_logged(tmp_path: Path) -> None:
     path = tmp_path / "killed.rrd"

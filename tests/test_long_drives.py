@@ -159,6 +159,7 @@ def long_drive(drives: tuple[Drive, Drive], monkeypatch: pytest.MonkeyPatch) -> 
     drive.recording.close()
 
 
+@pytest.mark.long
 def test_a_page_gets_the_frames_that_it_looks_at(long_drive: RecordedDrive) -> None:
     """First the requested one, then its neighbours. Tracks come with the run."""
     state = PageState()
@@ -181,6 +182,7 @@ def test_a_page_gets_the_frames_that_it_looks_at(long_drive: RecordedDrive) -> N
     assert [number for _, number in long_drive.frame_times()] == list(range(FRAMES))
 
 
+@pytest.mark.long
 def test_frames_on_demand_are_complete_in_any_order(long_drive: RecordedDrive, tmp_path: Path) -> None:
     """A viewer that has some of them shows nothing of the others, and the numbers of all."""
     run(long_drive.again, long_drive.drive.new_session(), [long_drive])
@@ -214,6 +216,7 @@ def entities_at(folder: Path, pieces: dict[int, bytes | None]) -> dict[int, set[
 # --- lists of earlier runs ----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_drive_that_was_run_before_shows_its_list_at_once(
     drives: tuple[Drive, Drive], bag: Path, store: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

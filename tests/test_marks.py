@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 import rerun as rr
 
 from bevviz.config import load
@@ -46,6 +47,7 @@ def says(recording: Recording, path: str) -> list[str]:
     return list(dict.fromkeys(recording.at[path]["says"].get(10, [])))
 
 
+@pytest.mark.long
 def test_missed_and_false_objects_are_marked_everywhere(tmp_path: Path) -> None:
     objects, frame = result().objects, result().frame
     assert objects is not None and frame.truth is not None

@@ -228,6 +228,7 @@ LEFT_OUT = {  # these are left out before their content is looked at: no sensor 
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", CHANGES)
 def test_every_kind_is_counted_and_told_by_info_and_bag(
     drive: Path, tmp_path: Path, how: str, capfd: pytest.CaptureFixture[str]

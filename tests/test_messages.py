@@ -145,6 +145,7 @@ def unpack(msg: Message) -> list[dict[str, float]]:
     return points
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(layouts())
 def test_any_layout_equals_unpacking_point_by_point(msg: Message) -> None:
@@ -366,6 +367,7 @@ def random_pixels(*shape: int, dtype: str = "u1", high: int = 256) -> NDArray[An
 ORDERS = {"bgr8": (0, 1, 2), "rgb8": (2, 1, 0), "bgra8": (0, 1, 2), "rgba8": (2, 1, 0), "8UC3": (0, 1, 2)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("encoding", [*ORDERS, "8UC4", "mono8", "8UC1"])
 @given(height=st.integers(1, 9), width=st.integers(1, 9), padding=st.integers(0, 5))
 def test_8_bit_images_are_decoded(encoding: str, height: int, width: int, padding: int) -> None:
@@ -866,6 +868,7 @@ def png_of(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", rows) + part(b"IEND", b"")
 
 
+@pytest.mark.long
 def test_an_image_of_gigabytes_is_refused_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     bomb = png_of(32_000, 32_000)
     jpeg = encoded(".jpg", random_pixels(16, 16, 3))

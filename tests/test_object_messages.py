@@ -45,6 +45,7 @@ def boxes(path: Path, *settings: str) -> LabelledBoxes3D:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
 @pytest.mark.parametrize("kind", ["Detected", "Tracked", "Predicted"])
 def test_objects_of_autoware_are_decoded(tmp_path: Path, package: str, kind: str) -> None:

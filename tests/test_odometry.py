@@ -80,6 +80,7 @@ def test_a_standing_robot_stands(street: list[Frame]) -> None:
         np.testing.assert_allclose(pose, np.eye(4), atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_scan_elsewhere_does_not_fit_and_begins_a_new_map(street: list[Frame]) -> None:
     odometry, far = Odometry(), SyntheticSource(1, 7).frame(0).points
     before = [odometry.estimate(frame.points, frame.stamp) for frame in street[:6]][-1]
@@ -174,6 +175,7 @@ def test_a_real_drive_repeats_and_single_frames_agree(shared: Path, tmp_path: Pa
     assert [line for line in lines if "odometry.method" in line] == lines[:1]
 
 
+@pytest.mark.long
 def test_the_workbench_places_questions_as_its_run_does(shared: Path) -> None:
     path = shared / "kitti_drive"
     bench = RecordedDrive(bevviz.open(path), BagSource([path], load()))

@@ -78,6 +78,7 @@ def expanded(path: Path, numbers: int) -> str:
 # --- metadata ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("names", "said"),
     [

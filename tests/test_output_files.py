@@ -78,6 +78,7 @@ def test_only_one_process_writes_a_file() -> None:
     assert Path("a.rrd").read_text() == "first"
 
 
+@pytest.mark.long
 def test_two_runs_cannot_write_one_recording(tmp_path: Path, capsys: Capture) -> None:
     """The second ends at once, the first is what it would have been."""
     bags.write(Path("drive"), bags.small_items(scans=3))
@@ -138,6 +139,7 @@ def test_a_text_can_be_written_to_a_pipe(capfd: Capture) -> None:
     assert capfd.readouterr().out == "a,b\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "options"),
     [
@@ -206,6 +208,7 @@ def test_a_link_to_another_bag_is_not_followed(capsys: Capture) -> None:
 # --- a disk that is full -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     """As on a full disk, writing fails from some megabytes on; what is there can be read."""
     Path("out.rrd").write_text("an older result")
@@ -323,6 +326,7 @@ def plant(target: Path, bag: Path) -> None:
     target.with_name(f"{target.stem}.partial-ffffffff{target.suffix}").symlink_to(bag)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "options", "outputs"),
     [
@@ -420,6 +424,7 @@ def read_bag(path: Path) -> list[tuple[int, int, bytes]]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compress", [False, True])
 def test_a_bag_cut_anywhere_is_completed(compress: bool) -> None:
     messages = little_bag(Path("whole.mcap"), compress=compress)

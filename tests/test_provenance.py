@@ -71,6 +71,7 @@ def imported(file: Path) -> Iterator[str]:
             yield node.module
 
 
+@pytest.mark.long
 def test_every_package_that_results_depend_on_is_listed() -> None:
     modules = {name for file in PACKAGE.rglob("*.py") for name in imported(file)}
     top = {name.split(".")[0] for name in modules} - sys.stdlib_module_names - {"bevviz"}

@@ -167,6 +167,7 @@ def test_without_truth_unexplained_objects_are_listed(result: FrameResult) -> No
 # --- what is shown with other values ------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_click_on_a_frame_with_other_values_is_about_these(bag: Path) -> None:
     """The rows are those of the result as tried; the sensors' input has those of the drive as opened."""
     settings = ("clustering.min_cluster_points=100000",)
@@ -192,6 +193,7 @@ def test_a_click_on_a_frame_with_other_values_is_about_these(bag: Path) -> None:
         bench.close()
 
 
+@pytest.mark.long
 def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path) -> None:
     """On a timeline of its own: what was there is as it was, the sensors' data are there on both."""
     from rerun.chunk import RrdReader
@@ -241,6 +243,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     )
 
 
+@pytest.mark.long
 def test_a_stopped_try_shows_nothing(bag: Path) -> None:
     """The next try begins anew."""
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
@@ -257,6 +260,7 @@ def test_a_stopped_try_shows_nothing(bag: Path) -> None:
         bench.close()
 
 
+@pytest.mark.long
 def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> None:
     """A page that is opened again asks for what it showed, long before the run is there."""
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
@@ -274,6 +278,7 @@ def test_a_frame_that_has_not_been_run_yet_is_meant_by_its_time(bag: Path) -> No
         bench.close()
 
 
+@pytest.mark.long
 def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) -> None:
     """It was drawn before all others, or came before those just before it."""
     from rerun.chunk import RrdReader

@@ -138,6 +138,7 @@ def test_a_missing_detector_is_asked_for(folder: Path, gone: Callable[[str], Non
     assert find_source(folder / "run.rrd", settings=["detector.model=demo"]).load().clustering.eps == EPS
 
 
+@pytest.mark.long
 def test_a_recording_without_a_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo, other = tmp_path / "demo.rrd", tmp_path / "other.rrd"
     assert main(["demo", "--frames", "1", "--save", str(demo)]) == 0
@@ -152,6 +153,7 @@ def test_a_recording_without_a_bag_is_one_line(tmp_path: Path, capsys: pytest.Ca
     assert "PATH has to be one .rrd file" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_commands_take_a_recording_for_its_bag(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Why answers the same as about the bag with the same options; the others run with what it says."""
     rrd, bag, model = str(folder / "run.rrd"), str(folder / "demo.mcap"), str(folder / "net.onnx")
@@ -221,6 +223,7 @@ def test_a_report_stands_for_the_bag_that_comes_with_it(
     assert "The " in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_redacted_report_tells_no_more_and_says_what_it_is(folder: Path) -> None:
     report = folder / "bug.rrd"
     given = ["--at", "0.1", "--before", "0", "--after", "0", "--redact"]
@@ -232,6 +235,7 @@ def test_a_redacted_report_tells_no_more_and_says_what_it_is(folder: Path) -> No
     assert "are redacted" in find_source(report).warnings[0]
 
 
+@pytest.mark.long
 def test_code_that_a_recording_names_is_not_run_unasked(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -271,6 +275,7 @@ def test_fingerprints_tell_content_apart(tmp_path: Path) -> None:
     assert fingerprint(folder) != before
 
 
+@pytest.mark.long
 def test_the_files_of_a_3d_detector_are_found_again(folder: Path, made: Path) -> None:
     """Beside the recording, moved with it; where they are gone they are asked for, but for others' sake."""
     names = {"objects.method": "head.onnx", "objects.params.encoder": "encoder.onnx"}

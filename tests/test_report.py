@@ -154,6 +154,7 @@ def test_no_path_of_the_machine_is_in_a_report(small: Path) -> None:
     assert str(Path.home()) + "/" not in text
 
 
+@pytest.mark.long
 def test_the_model_is_named_without_its_folder(tmp_path: Path, small: Path, capsys: Capture) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
     model = tmp_path / "secret" / "net.onnx"
@@ -286,6 +287,7 @@ def test_other_versions_and_machines_are_named(
     assert re.search(r"not as it was: memory was .*, is absent", said)
 
 
+@pytest.mark.long
 def test_whatever_may_be_the_reason_is_named(tmp_path: Path, capsys: Capture) -> None:
     """What only one of the two runs has, too: a detector, its file of class names, what it runs on."""
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))
@@ -334,6 +336,7 @@ def test_a_check_without_frames_proves_nothing() -> None:
     assert list(nothing.lines()) == ["no frame, then or now: there is nothing to compare"]
 
 
+@pytest.mark.long
 def test_a_folder_without_a_report_is_one_line(small: Path, tmp_path: Path, capsys: Capture) -> None:
     assert "no such file" in error_of(capsys, "report", "--check", "absent.rrd")
     Path("text.rrd").write_text("no recording")
@@ -374,6 +377,7 @@ def test_wrong_calls_are_one_line(tmp_path: Path, capsys: Capture) -> None:
         main(["report", str(bag), "--before", "-1"])
 
 
+@pytest.mark.long
 def test_an_interrupted_run_is_a_shorter_report(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -507,6 +511,7 @@ def test_report_windows_are_parsed() -> None:
     assert spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
 
 
+@pytest.mark.long
 def test_weights_beside_the_model_are_in_the_report(tmp_path: Path, small: Path) -> None:
     """A newer exporter of torch writes model.onnx and model.onnx.data."""
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=12))

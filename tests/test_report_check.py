@@ -65,6 +65,7 @@ def instead(name: str, make: Callable[[str], object]) -> None:
     make(name)
 
 
+@pytest.mark.long
 def test_a_sound_report_passes(capsys: Capture) -> None:
     assert main(["report", "--check", "bug.rrd"]) == 0
     assert "the recording is, byte for byte, the file" in capsys.readouterr().out
@@ -73,6 +74,7 @@ def test_a_sound_report_passes(capsys: Capture) -> None:
     assert "there is no page beside it" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["bug.rrd", "bug.mcap"])
 def test_every_changed_byte_is_detected(name: str, capsys: Capture) -> None:
     sound, rng = Path(name).read_bytes(), random.Random(0)
@@ -86,6 +88,7 @@ def test_every_changed_byte_is_detected(name: str, capsys: Capture) -> None:
         assert told and "Traceback" not in said and "bevviz itself" not in said, (at, out, said)
 
 
+@pytest.mark.long
 def test_damage_without_a_page_is_detected(capsys: Capture) -> None:
     """Among 600 kB some bytes are only shown: what is compared is found, and nothing breaks."""
     Path("bug.html").unlink()
@@ -114,6 +117,7 @@ def damage_that_breaks_the_reader(recording: Path) -> None:
     pytest.fail("nothing breaks the reader: is there need of bevviz.recording.rerun_cli.check_decodes?")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command",
     [
@@ -195,6 +199,7 @@ FORGED: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FORGED)
 def test_malicious_reports_are_one_line(name: str, made: Path, capsys: Capture) -> None:
     make, said = FORGED[name]

@@ -322,6 +322,7 @@ def contents(bag: Path) -> dict[str, list[bytes]]:
     return found
 
 
+@pytest.mark.long
 def test_pictures_inside_other_messages_are_redacted(crowded: Path, tmp_path: Path) -> None:
     report = redacted_report(crowded, tmp_path / "bug.rrd")
     before, after = contents(crowded), contents(report.with_suffix(".mcap"))
@@ -346,6 +347,7 @@ def test_pictures_inside_other_messages_are_redacted(crowded: Path, tmp_path: Pa
     assert "/snapshot left out" in report.with_suffix(".html").read_text()
 
 
+@pytest.mark.long
 def test_an_image_of_the_synthetic_drive_is_hidden(crowded: Path, tmp_path: Path) -> None:
     report = redacted_report(crowded, tmp_path / "bug.rrd")
     with Bag([crowded]) as old, Bag([report.with_suffix(".mcap")]) as new:
@@ -363,6 +365,7 @@ def test_an_image_of_the_synthetic_drive_is_hidden(crowded: Path, tmp_path: Path
     assert not changed.any()
 
 
+@pytest.mark.long
 def test_topics_kept_on_request_are_named(crowded: Path, tmp_path: Path, capsys: Capture) -> None:
     report = redacted_report(crowded, tmp_path / "bug.rrd", "--unredacted", "/s*", "/bytes")
     capsys.readouterr()
@@ -438,6 +441,7 @@ def test_redaction_flattens_the_box_and_nothing_else(
     assert left <= x0 and top <= y0 and right >= x1 and bottom >= y1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "codec", "b_frames"),
     [

@@ -66,6 +66,7 @@ def digests(path: Path, config: Config, window: ReportWindow) -> list[tuple[Stag
         return [digest(session.run(frame)) for frame in source]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("form", "compression"), [("mcap", "storage"), ("sqlite3", "message"), ("ros1", "bz2"), ("sqlite3", "")]
 )
@@ -97,6 +98,7 @@ def test_raw_messages_give_the_same_results(form: str, compression: str, tmp_pat
     assert [compare(a, b) for a, b in zip(then, now, strict=True)] == [None] * 11
 
 
+@pytest.mark.long
 def test_a_window_of_a_cut_bag_is_written(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "drive", bags.small_items(scans=60, points=2000), compression="storage")
     whole = next(path.glob("*.mcap")).read_bytes()
@@ -110,6 +112,7 @@ def test_a_window_of_a_cut_bag_is_written(tmp_path: Path) -> None:
     assert then and [compare(a, b) for a, b in zip(then, now, strict=True)] == [None] * len(then)
 
 
+@pytest.mark.long
 def test_other_readers_read_the_window(tmp_path: Path) -> None:
     qos: list[Qos] = [_qos(latched=True)]
     messages = bags.Messages()
@@ -193,6 +196,7 @@ def test_nothing_is_left_of_a_bag_that_fails(tmp_path: Path) -> None:
         cut_out(path, tmp_path / "no" / "bug.mcap", at="1")
 
 
+@pytest.mark.long
 def test_kitti_gives_the_same_through_the_bag(shared: Path, tmp_path: Path) -> None:
     config = load(settings=[f"detector.model={shared / 'models' / 'yolox_nano.onnx'}"])
     items = bags.kitti_items(shared, step=2)

@@ -95,6 +95,7 @@ def test_results_of_coco_are_detections(tmp_path: Path) -> None:
     assert main(["why", str(drive), "--results", f"net={file}", "--at-frame", "2"]) == 0
 
 
+@pytest.mark.long
 def test_a_table_of_our_own_objects_comes_back(tmp_path: Path) -> None:
     with bevviz.simulate(frames=3) as source:
         made = objects_of(source.at(frame=1))
@@ -137,6 +138,7 @@ def test_a_part_of_a_drive_has_the_rows_of_its_scans(tmp_path: Path) -> None:
         assert labels_of(source) == whole[-source.total :] and source.total < 20
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", ["mcap", "ros1"])
 def test_a_report_has_the_boxes_of_its_result_files(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -104,6 +104,7 @@ def test_the_same_image_is_not_detected_twice(frames: list[Frame]) -> None:
     assert len(kept) > 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "setting",
     [
@@ -343,6 +344,7 @@ def test_the_command_shows_and_empties_the_store(
     assert ": 0 results, " in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_redacted_reports_leave_nothing_in_the_store(folder: Path, tmp_path: Path) -> None:
     bag = tmp_path / "drive.mcap"
     assert main(["demo", "--frames", "3", "-o", str(bag), "--set", "store.size=0"]) == 0

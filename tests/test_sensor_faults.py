@@ -64,6 +64,7 @@ def test_clean_real_drive_has_no_sensor_fault(drive: Results) -> None:
     assert faults(drive, lambda row: drive[row]) == {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("subject", "within", "plant"),
     [
@@ -130,6 +131,7 @@ def test_returns_that_fade_are_told(drive: Results) -> None:
     assert told[0][0] <= FIRST + 16
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [3.0, -3.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(("sensor", "plant"), [(CAMERA, turned_camera), (LIDAR, turned_lidar)])
@@ -194,6 +196,7 @@ def drifts(results: Results, degrees: Callable[[int], float], axis: int) -> dict
     return seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [3.0, -3.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_transform_that_was_always_wrong_is_told(drive: Results, axis: int, degrees: float) -> None:
@@ -217,6 +220,7 @@ def restamped(results: Results) -> Results:
     return moved
 
 
+@pytest.mark.long
 def test_transform_that_drifts_slowly_is_told(drive: Results) -> None:
     """It drifts by 0.06 degrees a frame, too little for a jump, while the drive runs forth and back."""
     there_and_back = [*drive, *drive[-2:0:-1]]
@@ -224,10 +228,12 @@ def test_transform_that_drifts_slowly_is_told(drive: Results) -> None:
     assert list(seen) == [MISPLACED]
 
 
+@pytest.mark.long
 def test_long_clean_drive_has_no_sensor_fault(drive: Results) -> None:
     assert drifts(restamped([*drive, *drive[-2:0:-1]] * 2), lambda row: 0.0, 0) == {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["kitti", "kitti_more"])
 def test_right_transform_of_single_frames_is_left_alone(shared: Path, name: str) -> None:
     checks = []

@@ -228,6 +228,7 @@ def test_links_of_a_robot_description_are_placed() -> None:
             decode_shapes(make("std_msgs/msg/String", data=wrong), "String", "/robot_description")
 
 
+@pytest.mark.long
 def test_image_and_obstacles_of_the_robot_replace_missing_ones(tmp_path: Path) -> None:
     kinds = {"/points": "PointCloud2", "/lidar/points_no_ground": "PointCloud2"}
     kinds |= {"/visualization/bev_image": "Image", "/camera/image": "Image"}

@@ -154,6 +154,7 @@ def test_the_nearest_unmatched_object_is_matched() -> None:
     assert not free.any()
 
 
+@pytest.mark.long
 def test_required_objects_of_the_synthetic_drive_are_known() -> None:
     """In range, in the image, and hit: as the simulator knows it itself."""
     shot = source().snapshot(10)
@@ -227,6 +228,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
+@pytest.mark.long
 def test_a_sweep_of_the_synthetic_drive(drive: str, capsys: Capture) -> None:
     swept = ["--set", "clustering.min_points=5,5000", "--set", "clustering.min_cluster_points=1"]
     swept += ["--set", "fusion.split=false"]  # else the camera makes objects of noise
@@ -256,6 +258,7 @@ def test_a_sweep_of_the_synthetic_drive(drive: str, capsys: Capture) -> None:
     assert recording.blueprints == 1
 
 
+@pytest.mark.long
 def test_a_flat_sweep_over_two_parameters_has_no_best_value(drive: str, capsys: Capture) -> None:
     swept = ["--set", "clustering.eps=0.55,0.6", "--set", "fusion.min_points=1,2", "--save", "s.rrd"]
     assert main(["sweep", drive, "--model", "demo", *swept, "--json"]) == 0
@@ -285,6 +288,7 @@ def test_kitti_labels_serve_as_truth(shared: Path, capsys: Capture) -> None:
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_another_topic_serves_as_truth() -> None:
     """The frame's own truth under a topic of the robot is the same truth."""
     own = frame().truth

@@ -639,6 +639,7 @@ def test_detections_of_the_robot_know_their_camera() -> None:
     assert [d.camera for d in frame.robot_detections] == ["zed"]
 
 
+@pytest.mark.long
 def test_memory_is_bounded() -> None:
     feed = Feed(Roles(lidars=("/rslidar_points", "/back"), lidar_names=("rslidar", "back"), cameras=(LEFT,)))
     feed.calibration()

@@ -208,6 +208,7 @@ poses = st.builds(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_any_tree_is_consistent(data: st.DataObject) -> None:

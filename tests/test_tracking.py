@@ -268,6 +268,7 @@ def test_two_trucks_in_a_queue_have_two_ids() -> None:
     assert shown_ids(tracks) == [0, 1]
 
 
+@pytest.mark.long
 def test_trucks_in_a_real_queue_keep_their_ids(shared: Path) -> None:
     """A lorry and an articulated truck beside the robot, in clusters that change from frame to frame."""
     model = shared / "models" / "yolox_nano.onnx"
@@ -342,6 +343,7 @@ def test_metrics_of_a_known_id_switch_are_right() -> None:
     assert max(tally.speeds) < 0.01
 
 
+@pytest.mark.long
 def test_true_boxes_are_tracked_without_a_mistake() -> None:
     """The tracker alone: what it is given is exact, so every switch and every speed error is its own."""
     few = Lidar(beams=2, azimuths=8), PinholeCamera(width=8, height=4, focal=5.0)

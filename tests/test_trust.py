@@ -97,6 +97,7 @@ class Payload:
         return Path.touch, (self.target,)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("through", ["topics", "files", "yaml"])
 def test_a_recording_does_not_run_the_pickle_in_its_bag(
     received: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture, through: str
@@ -467,6 +468,7 @@ def segment(points):
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("trusted", [True, False])
 def test_compiled_functions_beside_a_module_do_not_run(
     received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trusted: bool
@@ -504,6 +506,7 @@ def test_compiled_functions_beside_a_module_do_not_run(
     numba_cache._user_kernel_folder.cache_clear()
 
 
+@pytest.mark.long
 def test_numba_takes_no_settings_from_the_folder(received: Path) -> None:
     """Its .numba_config.yaml could name a cache, which holds pickles, for the stages of bevviz."""
     (received / ".numba_config.yaml").write_text("cache_dir: cache\ncache_locator_classes: evil.Locator\n")
@@ -519,6 +522,7 @@ def test_numba_takes_no_settings_from_the_folder(received: Path) -> None:
     assert ran.stdout == "['', '']\n"
 
 
+@pytest.mark.long
 def test_workers_find_no_python_of_the_folder(received: Path) -> None:
     """A new process of Python looks into the working directory first, if nobody tells it not to."""
     for name in ("multiprocessing", "struct", "random", "signal"):
@@ -685,6 +689,7 @@ def names_in(path: Path) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
 
 
+@pytest.mark.long
 def test_trust_is_granted_in_few_places_only() -> None:
     """Few modules grant trust, and a layer without a stated origin is not trusted."""
     assert Layer("somewhere", {}).trust is RECEIVED and not RECEIVED.granted
@@ -695,6 +700,7 @@ def test_trust_is_granted_in_few_places_only() -> None:
     }
 
 
+@pytest.mark.long
 def test_settings_that_are_text_come_from_the_user_alone() -> None:
     """Callers of ``load`` that give settings: the command line, Python, or layers with their origin."""
     giving = {

@@ -473,6 +473,7 @@ def results_of(bag: Path, *settings: str) -> list[FrameResult]:
         return [session.run(frame) for frame in source]
 
 
+@pytest.mark.long
 def test_topics_of_the_robot_replace_stages(robot: Path) -> None:
     ours = results_of(robot, "detector.model=demo", "fusion.split=false")
     taken = results_of(
@@ -513,6 +514,7 @@ def test_image_boxes_of_an_unknown_camera_go_to_no_camera() -> None:
             detect(replace(alone, cameras=(front, rear)), camera, "/boxes")
 
 
+@pytest.mark.long
 def test_a_topic_of_the_robot_replaces_objects(robot: Path) -> None:
     ours = results_of(robot, "detector.model=demo", "fusion.split=false")
     taken = results_of(robot, "objects.method=topic:/robot/objects")

@@ -56,6 +56,7 @@ def numbers(frames: Sequence[Frame]) -> list[int | None]:
     return [None if picture is None else number_of(picture.bgr) for picture in found]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("codec", "kind"),
     [

@@ -70,6 +70,7 @@ def numbers(answer: Answer, stage: str) -> dict[str, object]:
 # --- planted faults ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", ["default", "reference"])
 def test_a_hidden_person_is_explained(preset: str) -> None:
     (row,) = planted("hidden_person", "person", 16.3)
@@ -172,6 +173,7 @@ def test_two_losses_without_truth_are_both_named() -> None:
     assert likely_reasons(subject, lost, known, ReasonKind.GROUND) == (), "ground truth tells"
 
 
+@pytest.mark.long
 def test_a_box_that_names_two_clusters_is_explained() -> None:
     (row,) = planted("shared_box", "person", 8.7)
     assert of_truth(asked("shared_box", "default", "person"), row).verdict.kind is ReasonKind.REPORTED
@@ -293,6 +295,7 @@ def test_a_cell_of_the_birds_eye_view_is_the_column_over_it() -> None:
         questioner.ask(Selection(cell=(900, 3)))
 
 
+@pytest.mark.long
 def test_a_track_is_its_cluster_or_its_expected_place() -> None:
     source, session = SyntheticSource(20, seed=3), Session(config_of("default"))
     for index in range(6):
@@ -358,6 +361,7 @@ def test_weak_detections_are_told_only_on_request() -> None:
 # --- stages that did not run -------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_without_a_model_no_detector_is_said_to_have_looked() -> None:
     frame = at("merged_people").frame
     lens = replace(frame.cameras[0], image=None, problems=("no image within 0.1 s",))
@@ -580,6 +584,7 @@ def test_the_command_prints_json(bag: Path, capsys: Capture) -> None:
     assert [step["stage"] for step in answer["chain"]][:3] == ["camera zed", "raw cloud", "occlusion"]
 
 
+@pytest.mark.long
 def test_frames_are_chosen_by_negative_or_scan_numbers(bag: Path, capsys: Capture) -> None:
     command = ["why", str(bag), "--model", "demo"]
     assert main([*command, "--at-frame", "0", "--point", "-5,1,-1.9"]) == 0

@@ -41,6 +41,7 @@ def again(preset: str, answer: Answer) -> Answer:
     return after.ask(Selection(truth=answer.subject.row))[0]
 
 
+@pytest.mark.long
 def test_changes_that_help_together_only_are_named_together() -> None:
     """Two planted values each lose the object: the hint sets both back, and none is there for nothing."""
     wrong = ["clustering.min_cluster_points=400", "detector.conf_threshold=0.97"]
@@ -74,6 +75,7 @@ def test_a_value_that_was_changed_is_set_back(wrong: str) -> None:
     assert (f"{key}={preset:g}",) in [hint.settings for hint in hints]
 
 
+@pytest.mark.long
 def test_without_a_remedy_each_tried_change_is_named() -> None:
     asked = questioner("default")
     answers = [asked.with_hints(a) for a in asked.missed()[:4]]
@@ -121,6 +123,7 @@ def test_the_sentence_names_the_changes(
     assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("eps", [0.5, 19.0])
 def test_only_valid_values_are_tried(eps: float) -> None:
     """Of parts whose distance is not known, too, and where a larger value is beyond the limit."""

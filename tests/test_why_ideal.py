@@ -29,6 +29,7 @@ def explained(*settings: str) -> FrameExplainer:
     return FrameExplainer(Session(config).run_explained(at("flat_car").frame), classes=CLASSES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("planted", "stage"),
     [

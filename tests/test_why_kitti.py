@@ -188,6 +188,7 @@ def test_without_ground_truth_doubtful_objects_are_false_ones(asked: dict[str, A
     assert doubtful >= 3 and right <= 1
 
 
+@pytest.mark.long
 def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None:
     """With ground truth and without, the list has the kind, subject, distance and reason of the answer."""
     rows = 0

@@ -78,6 +78,7 @@ def test_one_missed_object_is_one_entry(talk: Talk) -> None:
         assert all(sight[5] for sight in entry["sights"]), "its reason"
 
 
+@pytest.mark.long
 def test_rows_of_the_list_agree_with_their_answers(talk: Talk) -> None:
     """One kind, subject, distance and reason, whether it is read in the list or asked for."""
     for entry in talk.of("missed", "false"):
@@ -108,6 +109,7 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
     assert again["name"] == other["name"]
 
 
+@pytest.mark.long
 def test_the_subject_is_followed_over_frames(talk: Talk) -> None:
     """An object is asked by its row in one frame, and found by its id in each other one."""
     _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
@@ -158,6 +160,7 @@ def test_without_a_hint_a_sentence_names_the_tried_changes(hinted: Hinted) -> No
     assert any(re.fullmatch(r"No tried change helps: with \w+\.\w+=.*\.", text) for text in sentences)
 
 
+@pytest.mark.long
 def test_the_drive_is_run_with_other_values(talk: Talk, address: str, hinted: Hinted) -> None:
     """Every frame, with what it makes better and worse; another page is told the same; it can be ended."""
     stamp, pick, hint = helped(hinted)
@@ -188,6 +191,7 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str, hinted: Hi
     assert "clustering.epps" in talk.asked("never", type="drive", set=["clustering.epps=1"])["text"]
 
 
+@pytest.mark.long
 def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
     _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
     pick = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)["pick"]
@@ -210,6 +214,7 @@ def test_a_note_about_a_place_names_it_as_the_answer_does(talk: Talk) -> None:
     talk.until("notes", lambda message: not message["notes"])
 
 
+@pytest.mark.long
 def test_a_report_has_what_was_asked_tried_and_noted(
     talk: Talk, address: str, bag: Path, hinted: Hinted
 ) -> None:
@@ -252,6 +257,7 @@ def test_a_report_has_what_was_asked_tried_and_noted(
     assert "up to 600" in talk.asked("never", type="report", time=stamp, before=1e9, after=0, text="")["text"]
 
 
+@pytest.mark.long
 def test_a_report_is_about_the_object_of_its_own_tab(talk: Talk, address: str, hinted: Hinted) -> None:
     """Another tab asks about another object of the same frame afterwards."""
     stamp, pick, _ = helped(hinted)
@@ -275,6 +281,7 @@ def test_a_report_is_about_the_object_of_its_own_tab(talk: Talk, address: str, h
     assert "of the drive as opened" in said["text"]
 
 
+@pytest.mark.long
 def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None:
     copy = tmp_path / "drive.mcap"
     copy.hardlink_to(bag)
@@ -416,6 +423,7 @@ def test_two_drives_at_once(bag: Path, address: str) -> None:
         assert answered(f"{other.split('?')[0]}?{urlsplit(address).query}") == 403
 
 
+@pytest.mark.long
 def test_a_damaged_bag_is_opened_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
     """What could be read is run and asked about; what was lost is said."""
     cut = tmp_path / "cut.mcap"

@@ -118,6 +118,7 @@ def _is_at(answer: Answer, place: NDArray[np.float64], path: str) -> bool:
     return bool(inside or near)
 
 
+@pytest.mark.long
 def test_every_drawn_entity_answers_about_itself(source: RecordedDrive, tmp_path: Path) -> None:
     session, result = WorkbenchSession(source), source.look(FRAME)
     seen, silent, others = set(), [], []

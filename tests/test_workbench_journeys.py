@@ -278,6 +278,7 @@ def test_findings_are_sorted_filtered_and_saved(page: Page, whole: int, tmp_path
     until(lambda: 0 < number(page) < whole)
 
 
+@pytest.mark.long
 def test_findings_are_marked_and_noted_beside_the_bag(
     page: Page, whole: int, bag: Path, browser: Browser, address: str
 ) -> None:
@@ -314,6 +315,7 @@ def test_findings_are_marked_and_noted_beside_the_bag(
     until(lambda: "handled" not in page.inner_text("#kinds") and not Notes([bag]).path.exists())
 
 
+@pytest.mark.long
 def test_keys_step_through_frames_and_findings(page: Page) -> None:
     """They do nothing while the user types; the sheet of keys has the legend, too."""
     page.keyboard.press("End")
@@ -404,6 +406,7 @@ def choose_missed(page: Page, *, with_hints: bool) -> None:
     pytest.fail("there is no such row")
 
 
+@pytest.mark.long
 def test_parameters_are_tried_and_taken_back(page: Page) -> None:
     """By a field, a list and a slider, with undo and reset. The keys work on a slider, too."""
     page.keyboard.press("/")
@@ -442,6 +445,7 @@ def test_parameters_are_tried_and_taken_back(page: Page) -> None:
     until(lambda: "As it was opened" in page.inner_text("#effect"))
 
 
+@pytest.mark.long
 def test_the_drive_is_run_with_other_values(page: Page) -> None:
     """Runs are kept and compared; a search is cancelled."""
     page.fill("#search", "clustering.eps")
@@ -488,6 +492,7 @@ def test_the_timeline_goes_to_findings_and_shows_the_camera(page: Page) -> None:
     until(page.locator("#thumbnail").is_hidden)
 
 
+@pytest.mark.long
 def test_an_address_and_a_shared_link_open_the_same(
     page: Page, bag: Path, browser: Browser, tmp_path: Path
 ) -> None:

@@ -164,6 +164,7 @@ def nearest_missed(talk: Channel, frame: int) -> str:
     return str(min(missed, key=lambda sight: sight[2])[3])
 
 
+@pytest.mark.long
 def test_a_running_robot_is_asked_and_changed(robot: tuple[str, Path]) -> None:
     """From the newest frame to a held one, its answer, a parameter for all to come, a mark, a snapshot."""
     address, folder = robot
@@ -238,6 +239,7 @@ def bench(results: list[FrameResult]) -> Iterator[RunningRobot]:
         yield bench
 
 
+@pytest.mark.long
 def test_only_the_newest_frames_and_those_held_are_there(
     bench: RunningRobot, results: list[FrameResult]
 ) -> None:

@@ -398,6 +398,7 @@ def test_a_drive_below_wins_over_crops_of_its_objects(tmp_path: Path, capsys: Ca
     assert main(["info", str(root / "kitti_gt_database")]) == 0  # who asks for the crops gets them
 
 
+@pytest.mark.long
 def test_a_bag_needs_no_loader_of_data_sets() -> None:
     script = (
         "import sys; from bevviz.cli import main; main(['info', sys.argv[1]])\n"

@@ -134,6 +134,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.long
 @MAKERS
 def test_a_folder_has_its_name_when_it_is_complete(tmp_path: Path, make: type[FolderExport]) -> None:
     target = tmp_path / "made"
@@ -156,6 +157,7 @@ def test_a_folder_has_its_name_when_it_is_complete(tmp_path: Path, make: type[Fo
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
+@pytest.mark.long
 @MAKERS
 def test_a_full_disk_leaves_no_folder(tmp_path: Path, make: type[FolderExport]) -> None:
     with small_disk(tmp_path / "small", "1m") as small:
@@ -164,6 +166,7 @@ def test_a_full_disk_leaves_no_folder(tmp_path: Path, make: type[FolderExport]) 
         assert not list(small.iterdir())
 
 
+@pytest.mark.long
 def test_the_next_export_deletes_what_a_killed_one_left(tmp_path: Path) -> None:
     script = (
         "import os, signal, sys; from pathlib import Path\n"
@@ -250,6 +253,7 @@ def test_the_nuscenes_tables_name_existing_files(exported: tuple[Path, bevviz.Dr
     assert len(tables["sample_annotation"]) > 3 * len(tables["instance"])  # they are tracks
 
 
+@pytest.mark.long
 def test_a_track_has_its_most_frequent_class(tmp_path: Path) -> None:
     """A detector may begin with another name; an instance of nuScenes has one for all of its annotations."""
 
@@ -280,6 +284,7 @@ def test_tables_of_two_scenes_can_be_joined(tmp_path: Path) -> None:
         assert one == two if table in ("sensor", "category", "visibility") else not one & two, table
 
 
+@pytest.mark.long
 def test_a_scene_is_written_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = tmp_path / "bag.mcap"
     assert main(["demo", "-o", str(made), "--frames", "3"]) == 0

@@ -27,6 +27,7 @@ def clusters_on(name: str, preset: str, row: int) -> I32:
     return labels
 
 
+@pytest.mark.long
 def test_the_hidden_person_is_there_and_nobody_sees_it() -> None:
     (row,) = planted("hidden_person", "person", 16.3)
     shot = at("hidden_person")
@@ -36,6 +37,7 @@ def test_the_hidden_person_is_there_and_nobody_sees_it() -> None:
     assert shot.truth_hits[van] > 1000
 
 
+@pytest.mark.long
 def test_the_flat_car_is_ground_for_one_plane_only() -> None:
     (row,) = planted("flat_car", "car", 10.0)
     truth = at("flat_car").frame.truth
@@ -90,6 +92,7 @@ def test_an_impossible_fault_is_one_line(name: str, frames: int, message: str) -
         SyntheticSource(frames, plant=[name])
 
 
+@pytest.mark.long
 def test_demo_teaches_and_plants_every_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

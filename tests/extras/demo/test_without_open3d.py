@@ -60,6 +60,7 @@ def test_the_workbench_opens(tmp_path: Path) -> None:
     assert "workbench at http" in lines[-1], lines
 
 
+@pytest.mark.long
 def test_the_synthetic_drive_says_in_one_line_what_it_lacks(tmp_path: Path) -> None:
     done = run(tmp_path, "demo", "--frames", "1", "-o", "drive.mcap", "--quiet")
     assert done.returncode != 0

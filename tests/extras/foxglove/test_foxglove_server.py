@@ -119,6 +119,7 @@ def test_a_client_gets_what_it_subscribes_to(server: FoxgloveServer) -> None:
         until(lambda: not server.wants(FIRST))
 
 
+@pytest.mark.long
 def test_a_client_that_reads_nothing_delays_nobody() -> None:
     before = threading.active_count()
     with (

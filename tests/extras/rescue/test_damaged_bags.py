@@ -256,6 +256,7 @@ def test_a_file_cut_during_reading_is_reported(tmp_path: Path, name: str) -> Non
 # --- numbers beyond all measure ----------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["mcap", "mcap, flat", "mcap, no checksums", "ros1", "sqlite3"])
 def test_no_number_in_a_file_leads_to_a_traceback(tmp_path: Path, name: str) -> None:
     """The places take turns with two numbers, one of which is negative where it is read as signed."""

@@ -144,6 +144,7 @@ def asked(bag: Path, plant: Plant, graph: Graph, *more: str) -> list[str]:
     return ["why", str(bag), "--at-frame", str(plant.frame), "--robot", f"--point={x},{y},{z}", *more]
 
 
+@pytest.mark.long
 def test_a_bag_tells_which_step_lost_an_object(
     bag: tuple[Path, Graph], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,6 +184,7 @@ def place_of(plant: Plant, graph: Graph) -> np.ndarray:
     return graph.places[plant][1] - [plant.frame, 0, 1.8]
 
 
+@pytest.mark.long
 def test_the_page_shows_which_node_lost_it(bag: tuple[Path, Graph]) -> None:
     path, graph = bag
     plant = next(plant for plant in graph.plants if plant.node == "tracker")
@@ -237,6 +239,7 @@ def test_a_running_robot_is_asked_for_its_nodes(bag: tuple[Path, Graph]) -> None
 # --- asked beside a robot -------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_nodes_of_a_running_robot_are_named() -> None:
     """The results come after their frames, and the newest frames of the buffer have no later messages."""
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
