@@ -92,8 +92,8 @@ def test_labels_of_types_that_kitti_has_not(tmp_path: Path) -> None:
     kinds = ["car", "Bus", "Sign", "Misc", "DontCare", "Car"]
     (tmp_path / "label_2/000000.txt").write_text("\n".join(f"{kind} {numbers}" for kind in kinds) + "\n\n")
     labels = read_labels(tmp_path / "label_2/000000.txt")
-    assert labels.labels == ("car", "Bus", "Sign", "Car")
-    assert len(labels.boxes) == 4
+    assert labels.labels == ("car", "Bus", "Sign", "Misc", "Car")
+    assert len(labels.boxes) == 5
 
 
 def test_boxes_in_a_map_far_from_its_origin_keep_their_place() -> None:

@@ -417,7 +417,7 @@ def test_a_hint_names_its_side_effects() -> None:
     before = run("flat_car", "reference").objects
     after = Session(config_of("reference", *answer.hints[0].settings)).run(at("flat_car").frame).objects
     assert before is not None and after is not None
-    assert len(after) - len(before) == len(effects.fixed) + len(effects.added) - len(effects.lost)
+    assert len(after) - len(before) == len(effects.fixed) + len(effects.added) - len(effects.gone)
 
 
 @pytest.mark.parametrize(

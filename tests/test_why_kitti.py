@@ -10,7 +10,7 @@ import pytest
 
 import bevviz
 from bevviz.config import load
-from bevviz.evaluate import match, truth_of
+from bevviz.evaluate import exemptions, match, truth_of
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model.frame import Camera, Frame
 from bevviz.model.reasons import ReasonKind
@@ -160,7 +160,7 @@ def test_each_false_object_has_a_cause(asked: dict[str, Asked]) -> None:
         assert labelled is not None and objects is not None
         truth = truth_of(frame.result.frame, labelled)
         judged = frozenset().union(*truth.accepted)
-        partner, ignored = partner_of(frame), truth.unlabelled(objects.boxes)
+        partner, ignored = partner_of(frame), exemptions(objects, truth, frame.result.cameras)
         false = {
             row
             for row, label in enumerate(partner)

@@ -85,6 +85,12 @@ class SourceConfig(Section):
         max_length=MAX_SENSORS,
         description="name -> file with a detector's results, which appear on the topic /results/NAME",
     )
+    labels: Mapping[str, tuple[str, ...]] = Field(
+        {},
+        max_length=MAX_SETTINGS,
+        description="label of the ground truth -> right names of its objects, in place of the known ones; "
+        "[]: none has to be found, and an object on one is neither right nor wrong",
+    )
     frames: Mapping[str, str] = Field(
         {},
         max_length=MAX_SETTINGS,

@@ -61,8 +61,8 @@ def labelled_boxes(
 ) -> LabelledBoxes3D:
     """Convert label lines to boxes in the LiDAR frame.
 
-    Every type but Misc counts, because data sets in KITTI's format have types of their own. A label with
-    non-finite numbers or a negative size is left out and listed in ``unusable``.
+    Every type is kept, because data sets in KITTI's format have types of their own. A label with non-finite
+    numbers or a negative size is left out and listed in ``unusable``.
 
     Args:
         file: label file, for messages.
@@ -77,7 +77,7 @@ def labelled_boxes(
     labels, rows, dont_care, kept, unusable, scores = [], [], [], [], [], []
     for index, (number, line) in enumerate(lines):
         kind, *values = line.split() or [""]
-        if kind in ("", "Misc"):
+        if not kind:
             continue
         if len(values) < 14:
             raise UserError(f"{file}: line {number} has {len(values)} numbers, a KITTI label has 14")

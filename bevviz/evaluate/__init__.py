@@ -9,7 +9,15 @@ from bevviz.evaluate.ground_truth import (
     truth_of,
     truth_source,
 )
-from bevviz.evaluate.matching import Matches, ObjectScore, judge, match, pair_in_order, position_text
+from bevviz.evaluate.matching import (
+    Matches,
+    ObjectScore,
+    exemptions,
+    judge,
+    match,
+    pair_in_order,
+    position_text,
+)
 
 __all__ = [
     "MAX_DISTANCE",
@@ -18,6 +26,7 @@ __all__ = [
     "Matches",
     "ObjectScore",
     "Truth",
+    "exemptions",
     "judge",
     "match",
     "pair_in_order",

@@ -115,7 +115,7 @@ class Evaluation(Observer[FrameResult], Tabular):
             return
         self.unusable += [f"frame {result.frame.index}: {reason}" for reason in truth.unusable]
         objects = result.objects or Objects.empty()
-        matches = self._score.add(objects, truth)
+        matches = self._score.add(objects, truth, result.cameras)
         self.last = result, truth, matches
         asked = self._causes is not None and matches.false.any()
         self.causes = self._causes(result, truth) if self._causes is not None and asked else {}

@@ -14,9 +14,10 @@ from bevviz.errors import UserError
 from bevviz.messages.foreign_boxes import box_name
 from bevviz.messages.roles import Roles
 from bevviz.model import geometry
+from bevviz.model.box_overlap import bev_iou_and_share
 from bevviz.model.box_points import inside_each
-from bevviz.model.class_names import ACCEPTED_NAMES, OPTIONAL, PART_OF, judged_names
-from bevviz.model.frame import Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
+from bevviz.model.class_names import judged_names, rule_of
+from bevviz.model.frame import I64, Bool, Boxes3D, Camera, Frame, ImageLabels, LabelledBoxes3D
 from bevviz.stages.robot_results import in_points_frame
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 MIN_HITS = 10  # least number of LiDAR points on an object to be found
 MAX_DISTANCE = 2.0  # metres between the centres of a box and its object, on the ground plane
 SAME_PLACE = 0.8  # metres between the centres of two labels of one object
+HALF = 0.5  # share of a box from which it is on another one
 RANGE = 40.0  # metres, largest distance of an object to be found
 
 
@@ -43,11 +45,27 @@ class Truth:
     image: ImageLabels | None = None  # labels in the image, if the data set has them
     camera: Camera | None = None  # camera of that image
     unusable: tuple[str, ...] = ()  # one sentence for each label that cannot be used
+    judged: Bool | None = None  # (K,) False: an object on it is neither right nor wrong; None: all are judged
 
     @property
     def judged_names(self) -> frozenset[str]:
         """Names, in lower case, of which an object without a label is false."""
         return judged_names(self.labels).union(*self.accepted)
+
+    def unjudged_label(self, boxes: Boxes3D) -> I64:
+        """Return (J,) the row of the label of an unjudged type that a box is on, -1: none.
+
+        The two are no farther apart than a match may be, or half of the smaller one lies in the other.
+        """
+        none = np.full(len(boxes), -1, np.int64)
+        if self.judged is None or self.judged.all() or not len(boxes):
+            return none
+        labels = np.flatnonzero(~self.judged)
+        unjudged = self.boxes.chosen(labels)
+        offset = boxes.center[:, None, :2] - unjudged.center[None, :, :2]
+        is_on = np.linalg.norm(offset, axis=2) <= MAX_DISTANCE
+        is_on |= bev_iou_and_share(boxes, unjudged)[1] >= HALF
+        return np.where(is_on.any(axis=1), labels[is_on.argmax(axis=1)], none)
 
     def unlabelled(self, boxes: Boxes3D) -> Bool:
         """Return (J,) whether a box has its centre in an image region without labels (KITTI's DontCare)."""
@@ -141,7 +159,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
     Args:
         frame: the frame.
         labelled: boxes in any frame, with its pose. A label of a data set accepts the names that detectors
-            of COCO's classes use for it. Any other label accepts its own name only.
+            of COCO's classes use for it (``rule_of``). Any other label accepts its own name only.
     """
     boxes = in_points_frame(frame, labelled)
     must = must_be_found(frame, boxes, labelled.labels)
@@ -149,17 +167,18 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
     ]
-    accepted = {label: ACCEPTED_NAMES.get(label, frozenset((label.lower(),))) for label in labelled.labels}
+    rules = {label: rule_of(label, frame.label_names) for label in labelled.labels}
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
         boxes,
         labelled.labels,
-        tuple(accepted[label] for label in labelled.labels),
+        tuple(rules[label].names for label in labelled.labels),
         must,
         labelled.ids,
         labelled.image,
         camera,
         (*labelled.unusable, *flat),
+        np.array([rules[label].judged for label in labelled.labels], bool),
     )
 
 
@@ -169,10 +188,11 @@ def must_be_found(frame: Frame, boxes: Boxes3D, labels: Sequence[str]) -> Bool:
     Its centre lies within 40 m, and in the image of some camera if there is one, and its box holds 10 LiDAR
     points or more. Its label is of a type that detectors know, and no second label of one object.
     """
-    wanted = np.array([label.lower() not in OPTIONAL for label in labels], bool)
+    rules = {label: rule_of(label, frame.label_names) for label in labels}
+    wanted = np.array([rules[label].judged for label in labels], bool)
     must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes) & wanted, bool)
     for row in np.flatnonzero(must).tolist():
-        whole = [k for k, label in enumerate(labels) if label.lower() == PART_OF.get(labels[row].lower())]
+        whole = [k for k, label in enumerate(labels) if label.lower() == rules[labels[row]].whole]
         away = np.hypot(*(boxes.center[whole, :2] - boxes.center[row, :2]).T)
         must[row] = not (away <= SAME_PLACE).any()
     rows = np.flatnonzero(must)

@@ -22,8 +22,8 @@ class Matches:
     """Objects of a frame matched with its ground truth.
 
     An object is true if it matches a label that has to be found. It is false if it matches no label. It is
-    neither if it matches a label that need not be found, lies in a region without labels, or has a name that
-    the labels do not judge (``Truth.judged_names``).
+    neither if it matches a label that need not be found, is exempt (``exemptions``), or has a name that the
+    labels do not judge (``Truth.judged_names``).
     """
 
     partner: I32  # (J,) row of the object's label, else -1
@@ -80,9 +80,9 @@ class ObjectScore:
     _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     _frames: list[tuple[int, int, Counter[str]]] = field(default_factory=list)  # true, missed, false by name
 
-    def add(self, objects: Objects, truth: Truth) -> Matches:
+    def add(self, objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> Matches:
         """Match one frame's objects with the ground truth, best score first, and count."""
-        matches = judge(objects, truth)
+        matches = judge(objects, truth, cameras)
         self.count(objects.names, truth, matches)
         return matches
 
@@ -145,8 +145,15 @@ def share(right: int, wrong: int) -> float:
     return right / (right + wrong) if right + wrong else float("nan")
 
 
-def judge(objects: Objects, truth: Truth) -> Matches:
-    """Match the objects of a frame with its ground truth and judge them."""
+def judge(objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> Matches:
+    """Match the objects of a frame with its ground truth and judge them.
+
+    Args:
+        objects: objects of the frame.
+        truth: ground truth of the frame.
+        cameras: results with the detections of the objects. Without them a region without labels exempts only
+            objects with their centre in it.
+    """
     partner, distance = match(objects, truth)
     paired = partner >= 0
     missed = truth.must.copy()
@@ -155,8 +162,28 @@ def judge(objects: Objects, truth: Truth) -> Matches:
     true[paired] = truth.must[partner[paired]]
     judged = truth.judged_names
     is_judged = np.array([name.lower() in judged for name in objects.names], bool)
-    false = ~paired & ~truth.unlabelled(objects.boxes) & is_judged
-    return Matches(partner, distance, true, false, missed)
+    exempt = np.array([bool(why) for why in exemptions(objects, truth, cameras)], bool)
+    return Matches(partner, distance, true, ~paired & ~exempt & is_judged, missed)
+
+
+def exemptions(objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> list[str]:
+    """Return why each object would be neither right nor wrong without a label of its own; empty: it is false.
+
+    It is on a label of a type that is not judged, or in a region without labels: its centre, or more than
+    half of the image box of its detection (as KITTI's benchmark ignores detections).
+    """
+    in_region = truth.unlabelled(objects.boxes)
+    if truth.camera is not None:
+        detections = next((c.detections for c in cameras if c.camera.name == truth.camera.name), None)
+        of_camera = np.array([name == truth.camera.name for name in objects.camera], bool)
+        rows = np.flatnonzero(of_camera & (objects.detection >= 0))
+        if detections is not None:
+            in_region[rows] |= _in_regions(detections.xyxy[objects.detection[rows]], truth)
+    on_label = truth.unjudged_label(objects.boxes)
+    texts = ["in a DontCare region, where nothing is labelled" if inside else "" for inside in in_region]
+    for row in np.flatnonzero(on_label >= 0).tolist():
+        texts[row] = f"on a label of the type {truth.labels[on_label[row]]}, which is not judged"
+    return texts
 
 
 def match(objects: Objects, truth: Truth) -> tuple[I32, F64]:
@@ -231,6 +258,8 @@ class DetectionScore:
         cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
         partner, free = pair_in_order(cost, 1.0)
         excused, judged = _in_regions(detections.xyxy[kept], truth), truth.judged_names
+        if truth.judged is not None:
+            excused |= (overlap[:, ~truth.judged] >= DETECTION_OVERLAP).any(axis=1)
         to_find = truth.must & np.isfinite(boxes).all(axis=1)
         for name, k, is_excused in zip(names, partner.tolist(), excused.tolist(), strict=True):
             if k >= 0 and to_find[k]:

@@ -337,6 +337,7 @@ class Frame:
     robot_detections: tuple[LabelledBoxes2D, ...] = ()
     robot_clouds: tuple[Cloud, ...] = ()  # obstacle points, in the frame of the points
     truth: LabelledBoxes3D | None = None
+    label_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # source.labels
     tf_age: float = float("nan")
     problems: tuple[str, ...] = ()  # one clear sentence each
     around: RobotContext | None = None

@@ -112,7 +112,7 @@ MEANINGS = {  # of each reason that an answer can have, for the docs and the pag
     ReasonKind.DUPLICATE: "false: another object is the same thing already",
     ReasonKind.WRONG_DEPTH: "false: its image box is right, and its points are before or behind the thing",
     ReasonKind.WALL: "false: its points are a part of something larger",
-    ReasonKind.DETECTOR_ERROR: "false: the detector sees something, and nothing is labelled there",
+    ReasonKind.DETECTOR_ERROR: "false: no label is in reach; it is unlabelled, or the detector's own error",
     ReasonKind.FAILED: "a stage failed",
     ReasonKind.OUT_OF_VIEW: "no camera sees it",
     ReasonKind.HIDDEN: "fewer than three points; most returns in its direction end before it",

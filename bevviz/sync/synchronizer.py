@@ -551,6 +551,7 @@ class Synchronizer:
             robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
             robot_clouds=self._taken_clouds(reference, first, last, problems),
             truth=None if truth is None else self.placing.placed(truth, reference, problems),
+            label_names=self._config.source.labels,
             tf_age=reference.tf_age,
             problems=tuple(problems),
             around=self.around.take(lambda name: self.placing.world_from(reference, name)),

@@ -85,7 +85,7 @@ class Outcome:
     @cached_property
     def matches(self) -> Matches | None:
         """The objects matched with the ground truth. None: it is unknown."""
-        return None if self.truth is None else judge(self.objects, self.truth)
+        return None if self.truth is None else judge(self.objects, self.truth, self.result.cameras)
 
     @property
     def traces(self) -> FrameIndex:

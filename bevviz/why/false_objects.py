@@ -19,6 +19,7 @@ from bevviz.why.subject_matches import opinion_on
 LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
 BARELY = 2.0  # factor on a limit of the fusion within which it accepts an object only just
 DOUBLE = 0.1  # IoU from above from which two objects are one
+INSIDE = 0.6  # share of an object's box in a labelled one from which it is a part of that object
 DEPTH = 3.0  # metres that an object may be nearer than the points in the middle of its 2D box
 
 
@@ -63,21 +64,22 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
     owner = _owner(traces, objects, row)
     values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
     holder = _holder_of_points(traces, objects, row)
-    for number in dict.fromkeys((holder, owner)):
+    inside = _label_around(traces, objects, row)
+    for number in dict.fromkeys((holder, owner, inside)):
         if number < 0:
             continue
         subject = traces.truth[number]
         assert subject.box is not None
         away = float(np.linalg.norm(objects.boxes.center[row, :2] - subject.box.center[0, :2]))
-        values |= {"truth": subject.name, "away": away}
+        values |= {"truth": subject.name, "away": away, "inside": number == inside}
         other = np.flatnonzero(partner == number)
-        if len(other) and (number == holder or away <= MAX_DISTANCE):
+        if len(other) and (number in (holder, inside) or away <= MAX_DISTANCE):
             values["other"] = scored(objects, int(other[0]))
-            near = away <= MAX_DISTANCE or number == owner
+            near = away <= MAX_DISTANCE or number in (owner, inside)
             return Reason(ReasonKind.DUPLICATE if near else ReasonKind.SPLIT, None, values)
-        if number == holder and not subject.accepts(name):
+        if number in (holder, inside) and not subject.accepts(name):
             return Reason(ReasonKind.MISNAMED, None, values)
-        if number == holder:
+        if number in (holder, inside):
             return Reason(ReasonKind.MISPLACED, None, values)
     values |= {"truth": traces.truth[owner].name if owner >= 0 else "", "off": 0.0}
     if owner >= 0:
@@ -128,6 +130,17 @@ def _holder_of_points(traces: FrameIndex, objects: Objects, row: int) -> int:
         for subject in traces.truth
     ]
     return int(np.argmax(shares)) if shares and max(shares) >= MOST else -1
+
+
+def _label_around(traces: FrameIndex, objects: Objects, row: int) -> int:
+    """Return the row of the ground truth object whose box holds most of an object's, -1: none."""
+    truth = traces.labels_in_evaluate
+    if truth is None or not len(truth.boxes):
+        return -1
+    box = single_box(objects.boxes, row)
+    is_larger = np.prod(truth.boxes.size[:, :2], axis=1) >= np.prod(box.size[:, :2])
+    shares = np.where(is_larger, box_overlap.bev_iou_and_share(box, truth.boxes)[1][0], 0)
+    return int(shares.argmax()) if shares.max() >= INSIDE else -1
 
 
 def _larger_whole(traces: FrameIndex, objects: Objects, row: int) -> tuple[float, float] | None:

@@ -9,10 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, judge, truth_of
+from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, exemptions, judge, truth_of
 from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
-from bevviz.model.class_names import accepted_names
 from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
@@ -259,7 +258,7 @@ class FrameIndex:
     def truth(self) -> tuple[Subject, ...]:
         """Objects of the ground truth, in order of their rows."""
         truth = self.labels_in_evaluate
-        return () if truth is None else truth_subjects(truth, self.classes)
+        return () if truth is None else truth_subjects(truth)
 
     @cached_property
     def labels_in_evaluate(self) -> Truth | None:
@@ -273,7 +272,14 @@ class FrameIndex:
     def matches(self) -> Matches | None:
         """The judgement of ``evaluate`` about the objects of the frame."""
         objects, truth = self.result.objects, self.labels_in_evaluate
-        return None if objects is None or truth is None else judge(objects, truth)
+        return None if objects is None or truth is None else judge(objects, truth, self.result.cameras)
+
+    def exemption(self, row: int) -> str:
+        """Return why an object without a label is neither right nor wrong; empty: it is judged."""
+        objects, truth, matches = self.result.objects, self.labels_in_evaluate, self.matches
+        if objects is None or truth is None or matches is None or matches.partner[row] >= 0:
+            return ""
+        return exemptions(objects, truth, self.result.cameras)[row]
 
     def must(self, subject: Subject) -> bool:
         """Return whether a subject had to be reported.
@@ -418,20 +424,15 @@ def _near(points: F32, boxes: Boxes3D) -> Sequence[I64]:
     return np.split(rows, first[1:-1])
 
 
-def truth_subjects(truth: Truth, classes: Sequence[str] = ()) -> tuple[Subject, ...]:
-    """Return the objects of a frame's ground truth, in order of their rows.
-
-    Args:
-        truth: the ground truth.
-        classes: names of the classes that the detector knows.
-    """
+def truth_subjects(truth: Truth) -> tuple[Subject, ...]:
+    """Return the objects of a frame's ground truth, in order of their rows."""
     away = truth.boxes.distance
     return tuple(
         Subject(
             "truth",
             f"the {label.lower()} at {away[row]:.1f} m",
             label,
-            accepted_names(label, classes),
+            truth.accepted[row],
             row,
             box=single_box(truth.boxes, row),
         )

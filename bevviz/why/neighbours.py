@@ -70,7 +70,7 @@ class NeighbourRuns:
         """Return the number of right objects minus that of wrong ones."""
         result = perceive(frame, config, self._loader.load(config), memo)
         if frame.truth is not None and result.objects is not None:
-            matches = judge(result.objects, truth_of(frame, frame.truth))
+            matches = judge(result.objects, truth_of(frame, frame.truth), result.cameras)
             return int(matches.true.sum()) - int(matches.false.sum())
         unmatched = sum(
             int((camera.fusion.detection_decision[camera.detections.kept] != Decision.MATCHED).sum())

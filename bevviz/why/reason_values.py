@@ -89,6 +89,8 @@ class ReasonValues:
         if not self.result.frame.lidar:
             return self._detection()
         values, splits = self._object(), self.result.splits
+        if self.subject.kind == "object":
+            values["exempt"] = self.traces.exemption(self.subject.row)
         if splits is None or not values["camera"]:
             return {**values, "split_off": ()}
         parts = (splits.cluster == values["cluster"]) & (splits.points < splits.of)

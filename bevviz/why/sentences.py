@@ -90,6 +90,12 @@ def _object(reason: Reason) -> str:
 
 
 def _reported(reason: Reason, _: Subject) -> str:
+    exempt = reason.values.get("exempt")
+    return _made_by(reason) + (f", {exempt}: neither right nor wrong" if exempt else "")
+
+
+def _made_by(reason: Reason) -> str:
+    """Say what made a reported object."""
     if "object" not in reason.values:
         return f"{reason['detection']} was kept {_by(reason)}; without a LiDAR nothing tells where it is"
     if reason["opinion"]:
@@ -374,6 +380,9 @@ def _lost_in_fusion(reason: Reason, _: Subject) -> str:
 
 
 def _duplicate(reason: Reason, _: Subject) -> str:
+    if reason.values.get("inside"):
+        whole = f"it is inside the box of {reason['truth']}"
+        return f"{whole}: a second box of it, which {reason['other']} is already"
     what = f"{reason['truth']} is {reason['other']} already" if reason["truth"] else ""
     return f"it is a duplicate: {what or 'its box overlaps that of ' + str(reason['other'])}"
 
@@ -409,7 +418,7 @@ def _wall(reason: Reason, _: Subject) -> str:
 
 
 def _nothing_labelled(reason: Reason, _: Subject) -> str:
-    text = "it is the detector's own error: nothing is labelled there"
+    text = "no label is in reach: it is unlabelled, or the detector's own error"
     return f"{text}, and it is {reason['opinion']}" if reason["opinion"] else text
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from bevviz.evaluate import Truth, match
 from bevviz.evaluate.differences import Change, SideResult, compare_objects
-from bevviz.model.class_names import ACCEPTED_NAMES
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
 from bevviz.why.subject import Subject, count
@@ -71,8 +70,8 @@ class Effects:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Names of the objects that are gone."""
-        return tuple(effect.name for effect in self.gone)
+        """Names of the objects that are gone, except those that the ground truth calls false."""
+        return tuple(effect.name for effect in self.gone if not self.known or effect.truth >= 0)
 
     @property
     def right(self) -> tuple[str, ...]:
@@ -100,6 +99,7 @@ class Effects:
         """All effects in brief."""
         texts = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
         texts += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
+        texts += [f"removes {effect.name} (false)" for effect in self.gone if self.known and effect.truth < 0]
         texts += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
         texts += [f"adds {count(self.doubtful, 'doubtful object')}"] if self.doubtful > 0 else []
         texts += [f"changes {count(self.changed, 'other')}"] if self.changed else []
@@ -174,12 +174,7 @@ def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]
     if objects is None:
         return []
     boxes = Boxes3D.joined([subject.box for subject in subjects if subject.box is not None])
-    accepted = tuple(_accepted_names(subject.label) for subject in subjects)
+    accepted = tuple(subject.accepted for subject in subjects)
     labels = tuple(subject.label for subject in subjects)
     partner, _ = match(objects, Truth(boxes, labels, accepted, np.ones(len(labels), np.bool_)))
     return [int(row) for row in partner]
-
-
-def _accepted_names(label: str) -> frozenset[str]:
-    """Return the names of objects that ``evaluate`` accepts for a label."""
-    return ACCEPTED_NAMES.get(label, frozenset((label.lower(),)))
