@@ -30,6 +30,8 @@ from bevviz.live.typesupport import message_type
 from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
 from tests.support.live_sessions import run_beside
 
+pytestmark = pytest.mark.long
+
 BOXES, STRING = "vision_msgs/msg/Detection3DArray", "std_msgs/msg/String"
 MARK = "the person behind the van"
 PAGE_MARK = "odd (frame 7)"
@@ -258,7 +260,6 @@ def test_a_plan_is_shown_where_it_is(flight: Flight) -> None:
     assert placed and placed[-1].frame_id == "map"
 
 
-@pytest.mark.long
 def test_a_bag_gives_the_same_surroundings(flight: Flight) -> None:
     with BagSource([flight.folder / "snap.mcap"], load()) as source:
         frames = list(source)

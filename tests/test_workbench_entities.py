@@ -20,6 +20,8 @@ from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.session import WorkbenchSession
 from tests.support.workbench_pages import demo_bag
 
+pytestmark = pytest.mark.long
+
 FRAME = 3
 ROWS = 8  # of each entity that are clicked
 MARGIN = 0.3  # metres around the box of an answer
@@ -118,7 +120,6 @@ def _is_at(answer: Answer, place: NDArray[np.float64], path: str) -> bool:
     return bool(inside or near)
 
 
-@pytest.mark.long
 def test_every_drawn_entity_answers_about_itself(source: RecordedDrive, tmp_path: Path) -> None:
     session, result = WorkbenchSession(source), source.look(FRAME)
     seen, silent, others = set(), [], []
