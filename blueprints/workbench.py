@@ -14,10 +14,11 @@ def blueprint(scene: Scene) -> rrb.Blueprint:
         [views.cameras(scene, why=True, weak=True)] if scene.cameras else []
     )
     beside = (f"{entities.ROBOT.above}/**", f"{entities.WHY}/**")
+    above = views.from_above(scene, beside) if scene.moving else views.birds_eye(scene)
     return rrb.Blueprint(
         rrb.Horizontal(
-            views.spaces(scene, beside=beside, follow=entities.WHY_PART.path("place")),
-            rrb.Vertical(*side, views.birds_eye(scene), row_shares=[*[3] * len(side), 2]),
+            views.spaces(scene, beside=beside, names=False),
+            rrb.Vertical(*side, above, row_shares=[*[3] * len(side), 2]),
             column_shares=[4, 4],
         ),
         views.time_panel(play=rrb.components.PlayState.Paused),

@@ -77,6 +77,16 @@ def test_the_eye_follows_the_robot_and_the_explained_object(tmp_path: Path) -> N
     assert near["EyeControls3D:position"] == [[-3, 4, 6]]
 
 
+def test_the_views_of_the_page_show_frames_that_move(tmp_path: Path) -> None:
+    scene = replace(SCENES["one camera"], moving=True)
+    found = properties(save(blueprints.load("workbench", scene), tmp_path / "layout.rbl"))
+    for view, name in (("3D", "space"), ("Bird's-eye view", "above"), ("zed", "zed")):
+        assert found[view][1]["SpatialInformation:target_frame"] == [f"focus:{name}"]
+    contents, image = found["3D"][0], found["zed"][1]
+    assert "- /world/zed/**" in contents, "the viewer draws no camera in a scaled frame"
+    assert image["VisualBounds2D:range"] == [{"x_range": [0, 1000], "y_range": [0, 562.5]}]
+
+
 def test_the_view_from_above_starts_ahead_of_the_robot(tmp_path: Path) -> None:
     scene = SCENES["one camera"]
     path = save(blueprints.load("debug", scene, load()), tmp_path / "layout.rbl")

@@ -307,7 +307,7 @@ def test_a_frame_shows_nothing_of_frames_before_it(bag: Path, tmp_path: Path) ->
         for result in (results[0], blind(results[1]), blind(results[2])):
             bench.observe(result)
         first, *others = [bench.recording.rows[row] for row in range(len(bench.recording.rows))]
-        application = blueprints.application_id("workbench", drive.scene, drive.config)
+        application = blueprints.application_id("workbench", bench.recording.scene, drive.config)
         bench.close()
     (whole := tmp_path / "first.rrd").write_bytes(first)
     assert {store.application_id for store in RrdReader(whole).recordings()} == {application}

@@ -376,5 +376,6 @@ class Scene:
     topics: tuple[str, ...] = ()  # key=value settings that give the same topics the same roles
     focus: tuple[float, float, float] | None = None  # the point in question, in metres of Frame.points_frame
     above: tuple[float, float, float, float] | None = None  # u, v, u, v: start of a look from above
+    moving: bool = False  # the views go to what a user asks about
     raw: bool = True  # every raw cloud is logged
     color_by: tuple[Quantity, ...] = ()  # quantities that can colour the raw cloud

@@ -214,7 +214,13 @@ WHY_PART = Entity(
     "Points3D, LineStrips3D, Boxes2D",
     "`points`: raw points, brown ground, red noise, orange set aside, yellow unnamed cluster, light blue "
     "reported, dark blue in front; `legend`: its name and counts; `place`, `<camera>/place`: its place, "
-    "thin for further subjects",
+    "thin for further subjects; `<camera>/veil`: covers the rest of the image in the workbench",
+)
+FOCUS = Entity(
+    "/focus/{view}",
+    "Transform3D, LineStrips3D",
+    "in the workbench: pose of the coordinate frame of each view, which goes to the subject; `robot`: the "
+    "robot and rings of 10 m around it",
 )
 
 # Health

@@ -7,7 +7,7 @@ unexplained and unnamed ones are dotted.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -182,9 +182,12 @@ class _MarkDrawer:
         dashes = [_dashed(mark_lines, count) for mark_lines in lines]
         instances = [row for row, strokes in zip(rows, dashes, strict=True) for _ in strokes]
         says = [self._marks[row].sentence for row in instances]
-        style = replace(style, color=MARK_COLORS[state])
+        # Not static: the workbench dims what is not asked about.
+        colors = [MARK_COLORS[state]] * len(instances)
         addresses = self._addresses(instances)
-        draw(self._to, Layer(path, np.concatenate(dashes), style, says=says, frame=frame, rows=addresses))
+        strokes = np.concatenate(dashes)
+        layer = Layer(path, strokes, style, says=says, colors=colors, frame=frame, rows=addresses)
+        draw(self._to, layer)
         named = [row for row in rows if names and names[row]]
         if places is not None and named:
             texts, sentences = [names[row] for row in named], [self._marks[row].sentence for row in named]

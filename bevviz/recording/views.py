@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from bevviz.config.sections import Quantity
@@ -13,10 +14,14 @@ from bevviz.model.counts import OPINIONS
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
 from bevviz.recording.cloud import quantity_visualizer
+from bevviz.recording.focus import ABOVE, FROM_ABOVE, IMAGE_WIDTH, SPACE, frame_name
 from bevviz.recording.health import COUNTS
 from bevviz.recording.labels import EYE, LOOK_TARGET
+from bevviz.recording.marks import MARK_COLORS
 
 _DARK = (13, 14, 18)
+_FROM_ABOVE = (0.0, 0.0, 40.0)  # eye over the origin of its view
+_IMAGE_HEIGHT = 562.5  # of the view of an image of the width ``IMAGE_WIDTH``
 HIDDEN = rrb.EntityBehavior(visible=False)
 LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
 
@@ -33,6 +38,7 @@ def space(
     beside: Sequence[str] = (f"{entities.ROBOT.above}/**",),
     by: Quantity | None = None,
     follow: str | None = None,
+    above: bool = False,
 ) -> rrb.Spatial3DView:
     """Return a 3D view of points, boxes, frustums and poses, seen from behind and above the robot.
 
@@ -50,6 +56,7 @@ def space(
         beside: further contents of the view.
         by: quantity that colours the raw points; None: ground or obstacle.
         follow: entity that the eye goes to whenever it moves.
+        above: look straight down, where the views of the scene go to a subject.
     """
     hidden = [entities.SET_ASIDE.path(scene.lidar)]
     # The coloured points of the clusters and the raw cloud already show the obstacles.
@@ -63,28 +70,40 @@ def space(
     hidden += [entities.CLUSTERS.path(scene.lidar), entities.FRUSTUMS] if why else []
     hidden += [entities.CLUSTERS.path(scene.lidar), entities.FRUSTUMS] if by is not None else []
     name_entities = entities.NAMES.path(entities.FUSED), entities.NAMES.path(entities.FUSION)
-    hidden += [*name_entities] if why or not names else []
+    if why or not names:
+        hidden += [
+            *name_entities,
+            *(entities.NAMES.path(entities.MARKED.path(state)) for state in MARK_COLORS),
+        ]
     overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: quantity_visualizer(by) for path in clouds}
     position, target = EYE, LOOK_TARGET
-    if why and scene.focus is not None:
+    # Without a target frame, contents outside of the origin's tree make the viewer use the fixed frame.
+    target_frame = entities.space(root + entities.SENSOR.path(scene.lidar))
+    away: list[str] = []
+    if scene.moving:
+        # The viewer draws no camera in a scaled frame.
+        sensors = [
+            entity.path(camera) for camera in scene.cameras for entity in (entities.SENSOR, entities.WHY_PART)
+        ]
+        away = [f"- {path}/**" for path in sensors]
+        position, target = (_FROM_ABOVE if above else tuple(np.subtract(EYE, LOOK_TARGET))), (0.0, 0.0, 0.0)
+        target_frame = frame_name(ABOVE if above else SPACE)
+    elif why and scene.focus is not None:
         position, target = _eye_near(scene.focus), scene.focus
     return rrb.Spatial3DView(
         name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.SENSOR.path(scene.lidar),
-        contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else [])],
+        contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else []), *away],
         background=_DARK,
         line_grid=False,
-        # Without this, contents outside of the origin's tree make the viewer use the fixed frame.
-        spatial_information=rrb.SpatialInformation(
-            target_frame=entities.space(root + entities.SENSOR.path(scene.lidar))
-        ),
+        spatial_information=rrb.SpatialInformation(target_frame=target_frame),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
             position=position,
             look_target=target,
-            eye_up=(0.0, 0.0, 1.0),
+            eye_up=(1.0, 0.0, 0.0) if above else (0.0, 0.0, 1.0),
             tracking_entity=follow,
         ),
         overrides=overrides,
@@ -128,12 +147,22 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
     """
     contents = ["$origin/**", *([f"{entities.ROBOT.above}/**"] if scene.robot else [])]
     points_and_names = [entities.PROJECTED.path(name), entities.NAMES.path(entities.DETECTIONS.path(name))]
-    hidden = [*(points_and_names if why else []), *([] if weak else [entities.WEAK.path(name)])]
+    names_of_marks = [entities.NAMES.path(entities.IMAGE_MARK.path(name, state)) for state in MARK_COLORS]
+    hidden = [
+        *([*points_and_names, *names_of_marks] if why else []),
+        *([] if weak else [entities.WEAK.path(name)]),
+    ]
+    options: dict[str, Any] = {}
+    if scene.moving:
+        options["spatial_information"] = rrb.SpatialInformation(target_frame=frame_name(name))
+        x_range, y_range = (0.0, IMAGE_WIDTH), (0.0, _IMAGE_HEIGHT)
+        options["visual_bounds"] = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     return rrb.Spatial2DView(
         name=name,
         origin=entities.SENSOR.path(name),
         contents=[*contents, *([f"{entities.WHY_PART.path(name)}/**"] if why else [])],
         overrides=dict.fromkeys(hidden, HIDDEN),
+        **options,
     )
 
 
@@ -143,6 +172,13 @@ def cameras(scene: Scene, *, why: bool = False, weak: bool = False) -> rrb.Conta
     if len(views) == 1:
         return views[0]
     return rrb.Tabs(*views, name="Cameras") if len(views) > 2 else rrb.Vertical(*views, name="Cameras")
+
+
+def from_above(scene: Scene, beside: Sequence[str]) -> rrb.Container | rrb.View:
+    """Return a view of the scene from above that goes to the subject, with the bird's-eye image in a tab."""
+    robot = f"{entities.FOCUS.above}/**"
+    view = space(scene, raw=False, names=False, name=FROM_ABOVE, beside=[*beside, robot], above=True)
+    return rrb.Tabs(view, birds_eye(scene, name="Its image"))
 
 
 def birds_eye(scene: Scene, root: str = "", name: str = "Bird's-eye view") -> rrb.Spatial2DView:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
@@ -10,8 +11,11 @@ import rerun as rr
 from bevviz.config import BevConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F32, U8, Boxes3D, Camera, Frame
+from bevviz.model.results import FrameResult
 from bevviz.recording import entities
-from bevviz.recording.layers import Layer, Style, draw
+from bevviz.recording.focus import Focus, dim_rest, eye_distance, log_focus
+from bevviz.recording.labels import under
+from bevviz.recording.layers import Layer, Style, draw, name_layers
 from bevviz.recording.primitives import document, transform
 from bevviz.recording.projection import bev_outlines, bev_pixels, edges
 from bevviz.recording.writer import Writer
@@ -39,6 +43,9 @@ NAMES = {
 }
 _SUBJECT = StateColor.SUBJECT.value
 _LINE = 0.65  # metres between the lines of the legend
+_NAME = 0.035  # of the distance from the eye to a subject, from its top to its name
+_MARGIN = np.float32(0.06)  # metres that the outline of a subject is longer than its box, whose lines hide it
+_LENGTH = 2.0  # metres, of a subject without a box
 _DEPTH = 20.0  # metres, length of a frustum where the distance is unknown
 
 
@@ -49,7 +56,12 @@ def clear_answers(to: Writer) -> None:
 
 
 def log_answers(
-    to: Writer, frame: Frame, answers: Sequence[Answer], shown: int, above: BevConfig | None = None
+    to: Writer,
+    frame: Frame,
+    answers: Sequence[Answer],
+    shown: int,
+    above: BevConfig | None = None,
+    counted: bool = True,
 ) -> None:
     """Log the sentences of all answers, and draw the first ones at the writer's current time.
 
@@ -59,6 +71,7 @@ def log_answers(
         answers: the answers, worst first.
         shown: number of answers to draw.
         above: configuration of the bird's-eye view, to draw there as well.
+        counted: write the meaning of the colours beside the first one.
     """
     to.write(entities.WHY, document(markdown_page(answers, shown)))
     drawn = answers[:shown]
@@ -71,19 +84,19 @@ def log_answers(
     strips, widths = list[F32](), list[float]()
     for answer in drawn:
         box = answer.subject.box
-        lines = [] if box is None else [edges(geometry.corners(box)[0])]
+        lines = [] if box is None else [edges(geometry.corners(replace(box, size=box.size + _MARGIN))[0])]
         lines += [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
         strips += lines
-        widths += [2.0 if answer is drawn[0] else 0.5] * len(lines)
+        widths += [2.5 if answer is drawn[0] else 0.5] * len(lines)
     points, place = entities.WHY_PART.path("points"), entities.WHY_PART.path("place")
     layers = [
-        *_legend(frame, drawn),
+        *_legend(frame, drawn, counted),
         Layer(points, frame.points[known], Style(width=4.0), colors=colors[fate[known]]),
         Layer(place, strips, Style(_SUBJECT), widths=widths),
     ]
     for layer in layers:
         _log_frame_of_points(to, layer, frame)
-    images = [_image_layer(camera, drawn) for camera in frame.cameras]
+    images = [layer for camera in frame.cameras for layer in _image_layers(camera, drawn)]
     draw(to, *layers, *images, *_layers_above(frame, drawn, above, fate), put=to.write)
 
 
@@ -107,18 +120,19 @@ def focus_point(frame: Frame, answer: Answer) -> F32 | None:
     return np.median(points, axis=0).astype(np.float32) if len(points) else None
 
 
-def _legend(frame: Frame, drawn: Sequence[Answer]) -> Iterator[Layer]:
-    """Yield the name of the worst subject and the meaning of its colours above it."""
+def _legend(frame: Frame, drawn: Sequence[Answer], counted: bool) -> Iterator[Layer]:
+    """Yield the name of the worst subject above it. ``counted``: with the meaning of its colours."""
     place = focus_point(frame, drawn[0]) if drawn else None
     if place is None:
         return
     subject, counts = drawn[0].subject, np.bincount(drawn[0].fate, minlength=len(Fate))
-    fates = [fate for fate in COLORS if counts[fate]]
+    fates = [fate for fate in COLORS if counts[fate]] if counted else []
     lines = [f"{counts[fate]} {NAMES[fate]}" for fate in fates] + [subject.name]
     colors = [COLORS[fate] for fate in fates] + [_SUBJECT]
     top = place[2] + (0.5 if subject.box is None else subject.box.size[0, 2] / 2)
+    line = _LINE if counted else _NAME * eye_distance(_length(drawn[0]))
     places = np.tile(place, (len(lines), 1))
-    places[:, 2] = top + _LINE * (1 + np.arange(len(lines)))
+    places[:, 2] = top + line * (1 + np.arange(len(lines)))
     path, style = entities.WHY_PART.path("legend"), Style(width=0.0, labels=True)
     yield Layer(path, places, style, lines, colors=colors)
 
@@ -152,9 +166,39 @@ def mark_answers(to: Writer, frame: Frame, answers: Sequence[Answer], above: Bev
     to.refresh()  # A viewer may lack what was logged with earlier answers.
     to.set_time(frame.index, frame.stamp, frame.received)
     clear_answers(to)
-    log_answers(to, frame, answers, len(answers), above)
+    log_answers(to, frame, answers, len(answers), above, counted=False)
     to.set_time(frame.index + 1, frame.stamp + 1, frame.received and frame.received + 1)
     clear_answers(to)
+
+
+def focus_answer(to: Writer, result: FrameResult, answer: Answer, number: int) -> Focus:
+    """Bring the subject of an answer before the eye of every view, and dim the rest of its frame.
+
+    Args:
+        to: writer of the answers.
+        result: result of the frame.
+        answer: the answer.
+        number: number of the answer in its page.
+
+    Returns:
+        The focus, for the positions of clicks.
+    """
+    frame = result.frame
+    boxes = {camera.name: box for camera in frame.cameras if (box := _image_box(camera, answer)) is not None}
+    place = focus_point(frame, answer)
+    if place is None:
+        strips = [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
+        place = np.concatenate(strips).mean(axis=0) if strips else None
+    focus = Focus.on(frame, place, _length(answer), boxes)
+    log_focus(to, frame, focus, number)
+    to.set_time(frame.index, frame.stamp, frame.received)
+    dim_rest(to, result, boxes)
+    return focus
+
+
+def _length(answer: Answer) -> float:
+    """Return the longest side of an answer's subject in metres."""
+    return _LENGTH if answer.subject.box is None else float(answer.subject.box.size.max())
 
 
 def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
@@ -170,14 +214,22 @@ def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
             yield edges(geometry.apply(points_from_camera, corners))
 
 
-def _image_layer(camera: Camera, answers: Sequence[Answer]) -> Layer:
-    """Return the image boxes of the subjects over a camera's image."""
-    boxes, names = list[F32](), list[str]()
-    for number, subject in enumerate(answer.subject for answer in answers):
-        image_box = subject.xyxy if subject.camera == camera.name else None
-        box = projected_box(subject.box, camera) if subject.box is not None else image_box
-        if box is not None:
-            boxes.append(box)
-            names.append("" if number else subject.name)
-    path, style = entities.WHY_PART.path(f"{camera.name}/place"), Style(_SUBJECT, order=40.0)
-    return Layer(path, np.array(boxes, np.float32).reshape(-1, 4), style, names, frame=camera.name)
+def _image_layers(camera: Camera, answers: Sequence[Answer]) -> Iterator[Layer]:
+    """Yield the boxes of the subjects over a camera's image, and the name of the first one."""
+    seen = {row: box for row, one in enumerate(answers) if (box := _image_box(camera, one)) is not None}
+    if not seen:
+        return
+    boxes, order = np.array(list(seen.values()), np.float32), 40.0
+    path = entities.WHY_PART.path(f"{camera.name}/place")
+    yield Layer(path, boxes, Style(_SUBJECT, order=order), frame=camera.name)
+    if 0 in seen:  # The label of a box is as narrow as the box.
+        name = [answers[0].subject.name]
+        yield from name_layers(path, under(boxes[:1]), name, name, order, _SUBJECT, camera.name)
+
+
+def _image_box(camera: Camera, answer: Answer) -> F32 | None:
+    """Return the (4,) box of an answer's subject in a camera's image. None: it is not there."""
+    subject = answer.subject
+    if subject.box is not None:
+        return projected_box(subject.box, camera)
+    return subject.xyxy if subject.camera == camera.name else None

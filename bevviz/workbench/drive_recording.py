@@ -6,6 +6,7 @@ import bisect
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import rerun as rr
 import rerun_bindings
@@ -13,10 +14,11 @@ import rerun_bindings
 from bevviz.config import Config
 from bevviz.findings.frame_findings import Finding, find_findings
 from bevviz.findings.marks import log_findings
-from bevviz.model.frame import Scene
+from bevviz.model.frame import Frame, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints, entities
 from bevviz.recording.addresses import EntityRows, RowCache
+from bevviz.recording.focus import Focus, log_focus, log_robot_from_above
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
@@ -41,14 +43,17 @@ class DriveRecording(Closable):
         total: number of frames of the drive.
 
     Attributes:
+        scene: names of the sensors, and whether the views move.
         rows: pieces that every page gets. The first has the layout, the static data and a frame.
         on_demand: whether pages get further frames only on demand, because they hold no whole recording.
         recording_id: recording id of all pieces.
+        usual_focus: where the views look without a subject. None: no frame was shown yet.
     """
 
     def __init__(self, scene: Scene, config: Config, total: int) -> None:
-        self._scene, self._config, self._total = scene, config, total
+        self.scene, self._config, self._total = replace(scene, moving=bool(scene.lidar)), config, total
         self.rows, self.on_demand = RecordingBuffer(), False
+        self.usual_focus: Focus | None = None
         self._frames: FrameCache | None = None
         self._frame_versions: dict[int, int] = {}  # of the frames in ``_frames``
         self._rows_by_stamp: dict[int, int] = {}
@@ -60,10 +65,12 @@ class DriveRecording(Closable):
         self._together = TOGETHER[0]  # Few large pieces take a quarter of the bytes of many small ones.
         self.recording_id = f"bench-{time.time_ns()}"
         recording, self._stream = self.stream()
-        recording.send_blueprint(blueprints.load("workbench", scene, config), make_active=True)
-        self._logger = FrameLogger(recording, config, scene, wait=SCALAR_WAIT, stamps=BOTH)
+        recording.send_blueprint(blueprints.load("workbench", self.scene, config), make_active=True)
+        self._logger = FrameLogger(recording, config, self.scene, wait=SCALAR_WAIT, stamps=BOTH)
         self._logger.apart = True  # Pages receive frames in any order, so each is complete.
         self._logger.log_static()
+        if self.scene.moving:
+            log_robot_from_above(self._logger, scene.lidar)
         self._numbers: FrameLogger | None = None  # logger of the numbers of a long drive
 
     def close(self) -> None:
@@ -79,7 +86,7 @@ class DriveRecording(Closable):
         self, batches: rr.ChunkBatcherConfig | None = None
     ) -> tuple[rr.RecordingStream, rr.BinaryStream]:
         """Return a new stream into the recording, for a further thread that writes to it."""
-        application = blueprints.application_id("workbench", self._scene, self._config)
+        application = blueprints.application_id("workbench", self.scene, self._config)
         recording = rr.RecordingStream(application, recording_id=self.recording_id, batcher_config=batches)
         recording.set_log_time_enabled(False)
         return recording, rr.binary_stream(recording)
@@ -87,7 +94,7 @@ class DriveRecording(Closable):
     def mark_logger(self) -> tuple[FrameLogger, rr.BinaryStream]:
         """Return a logger of marks, and its stream."""
         recording, stream = self.stream()
-        return FrameLogger(recording, self._config, self._scene, stamps=BOTH), stream
+        return FrameLogger(recording, self._config, self.scene, stamps=BOTH), stream
 
     def tried_logger(self, config: Config | None = None) -> tuple[FrameLogger, rr.BinaryStream]:
         """Return a logger that writes tried results on a timeline of their own, and its stream.
@@ -98,23 +105,35 @@ class DriveRecording(Closable):
         recording, stream = self.stream()
         config, stamps = config or self._config, (entities.TRIED,)
         return FrameLogger(
-            recording, config, self._scene, wait=SCALAR_WAIT, stamps=stamps, inputs=False
+            recording, config, self.scene, wait=SCALAR_WAIT, stamps=stamps, inputs=False
         ), stream
 
     # --- frames as opened ----------------------------------------------------------------------
 
-    def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
+    def show(self, result: FrameResult, findings: Sequence[Finding], first: int) -> None:
         """Record a frame for all pages, which may come before frames that were recorded already.
 
         The first one decides whether the others come on demand.
+
+        Args:
+            result: result of the frame.
+            findings: its findings.
+            first: first stamp of the drive, from which on the views have poses.
         """
         with self._drawing:
+            if self.scene.moving and not self._rows_by_stamp:
+                self._log_usual_focus(result.frame, first)
             piece = self._drawn_piece(result, findings)
         if not self._rows_by_stamp and len(piece) * self._total > WHOLE:
             self._frames, self.on_demand = FrameCache(), True
             self._logger.streams_video = False  # A page may lack the packets that a picture depends on.
         self._rows_by_stamp[result.frame.stamp] = len(self.rows)
         self.rows.add(piece)
+
+    def _log_usual_focus(self, frame: Frame, first: int) -> None:
+        """Log the poses of the views without a subject."""
+        self.usual_focus = focus = Focus.usual(frame, self.scene.cameras)
+        log_focus(self._logger, replace(frame, stamp=first), focus, 0)
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame with this stamp."""
@@ -156,7 +175,7 @@ class DriveRecording(Closable):
         if self._numbers is None:
             recording, self._numbers_stream = self.stream(rr.ChunkBatcherConfig.NEVER())
             self._numbers = FrameLogger(
-                recording, self._config, self._scene, wait=float("inf"), stamps=BOTH, inputs=False
+                recording, self._config, self.scene, wait=float("inf"), stamps=BOTH, inputs=False
             )
         self._numbers.log_numbers(result)
         self._waiting_numbers += 1

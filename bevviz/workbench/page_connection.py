@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -296,7 +296,11 @@ class PageConnection:
             return Selection.parse(str(message["pick"]))
         instance = message.get("instance")
         row = None if instance is None else int(instance)
+        position: Sequence[float]
         position = [float(value) for value in message.get("position") or () if value is not None]
+        if self._overlay is not None and position:
+            stamp, view = round(float(message["time"])), str(message.get("view", ""))
+            position = self._source.position(self._overlay, stamp, view, position)
         return self._source.select(frame, settings, str(message["entity"]), row, position)
 
     async def _try(self, number: int, message: Message) -> None:

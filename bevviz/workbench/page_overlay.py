@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import bisect
 import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from bevviz.errors import UserError
+from bevviz.recording import entities
+from bevviz.recording.focus import Focus
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.support.contexts import Closable
 from bevviz.workbench.buffers import RecordingBuffer
 
 if TYPE_CHECKING:
     import rerun as rr
+
+    from bevviz.model.results import FrameResult
+    from bevviz.why import Answer
 
 NewLogger = Callable[[], tuple[FrameLogger, "rr.BinaryStream"]]  # a logger into the recording, and its stream
 
@@ -51,6 +57,9 @@ class PageOverlay(Closable):
     Attributes:
         buffer: pieces of the recording for this page.
         known: entities that tried results of this page had.
+        marked: result and answer that were marked last. None: none yet.
+        marks: number of marks until now.
+        marking: guards the marker, ``marked`` and ``marks``.
     """
 
     def __init__(self, lane: str, marker: NewLogger, tried: NewLogger) -> None:
@@ -58,6 +67,10 @@ class PageOverlay(Closable):
         self.marker, self._marks = marker()
         self._attempt = Attempt(self, *tried())
         self.known: frozenset[str] = frozenset()
+        self.marked: tuple[FrameResult, Answer] | None = None
+        self.marks = 0
+        self.marking = threading.Lock()
+        self._focuses: list[tuple[int, Focus]] = []  # by stamp, sorted
         self._lock = threading.Lock()
 
     def close(self) -> None:
@@ -69,6 +82,18 @@ class PageOverlay(Closable):
             self.buffer.close()
             # Rerun keeps the threads of a stream as long as a reference to it exists.
             del self.marker, self._marks, self._attempt
+
+    def keep_focus(self, stamp: int, focus: Focus) -> None:
+        """Keep where the views of the page look from a stamp on."""
+        with self._lock:
+            self._focuses = [one for one in self._focuses if one[0] != stamp]
+            bisect.insort(self._focuses, (stamp, focus), key=lambda one: one[0])
+
+    def focus_at(self, stamp: int) -> Focus | None:
+        """Return where the views of the page look at a stamp. None: nothing was marked until then."""
+        with self._lock:
+            row = bisect.bisect_right(self._focuses, stamp + entities.TIME_TOLERANCE, key=lambda one: one[0])
+            return self._focuses[row - 1][1] if row else None
 
     def attempt(self) -> Attempt:
         """Return the attempt of the next try. It has a new logger if the last try was stopped."""

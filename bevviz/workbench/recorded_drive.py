@@ -25,7 +25,7 @@ from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import Answer
-from bevviz.why.log import mark_answers
+from bevviz.why.log import focus_answer, mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
@@ -77,6 +77,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self._thumbnails = Thumbnails(len(self.again.scans))
         self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
         self._overlays = 0  # number of overlays until now
+        self._open_overlays: list[PageOverlay] = []
         self.over = False
         self._overview: OverviewFrames | None = None  # while it is made
         self._done, self._error = 0, ""
@@ -240,18 +241,21 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
                 f"overlay-{self._overlays}", self.recording.mark_logger, self.recording.tried_logger
             )
             self.lanes[overlay.lane] = overlay.buffer
+            self._open_overlays.append(overlay)
         return overlay
 
     def close_overlay(self, overlay: PageOverlay) -> None:
         """Remove an overlay whose page is closed."""
         with self._lock:
             self.lanes.pop(overlay.lane, None)
+            self._open_overlays.remove(overlay)
         overlay.close()
         end_unused_streams()
 
     def show(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Record a frame of the run, which may come before frames that were recorded already."""
-        self.recording.show(result, findings)
+        self.recording.show(result, findings, self.first or result.frame.stamp)
+        self._dim_again(result.frame.index)
         self._picture(result.frame)
         if self.opening is None:
             self.opening = result.frame.stamp
@@ -398,8 +402,28 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
         """Mark the object of an answer in every view of a page."""
         if overlay is not None:
-            mark_answers(overlay.marker, result.frame, [answer], result.config.bev)
-            overlay.add_marks()
+            with overlay.marking:
+                overlay.marked, overlay.marks = (result, answer), overlay.marks + 1
+                mark_answers(overlay.marker, result.frame, [answer], result.config.bev)
+                if self.recording.scene.moving:
+                    focus = focus_answer(overlay.marker, result, answer, overlay.marks)
+                    overlay.keep_focus(result.frame.stamp, focus)
+                overlay.add_marks()
+
+    def _dim_again(self, number: int) -> None:
+        """Dim a frame that was drawn again in the pages that have marked an object of it."""
+        with self._lock:
+            overlays = [*self._open_overlays]
+        for overlay in overlays:
+            if overlay.marked is not None and overlay.marked[0].frame.index == number:
+                self.mark(*overlay.marked, overlay)
+
+    def position(
+        self, overlay: PageOverlay, stamp: int, view: str, position: Sequence[float]
+    ) -> Sequence[float]:
+        """Return a position in a view among the points or in the image, see ``Focus.position``."""
+        focus = overlay.focus_at(stamp) or self.recording.usual_focus
+        return position if focus is None else focus.position(view, position)
 
     def try_values(
         self, number: int, settings: Settings, attempt: Attempt | None = None

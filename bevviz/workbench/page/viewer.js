@@ -149,7 +149,8 @@ function viewerEvent(event) {
   if (event.type === "selection_change") {
     const item = event.items.find((one) => one.type === "entity");
     if (item) {
-      callbacks.clicked({ entity: item.entity_path, instance: item.instance_id ?? null, position: item.position ?? null });
+      const { entity_path: entity, instance_id: instance = null, position = null, view_name: view = "" } = item;
+      callbacks.clicked({ entity, instance, position, view });
     }
   }
 }
