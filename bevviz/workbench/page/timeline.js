@@ -1,4 +1,5 @@
 // Timeline under the viewer: one lane for each sort of finding, the shown time, and a click that goes there.
+// The height of a bar is the number of findings at its time, its shade the distance of the nearest one.
 
 import { $, at, frameTimes, state } from "./page_state.js";
 import { kind, seek } from "./viewer.js";
@@ -13,11 +14,14 @@ const LANES = [
 ];
 const NAMES = 64; // pixels for the names of the lanes
 const HIT = 6; // pixels from the middle of a narrow mark that a click may be off
-const ROW = 12; // pixels
+const ROW = 16; // pixels
+const LOWEST = 4; // pixels, of the bar of one finding
+const [NEAR, FAR] = [5, 40]; // metres: a nearer one has the full colour, a farther one the faintest
+const [FAINTEST, UNKNOWN] = [0.35, 0.7]; // opacities: of the farthest, and where the distance is unknown
 
 let rows = [];
 let choose = () => {};
-let marks = []; // x, y, half of the width, entry and row of its sight, of each mark that is drawn
+let marks = []; // x, y, half of the width, number of findings, and entry and row of the nearest, of each bar
 const picture = document.createElement("canvas"); // the marks, which are drawn again only when they change
 let pictured = ""; // findings, frames and size that the picture has
 let changes = 0; // number of changes of the findings
@@ -27,7 +31,7 @@ export function start(choosing) {
   $("events").onclick = clicked;
   $("events").onpointermove = (event) => {
     const mark = markAt(event);
-    $("events").title = mark ? `${mark.entry.what} ${mark.entry.name} at ${at(mark.entry.sights[mark.row][1])}` : "";
+    $("events").title = mark ? told(mark) : "";
     showThumbnail(event, rowAt(event));
   };
   $("events").onpointerleave = () => { $("thumbnail").hidden = true; };
@@ -78,31 +82,54 @@ export function draw() {
   }
 }
 
-// Draw one mark for each pixel of a lane, however many findings a long drive has there.
+// Draw one bar for each pixel of a lane, however many findings a long drive has there.
 function drawMarks(shown, x, each, width, height, scale) {
   [picture.width, picture.height] = [width * scale, height * scale];
   const pen = picture.getContext("2d");
   pen.scale(scale, scale);
   const style = getComputedStyle(document.documentElement);
-  const color = (name) => style.getPropertyValue(name);
-  marks = [];
   pen.font = "10px system-ui, sans-serif";
   pen.textBaseline = "middle";
-  for (const [number, lane] of shown.entries()) {
-    const y = 2 + ROW * number;
-    pen.fillStyle = color("--faint");
-    pen.fillText(lane.name, 8, y + ROW / 2);
-    pen.fillStyle = color(lane.color);
-    const drawn = new Set();
-    for (const entry of lane.entries) {
-      for (const [row, one] of entry.sights.entries()) {
-        const at = x(one[1]);
-        if (drawn.size === drawn.add(Math.round(at)).size) continue;
-        pen.fillRect(at - each / 2, y + 2, each, ROW - 4);
-        marks.push({ x: at, y, half: Math.max(HIT, each / 2), entry, row });
-      }
+  const drawn = shown.map((lane, number) => ({ ...lane, y: 2 + ROW * number, bars: bars(lane, x) }));
+  const most = Math.max(1, ...drawn.flatMap(({ bars }) => bars.map((bar) => bar.count)));
+  marks = drawn.flatMap(({ y, bars }) => bars.map((bar) => ({ ...bar, y, half: Math.max(HIT, each / 2) })));
+  for (const { name, color, y, bars } of drawn) {
+    pen.fillStyle = style.getPropertyValue("--faint");
+    pen.fillText(name, 8, y + ROW / 2);
+    pen.fillStyle = style.getPropertyValue(color);
+    for (const { x: middle, count, distance } of bars) {
+      const tall = LOWEST + ((ROW - 2 - LOWEST) * (count - 1)) / Math.max(1, most - 1);
+      pen.globalAlpha = shade(distance);
+      pen.fillRect(middle - each / 2, y + ROW - 1 - tall, each, tall);
+    }
+    pen.globalAlpha = 1;
+  }
+}
+
+// Bars of a lane: its findings at each pixel, and the nearest of them.
+function bars(lane, x) {
+  const all = new Map();
+  for (const entry of lane.entries) {
+    for (const [row, one] of entry.sights.entries()) {
+      const at = x(one[1]);
+      const bar = all.get(Math.round(at)) ?? { x: at, count: 0, distance: null };
+      bar.count += 1;
+      if (bar.count === 1 || (one[2] ?? Infinity) < (bar.distance ?? Infinity)) Object.assign(bar, { entry, row, distance: one[2] });
+      all.set(Math.round(at), bar);
     }
   }
+  return [...all.values()];
+}
+
+function shade(distance) {
+  if (distance === null) return UNKNOWN;
+  const far = Math.min(1, Math.max(0, (distance - NEAR) / (FAR - NEAR)));
+  return 1 - far * (1 - FAINTEST);
+}
+
+function told({ entry, row, count }) {
+  const when = at(entry.sights[row][1]);
+  return count === 1 ? `${entry.what} ${entry.name} at ${when}` : `${count} at ${when}; the nearest: ${entry.what} ${entry.name}`;
 }
 
 function markAt(event) {
