@@ -182,3 +182,25 @@ def test_a_bag_in_a_loop_gives_no_advice_about_clocks(robot: Robot) -> None:
         assert len(session.frames) > 100
         advice = [text for text in session.said if "clock" in text or "sync." in text]
         assert not advice and session.told("the stamps of the clouds jumped back")
+
+
+def test_several_robots_are_named(robot: Robot) -> None:
+    """Frames begin with the name of their robot, so that each sensor is of one robot for certain."""
+    with joined(robot.graph) as session:
+        for name in ("van", "truck"):
+            robot.publishers |= {
+                f"/{name}/lidar": robot.graph.advertise(f"/{name}/lidar", CLOUD),
+                f"/{name}/odom": robot.graph.advertise(f"/{name}/odom", "nav_msgs/msg/Odometry"),
+            }
+        for topic in TOPICS:
+            robot.graph.withdraw(robot.publishers.pop(topic))
+        for _ in range(30):
+            for name in ("van", "truck"):
+                cloud = make_cloud(f"{name}/lidar", robot.graph.time_ns())
+                robot.graph.publish(robot.publishers[f"/{name}/lidar"], cloud)
+            robot.graph.advance(STEP)
+        (told,) = session.source.problems.of("namespaces")
+        assert str(told) == (
+            "the topics are of 2 robots, truck and van: truck is shown; "
+            "--set source.lidar_topics=[/van/lidar] shows van"
+        )

@@ -162,7 +162,7 @@ class InputProblems:
             over = f"{name} is there, as the configuration states"
             note("stated", name, misstated.get(name, ""), over)
         merged = "" if node.namespace.strip("/") else merged_robots(topics, self._inputs.frame_ids)
-        note("robots", "namespaces", merged, "one robot is received")
+        note("robots", "namespaces", merged or roles.robots, "one robot is received")
 
     # --- time ----------------------------------------------------------------------------------
 
