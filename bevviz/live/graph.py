@@ -15,7 +15,8 @@ from bevviz.messages.definitions import learn, store_of
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's node name for a publisher that is discovered before its node
 LATCHED_DEPTH = 100  # one message of each node that publishes static transforms
-SENSOR_DEPTH = 5
+CLOUD_DEPTH = 5
+IMAGE_DEPTH = 30  # images that arrive while a cloud of 50 MB is received and decoded
 STREAM_DEPTH = 100  # small messages that come in bursts
 FIRST = 1.0  # seconds after subscribing in which lost messages are expected and not counted
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -80,11 +81,15 @@ def matched_qos(publishers: Sequence[Any], kind: str) -> Any:
 
     reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
-    bulky = kind in ("PointCloud2", "Image", "CompressedImage")
-    streamed = PACKET_DEPTH if kind == "PacketMsg" else STREAM_DEPTH
+    depths = {
+        "PointCloud2": CLOUD_DEPTH,
+        "Image": IMAGE_DEPTH,
+        "CompressedImage": IMAGE_DEPTH,
+        "PacketMsg": PACKET_DEPTH,
+    }
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=SENSOR_DEPTH if bulky else LATCHED_DEPTH if latched else streamed,
+        depth=depths.get(kind, LATCHED_DEPTH if latched else STREAM_DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -64,7 +64,9 @@ def add_index(path: Path) -> None:
     indexed = path.with_name(f"{path.stem}{INDEX}{secrets.token_hex(4)}")
     handle = create_file(indexed)
     try:
-        with suppress(UserError):  # A run that removes leftovers has it for a moment, and its file is made again.
+        with suppress(
+            UserError
+        ):  # A run that removes leftovers has it for a moment, and its file is made again.
             lock_file(handle, "")
         optimize = [rerun_cli.rerun_program(), "rrd", "optimize", str(path), "-o", str(indexed)]
         done = subprocess.run(
