@@ -469,6 +469,16 @@ def test_bags_are_found_in_folders_and_by_pattern(tmp_path: Path) -> None:
     assert [bag.name for bag in find_bags([tmp_path / "**/*.mcap"])] == ["a.mcap", "drive_0.mcap"]
 
 
+def test_a_plain_folder_is_a_drive_unless_it_holds_bags(tmp_path: Path) -> None:
+    for name in ("day/lidar/000000.pcd", "day/camera/000000.png"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).touch()
+    assert find_bags([tmp_path / "day"]) == find_bags([tmp_path]) == [tmp_path / "day"]
+    (tmp_path / "day/recorded").mkdir()
+    (tmp_path / "day/recorded/a.mcap").touch()
+    assert tmp_path / "day/recorded/a.mcap" in find_bags([tmp_path / "day"])
+
+
 def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = bags.write(tmp_path / "drive", bags.small_items(scans=1))
     runs = tmp_path / "runs"

@@ -120,8 +120,8 @@ def test_a_picture_beside_the_drive_leaves_its_stamps_alone(tmp_path: Path) -> N
     )
     assert there == {"top": [1700000001.5, 1700000001.6], "front": [1700000001.52, 1700000001.62]}
     told = drive_in.warnings  # type: ignore[attr-defined]
-    assert sum("left out (stamps.csv can say it)" in line for line in told) == 2
-    assert any(line.startswith("overview.png: the name does not tell") for line in told)
+    assert sum("left out (stamps.csv can say it)" in line for line in told) == 1
+    assert "overview.png: beside the folders of the cameras: left out" in told
 
 
 def test_images_that_are_numbered_beside_clouds_with_stamps(tmp_path: Path) -> None:

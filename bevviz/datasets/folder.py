@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevviz.config.files import parse_yaml
-from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_cloud, why_no_points
+from bevviz.datasets.cloud_files import CLOUDS, array_shape, read_bytes, read_cloud, why_no_points
 from bevviz.datasets.dataset import (
     BASE,
     IMAGES,
@@ -31,9 +31,10 @@ from bevviz.datasets.dataset import (
     read_table,
     subfolders,
 )
-from bevviz.datasets.stamps import file_times, group_by_sensor, stamps_in
+from bevviz.datasets.stamps import MAX_SENSORS, file_times, group_by_sensor, stamps_in
 from bevviz.datasets.sustech_labels import truth_streams
 from bevviz.errors import UserError
+from bevviz.messages.images import encoded_size
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Intrinsics
 from bevviz.support.extensions import load, registered
@@ -144,7 +145,13 @@ class Folder(Dataset):
         # Without a stated mounting, the only LiDAR's frame may be tilted.
         has_base = len(lidars) > 1 or (path / POSES).is_file() or any("pose" in s for s in _stated(about))
         unplaced = [name for name in lidars if "pose" not in about.get("lidars", {}).get(name, {})]
-        if len(lidars) > 1 and unplaced:
+        if unplaced and len(unplaced) < len(lidars) and not (path / CALIBRATION).is_file():
+            lidars = {name: files for name, files in lidars.items() if name not in unplaced}
+            self.warn(
+                f"{', '.join(unplaced)}: no calibration says how it is mounted beside {', '.join(lidars)}: "
+                f"left out (pose in {CALIBRATION})"
+            )
+        elif len(lidars) > 1 and unplaced:
             self.warn(
                 f"nothing says how {', '.join(unplaced)} {'are' if len(unplaced) > 1 else 'is'} mounted: the "
                 f"points are taken as they are, in {BASE} (pose in {CALIBRATION})"
@@ -199,14 +206,23 @@ class Folder(Dataset):
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""
         sensors: dict[str, dict[str, list[Path]]] = {"lidars": {}, "cameras": {}}
-        names = _sensor_folders(self.path)
+        names, beside = _sensor_folders(self.path), dict[str, list[Path]]()
         for folder in names:
             for kind, suffixes, default in (("lidars", CLOUDS, "lidar"), ("cameras", IMAGES, "camera")):
                 name = names[folder] or default
                 if name in sensors[kind] or (folder == self.path and name in names.values()):
                     name = f"{(folder if folder == self.path else folder.parent).name}_{name}"
                 files = _without_copies(files_in(folder, suffixes))
+                if kind == "cameras":
+                    files = list(self._camera_images(files))
                 sensors[kind] |= self._split_by_sensor(name, files, about.get(kind, ()))
+            if folder == self.path:
+                beside = {} if sensors["lidars"] else dict(sensors["cameras"])
+        pictures = [file for files in beside.values() for file in files]
+        others = [files for name, files in sensors["cameras"].items() if name not in beside]
+        if 0 < len(pictures) < max(map(len, others), default=0):
+            sensors["cameras"] = {n: f for n, f in sensors["cameras"].items() if n not in beside}
+            self.warn(f"{self._name_files(pictures)}: beside the folders of the cameras: left out")
         if broken := [file for folder in names for file in _broken_links(folder)]:
             self.warn(f"{self._name_files(broken)}: a link to what is not there")
         lidars = sensors["lidars"]
@@ -214,6 +230,27 @@ class Folder(Dataset):
             if reason := why_no_points(max(lidars[name], key=lambda file: file.stat().st_size)):
                 self.warn(f"{self._name_files(lidars.pop(name))}: {reason}: left out")
         return lidars, sensors["cameras"]
+
+    def _camera_images(self, files: Sequence[Path]) -> Sequence[Path]:
+        """Leave out pictures that no camera took: a label image beside its JPEG, and a screenshot.
+
+        A screenshot has another file type, name and size than the camera's images.
+        """
+        photos = {file.stem for file in files if file.suffix.lower() in (".jpg", ".jpeg")}
+        files = [f for f in files if f.suffix.lower() != ".png" or f.stem not in photos]
+        groups = dict[tuple[str, str], list[Path]]()
+        for file in files:
+            groups.setdefault((file.suffix.lower(), re.sub(r"\d+", "0", file.stem)), []).append(file)
+        if not 1 < len(groups) <= MAX_SENSORS:
+            return files
+        suffix, name = max(groups, key=lambda group: (len(groups[group]), group[0] != ".png"))
+        size = encoded_size(read_bytes(groups[suffix, name][0]))
+        for (other_suffix, _), pictures in groups.items():
+            if other_suffix != suffix and (other := encoded_size(read_bytes(pictures[0]))) != size:
+                text = f"{other[0]} x {other[1]}, and the camera's images {size[0]} x {size[1]}"
+                self.warn(f"{self._name_files(pictures)}: {text}: left out as no image of it")
+                files = [file for file in files if file not in pictures]
+        return files
 
     def _related_images(self, lidars: Mapping[str, Sequence[Path]]) -> dict[str, dict[Path, Path]]:
         """Return the images that lie in a folder for each cloud: by camera, with their clouds."""

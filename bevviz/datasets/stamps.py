@@ -18,6 +18,7 @@ DATE = re.compile(  # 20121214T142255.814212, 2011-09-26_13-02-25-594, 202311142
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
     r"(?:[-_.](\d{1,9})|(\d{3}|\d{6}))?(?=\D*$)"
 )
+PADDED = re.compile(r"[A-Za-z]*0\d{3,}")
 DECIMAL, WHOLE = re.compile(r"\d+(?:\.\d+)?"), re.compile(r"\d+")
 DIGITS = {19: 1, 16: 1000, 13: 1_000_000, 10: SECOND}  # number of digits of a stamp: nanoseconds of its unit
 UNITS = {1: "nanoseconds", 1000: "microseconds", 1_000_000: "milliseconds", SECOND: "seconds"}
@@ -99,12 +100,16 @@ def _words(match: re.Match[str]) -> list[str]:
 
 
 def _counter_columns(rows: Iterable[Sequence[str]]) -> set[int]:
-    """Return the columns of words that are counters: numbers with more values than sensors are possible."""
-    columns = zip(*rows, strict=False)
+    """Return the columns of words that are counters, such as ``frame000104``.
+
+    They are numbers with more values than sensors are possible, or padded ones that all differ.
+    """
+    columns = [(i, column, len(set(column))) for i, column in enumerate(zip(*rows, strict=False))]
     return {
         i
-        for i, column in enumerate(columns)
-        if len(set(column)) > MAX_SENSORS and all(map(str.isdigit, column))
+        for i, column, values in columns
+        if (values > MAX_SENSORS and all(map(str.isdigit, column)))
+        or (values == len(column) and all(map(PADDED.fullmatch, column)))
     }
 
 

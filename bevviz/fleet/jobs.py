@@ -175,13 +175,19 @@ def _bags(path: Path) -> Iterator[Path]:
         yield path
         return
     bags, loader = bag_files(path), find_loader(path)
-    if not bags and loader is not None and not loader.any_folder:
+    if not bags and loader is not None and not (loader.any_folder and _has_bags_inside(path)):
         yield from loader.drives(path)
         return
     yield from bags
     for inner in sorted(path.iterdir()):
         if inner.is_dir() and not inner.name.startswith("."):
             yield from _bags(inner)
+
+
+def _has_bags_inside(path: Path) -> bool:
+    """Return whether a subfolder is a bag or has bags, so that clouds beside it are no drive."""
+    inner = [folder for folder in path.iterdir() if folder.is_dir()]
+    return any((folder / METADATA).is_file() or bag_files(folder) for folder in inner)
 
 
 def name_bags(bags: Sequence[Path], owners: Mapping[str, str]) -> dict[Path, str]:

@@ -148,7 +148,7 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
             f"{topic}: compressed image of format '{msg.format}' holds neither JPEG, PNG nor WebP data "
             f"({len(encoded)} bytes)"
         )
-    width, height = _size_of(encoded)
+    width, height = encoded_size(encoded)
     if width * height > MOST_PIXELS:
         raise MessageError(
             f"{topic}: an image of {width} x {height} pixels is not taken: {MOST_PIXELS} at most"
@@ -183,7 +183,7 @@ def decode_compressed_image(msg: Any, topic: str, received: int) -> Image:
     )
 
 
-def _size_of(encoded: bytes) -> tuple[int, int]:
+def encoded_size(encoded: bytes) -> tuple[int, int]:
     """Return width and height from the header of a PNG, JPEG or WebP; 0 if the header is missing or cut."""
     if encoded.startswith(b"RIFF"):
         return _size_of_webp(encoded)

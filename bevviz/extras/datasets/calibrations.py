@@ -37,12 +37,16 @@ OPTICAL_FROM_BODY = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0,
 LENSES = {"radtan": "plumb_bob", "equi": "equidistant", "fisheye": "equidistant", "none": ""}
 CAMERAS = (2, 0, 1, 3, 4)  # of KITTI: the left colour camera first
 ANY_CAMERA = "camera"  # the only one of a folder, whatever its name
+ANY_LIDAR = "lidar"  # a folder's LiDAR without a name of its own
 # T_camera_lidar, T_cl and the like: the target first, as in a_from_b.
 DIRECTION = re.compile(
     r"T_?(?P<target>c(am(era)?)?\d*_?(?=(l|v))|(l(idar)?|velo(dyne)?)_?(?=c))"
     r"(c(am(era)?)?\d*|l(idar)?|velo(dyne)?)",
     re.IGNORECASE,
 )
+# os1_cloud_node-pylon_camera_node, vel2os1
+BETWEEN = re.compile(r"(?P<base>\w+)-(?P<sensor>\w+)|(?P<source>[a-z]\w*?)2(?P<target>[a-z]\w*)")
+CAMERA_WORD = re.compile("cam", re.IGNORECASE)
 SAME = 1e-3  # relative difference of two calibrations of a camera
 TOLERANCE = 0.02  # of a rotation matrix, which some tools write with few digits
 
@@ -76,6 +80,7 @@ def find_calibrations(path: Path, lidars: Collection[str], cameras: Collection[s
         lidars: names of its LiDARs.
         cameras: names of its cameras.
     """
+    cameras = [name for name in cameras if not LABELS.search(name)] or cameras  # images with labels
     found = FoundCalibration()
     stated_in = dict[Path, list[FoundSensor]]()
     for file in _candidates(path):
@@ -139,7 +144,11 @@ def _note(
 
 def _means(sensor: FoundSensor, names: Collection[str], single: bool) -> str:
     """Return the sensor of the folder that a statement is about; empty if it is not clear."""
-    return match_name(sensor.name, names, alone=single or sensor.is_lidar or sensor.name == ANY_CAMERA)
+    alone = single or sensor.is_lidar or sensor.name == ANY_CAMERA
+    name = match_name(sensor.name, names, alone=alone)
+    pose = sensor.base_from_sensor
+    is_base = sensor.is_lidar and pose is not None and np.array_equal(pose, np.eye(4))
+    return ANY_LIDAR if is_base and not name and ANY_LIDAR in names else name
 
 
 def match_name(name: str, names: Collection[str], *, alone: bool) -> str:
@@ -197,7 +206,13 @@ def _sensors_of(file: Path) -> list[FoundSensor]:
 
 
 def _text(file: Path) -> Iterator[FoundSensor]:
-    """Read lines of a name and numbers: those of KITTI's benchmarks and raw drives, and of CalibAnything."""
+    """Read lines of a name and numbers: those of KITTI's benchmarks and raw drives, and of CalibAnything.
+
+    RELLIS-3D's ``camera_info.txt`` has fx, fy, cx and cy alone.
+    """
+    if file.name == "camera_info.txt":
+        yield FoundSensor(ANY_CAMERA, {"K": _pinhole(read_text(file, MAX_SIZE).split())})
+        return
     if "extrin" in file.stem.lower() and (matrix := _plain_matrix(file)) is not None:
         yield FoundSensor(ANY_CAMERA, {}, matrix)
         return
@@ -299,15 +314,17 @@ def _opencalib(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
 
 
 def _camera_info(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
-    """Read camera matrices as ROS' camera_calibration, OpenCV and Autoware.AI write them."""
-    matrix = next((tree[key] for key in ("camera_matrix", "CameraMat", "K") if key in tree), None)
+    """Read camera matrices as ROS' camera_calibration, its CameraInfo, OpenCV and Autoware.AI write them."""
+    matrix = next((tree[key] for key in ("camera_matrix", "CameraMat", "K", "k") if key in tree), None)
     matrix = matrix.get("data") if isinstance(matrix, dict) else matrix
     if not isinstance(matrix, list) or len(matrix) not in (3, 9):
         return
-    keys = ("distortion_coefficients", "DistCoeff", "dist_coeffs", "D")
+    keys = ("distortion_coefficients", "DistCoeff", "dist_coeffs", "D", "d")
     distortion: Any = next((tree[key] for key in keys if key in tree), {})
     D = _flat(distortion.get("data", ()) if isinstance(distortion, dict) else distortion)
-    sides = tree.get("ImageSize") or [tree.get("image_width", 0), tree.get("image_height", 0)]
+    sides = tree.get("ImageSize") or [
+        tree.get(f"image_{side}", tree.get(side, 0)) for side in ("width", "height")
+    ]
     lens = {"K": _square(matrix), "size": sides, **_lens(D, str(tree.get("distortion_model", "")))}
     extrinsic = tree.get("CameraExtrinsicMat")
     lidar_from_camera = _rigid(extrinsic["data"]) if isinstance(extrinsic, dict) else None
@@ -420,6 +437,24 @@ def _fast_livo(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
         yield FoundSensor(ANY_CAMERA, {**lens, **_lens(D, "plumb_bob")})
 
 
+def _between_frames(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
+    """Read RELLIS-3D: ``LIDAR-CAMERA`` is the camera's pose in the LiDAR, ``vel2os1`` moves points so.
+
+    The first sensor of a name with ``-``, and the last one of a name with ``2``, is the base of the others.
+    """
+    for key, about in tree.items():
+        match = BETWEEN.fullmatch(key) if isinstance(about, dict) and {"q", "t"} <= about.keys() else None
+        if match is None:
+            continue
+        q, t = about["q"], about["t"]
+        pose = geometry.transform_wxyz([t[axis] for axis in "xyz"], [q[part] for part in "wxyz"])
+        base, sensor = match["base"] or match["target"], match["sensor"] or match["source"]
+        if CAMERA_WORD.search(base):
+            base, sensor, pose = sensor, base, geometry.inverse(pose)
+        yield FoundSensor(base, {}, None, np.eye(4), is_lidar=True)
+        yield FoundSensor(sensor, {}, None, pose, is_lidar=not CAMERA_WORD.search(sensor))
+
+
 def _matrix_by_name(tree: Mapping[str, Any], name: str) -> Iterator[FoundSensor]:
     """Read one transform whose name tells its direction, such as ``T_cam_lidar`` or ``T_C_L``."""
     pose = _named_transform(tree)
@@ -463,6 +498,7 @@ PARSERS: Sequence[Callable[[Mapping[str, Any], str], Iterator[FoundSensor]]] = (
     _autoware,
     _direct_visual,
     _fast_livo,
+    _between_frames,
     _matrix_by_name,
 )
 
