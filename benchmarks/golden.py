@@ -559,7 +559,8 @@ def _live(folder: Path) -> Results:
     """Run the live path over replayed frames, slowly enough that none is dropped."""
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.extras.demo.drive import SyntheticSource
-    from bevviz.live.runtime import Live, Outputs
+    from bevviz.live.run_outputs import Outputs
+    from bevviz.live.runtime import Live
     from bevviz.live.status import Notes
     from tests.support.replay import Replay
 

@@ -19,7 +19,8 @@ from tqdm import tqdm
 
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.extras.demo.drive import SyntheticSource
-from bevviz.live.runtime import Live, Outputs, Status
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live, Status
 from bevviz.live.status import Notes
 from tests.support.replay import Replay
 

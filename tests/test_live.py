@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 import signal
@@ -34,9 +35,10 @@ from bevviz.live.files import RecordingSaver, unused_names
 from bevviz.live.flight_recorder import FlightRecorder, Triggers
 from bevviz.live.indexing import INDEX, Indexer, add_index, remove_leftovers
 from bevviz.live.outputs import RETRY, Program, Viewer
-from bevviz.live.runtime import Live, Outputs
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
 from bevviz.live.source_wrappers import ThinnedSource, thin
-from bevviz.live.status import Notes
+from bevviz.live.status import Notes, keep_large_apart
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
     CameraResult,
@@ -124,7 +126,7 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         said: list[str] | None = None,
         **outputs: Any,
     ) -> Outcome:
-        monkeypatch.setattr("bevviz.live.runtime.Indexer", NoIndexer)
+        monkeypatch.setattr("bevviz.live.run_outputs.Indexer", NoIndexer)
         said = [] if said is None else said
         if source is None and rate is not None:
             source = Replay(frames, drive.scene, rate=rate, total=total)
@@ -770,9 +772,9 @@ def test_parts_open_on_their_own_and_lack_nothing_together(
 
 def test_a_run_is_saved_in_parts(run: Run) -> None:
     outcome = run(["live.split_time=1 s"], total=5, save=Path("drive.rrd"))
-    assert outcome.live.saver is not None
-    assert outcome.live.saver.paths == sorted(Path().glob("drive_*.rrd"))
-    assert [number for part in outcome.live.saver.paths for number in numbers(part)] == list(range(5))
+    (parts,) = outcome.live.outputs.saved
+    assert parts == sorted(Path().glob("drive_*.rrd"))
+    assert [number for part in parts for number in numbers(part)] == list(range(5))
 
 
 @pytest.mark.long
@@ -955,7 +957,7 @@ def test_a_late_viewer_sees_the_static_data_and_the_recent_past(
     port = a_port()
 
     def during(live: Live) -> None:
-        (url,) = live.urls
+        (url,) = live.outputs.urls
         assert url.startswith(f"http://localhost:{port}/?url=")
         until(lambda: listens(port))
         until(lambda: live.frames == 30)
@@ -1062,6 +1064,20 @@ def test_jumping_stamps_end_no_run(run: Run, frames: list[Frame], drive: Synthet
     assert outcome.live.frames == 10
     p99 = Recording(Path("out.rrd")).column("/health/latency_ms/p99", "Scalars:scalars")
     assert all(value[0] < 60_000 for value in p99)
+
+
+def test_large_buffers_leave_no_gaps_in_the_heap() -> None:
+    class Counts(ctypes.Structure):
+        """glibc's mallinfo2; the fifth number is the bytes in mappings of their own."""
+
+        _fields_ = [(f"n{number}", ctypes.c_size_t) for number in range(10)]
+
+    library = ctypes.CDLL(None)
+    library.mallinfo2.restype = Counts
+    keep_large_apart()
+    before = library.mallinfo2().n4
+    kept = bytes(3_000_000)
+    assert library.mallinfo2().n4 - before >= len(kept)
 
 
 # --- files of earlier runs ---------------------------------------------------------------------

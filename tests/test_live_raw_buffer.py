@@ -41,7 +41,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.files import define
 from bevviz.live.raw_recorder import LatchedMessages, RawMessage, RawRecorder, children
-from bevviz.live.runtime import Live, Outputs
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore

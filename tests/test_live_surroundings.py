@@ -23,7 +23,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.raw_recorder import RawRecorder
-from bevviz.live.runtime import Live, Outputs
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
 from bevviz.live.status import TYPE, Diagnostics, Notes
 from bevviz.live.typesupport import message_type

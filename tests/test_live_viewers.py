@@ -12,7 +12,9 @@ import bevviz
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
-from bevviz.live.runtime import Live, Outputs
+from bevviz.live.indexing import Indexer
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
@@ -85,7 +87,7 @@ def test_viewers_get_fewer_points_and_files_all(
 def test_what_is_held_to_be_saved_has_all_points(bench: RunningRobot, results: list[FrameResult]) -> None:
     live = bench.live
     packet = live.encoder.encode(results[0], live.scene, {}, ())
-    flight = FlightRecorder(live.config.live, live.encoder, live._indexer, live.notes)
+    flight = FlightRecorder(live.config.live, live.encoder, Indexer(), live.notes)
     flight.put(packet)
     assert flight.packets()[0].data == packet.data and flight.packets()[0].thinned is None
     assert packet.thinned is not None and len(packet.thinned) < len(packet.data) / 2

@@ -274,7 +274,8 @@ def _watch(
     problems: CurrentProblems | None = None,
 ) -> int:
     """Run until the source ends or the user ends it."""
-    from bevviz.live.runtime import Live, Outputs
+    from bevviz.live.run_outputs import Outputs
+    from bevviz.live.runtime import Live
 
     output = options.output
     show_window = output.viewer
@@ -298,7 +299,7 @@ def _watch(
         problems=problems,
     )
     live.on_change = follow(live)
-    for url in live.urls:
+    for url in live.outputs.urls:
         say(f"viewer at {url}", always=True)
     if no_output and not show_window:
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
@@ -325,11 +326,8 @@ def _watch(
             late = f"{comparison.late_images} of the robot's detections in images"
             say(f"{late} came when their frames were compared already: not compared")
     warn(live.summary)
-    written_paths = [
-        saver.paths for saver in (live.saver, live.raw_saver) if saver is not None and saver.paths
-    ]
     targets = [
-        f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "") for paths in written_paths
+        f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "") for paths in live.outputs.saved
     ]
     target = f" in {', '.join(targets)}" if targets else ""
     drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]

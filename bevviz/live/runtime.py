@@ -14,21 +14,21 @@ from typing import Any
 
 from bevviz.checks import InputChecks
 from bevviz.config import Config
-from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
-from bevviz.live.encoder import WHOLE, Encoder, Packet
-from bevviz.live.files import BagSaver, RecordingSaver, free_names
-from bevviz.live.flight_recorder import FlightRecorder, Triggers
-from bevviz.live.indexing import Indexer
-from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
+from bevviz.live.encoder import WHOLE, Encoder
+from bevviz.live.flight_recorder import Triggers
+from bevviz.live.live_settings import LiveSettings
+from bevviz.live.outputs import Output
 from bevviz.live.problems import CurrentProblems
 from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.result_problems import ResultProblems
 from bevviz.live.robot_comparison import RobotComparison
+from bevviz.live.run_outputs import Outputs, RunOutputs
 from bevviz.live.source_wrappers import RobotFrames, ThinnedSource, warm_up
-from bevviz.live.status import Health, Notes, set_nice
+from bevviz.live.status import Health, Notes, keep_large_apart
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -41,19 +41,6 @@ LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 PAUSE = 1.0  # seconds without a frame after which the states of the topics are shown without one
 GLANCE = 0.2  # seconds between two looks at them then
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """Outputs of a run, any number at once: files, window, web viewer at a port, remote viewers."""
-
-    save: Path | None = None
-    window: bool = False
-    serve: int | None = None
-    bind: str = "127.0.0.1"
-    connect: Sequence[str] = ()
-    blueprint: str = "live"
-    raw: Path | None = None  # .mcap file for the messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,70 +90,39 @@ class Live:
         robot: str | None = None,
         problems: CurrentProblems | None = None,
     ) -> None:
-        self.notes = notes
-        self._control = control
+        self.notes, self.raw, self._control = notes, raw, control
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
-        self.urls: list[str] = []
         self.frames = 0  # frames logged so far
-        self._source, self._settings = source, settings
+        self._source = source
         self._thinned = ThinnedSource(source, lambda: self.config)
         self.problems = problems or CurrentProblems(notes.warn)
         self._results = ResultProblems(self.problems)
         self._on_result = on_result
         self.checks = InputChecks(source, settings.config)
         self._shown = settings.config  # the configuration last passed to ``on_change``
-        self._changing = threading.Lock()
         self._over = threading.Event()
         self._asked_to_save = False
         self._looked = self._logged = self._glanced = 0.0  # seconds, monotonic
-        self._lag_watch = LagWatch(self.problems)
         self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
 
-        self._set_nice(live.nice)
         self._observes = observe
         self.session = (
             ObservingSession(settings.config) if observe else LiveSession(settings.config, loader=loader)
         )
+        self._settings = LiveSettings(settings, self.session, notes, self._follow)
         self.against = None if robot is None else RobotComparison(robot, live)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
         network = "" if observe else self.session.stages.provider
         self.encoder = Encoder(
             self.config, source.scene, outputs.blueprint, whole, self.against, network=network
         )
-        self._indexer = Indexer()
+        self.outputs = RunOutputs(outputs, live, self.encoder, notes, self.problems, raw)
+        self.flight = self.outputs.flight
         self._watchers: list[Callable[[FrameResult], None]] = []
-        self.flight = FlightRecorder(live, self.encoder, self._indexer, notes, raw)
-        self.raw = raw
         self._triggers = Triggers(live)
         self.health = Health()
         self._dropping = DropPolicy()
-
-        encoder = self.encoder
-        programs = [remote(url, encoder.application, encoder.recording_id) for url in outputs.connect]
-        if outputs.serve is not None:
-            program, address = server(outputs.serve, outputs.bind, live.viewer_memory)
-            programs.append(program)
-            self.urls.append(address)
-        if outputs.window:
-            programs.append(window())
-        self.saver: RecordingSaver | None = None
-        self._outputs: list[Output] = []
-        save, raw_path = free_names(outputs.save, outputs.raw, notes)
-        if save is not None:
-            self.saver = RecordingSaver(save, live, self.encoder, self._indexer, notes)
-            self._outputs.append(self.saver)
-        self.raw_saver: BagSaver | None = None
-        if raw_path is not None:
-            if raw is None:
-                raise UserError(f"--save {raw_path}: only a robot's messages can be saved")
-            self.raw_saver = BagSaver(raw_path, live, raw, notes, follows=self.saver is not None)
-            if self.saver is not None:
-                self.saver.on_part = self.raw_saver.next_part
-        sparse = live.viewer_rate is not None
-        self._outputs += [
-            Viewer(program, live.output_queue, self.encoder, notes, sparse=sparse) for program in programs
-        ]
 
     @property
     def config(self) -> Config:
@@ -206,7 +162,7 @@ class Live:
             output: takes the packets.
             watcher: called with each logged result, in the logging thread.
         """
-        self._outputs.append(output)
+        self.outputs.attach(output)
         self._watchers.append(watcher)
 
     @property
@@ -221,7 +177,7 @@ class Live:
             "memory, MB": status.memory,
         }
         numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
-        numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, lag in self._lags.items()}
+        numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, lag in self.outputs.lags.items()}
         return numbers | {path.rpartition("/")[2]: n for path, n in self.flight.scalars.items()}
 
     def save(self, path: Path | None = None) -> Path:
@@ -263,9 +219,10 @@ class Live:
         observers: list[Observer[FrameResult]] = [LoggingObserver(self), self.checks]
         if self._on_result is not None:
             observers.append(PublishingObserver(self._on_result, self.notes))
+        keep_large_apart()
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
-            stack.callback(self._close)
+            stack.enter_context(self.outputs)
             if self._control is None:
                 stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(answer_sigusr1(ask_to_save))
@@ -281,25 +238,13 @@ class Live:
 
     def _check(self) -> None:
         """Check the configuration file, the clock, the topics and the viewers."""
-        if self._settings.changed():
-            self._reload()
+        self._settings.look()
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
-        self._lag_watch.check(self._outputs)
+        self.outputs.check()
         if self._shown is not self.config:
             self._shown = self.config
             self.on_change(self._shown)
-
-    def _close(self) -> None:
-        """Close all outputs and finish the recordings."""
-        for output in self._outputs:
-            output.close()
-        if self.raw_saver is not None:
-            self.raw_saver.close()
-        self.flight.close()
-        if self._indexer.close():
-            self.notes.info("the recording gets its index in the background; it is complete already")
-        self.encoder.close()
 
     def warm_up(self) -> None:
         """Compile and load everything that the first frame needs. Scans of that time count as no drops."""
@@ -309,14 +254,13 @@ class Live:
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.DROPS.path(where): float(count) for where, count in self._drops().items()}
-        lags = {entities.VIEWER_LAG.path(name): 1e3 * lag for name, lag in self._lags.items()}
-        health = self.health.scalars() | drops | lags | self.flight.scalars
+        health = self.health.scalars() | drops | self.outputs.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
         boxes = [(late_result.frame_stamp, late_result.boxes) for late_result in late]
         compared = self.against.compare(result, boxes) if self.against is not None else ()
         notes, scene = self.notes.take(), self._source.scene
-        self._hand_out(self.encoder.encode(result, scene, health, notes, late, states, compared))
+        self.outputs.put(self.encoder.encode(result, scene, health, notes, late, states, compared))
         self._results.observe(result)
         for watcher in self._watchers:
             watcher(result)
@@ -347,11 +291,6 @@ class Live:
         if reason := against.reason():
             self.flight.save_soon(reason, self.config.live.trigger_after)
 
-    @property
-    def _lags(self) -> dict[str, float]:
-        """Seconds that each viewer is behind, by name."""
-        return {output.name: lag for output in self._outputs if (lag := output.lag) is not None}
-
     def _log_meanwhile(self) -> None:
         """Log messages and topic states while no frame comes."""
         since, states = time.monotonic() - self._logged, self._topic_states()
@@ -359,13 +298,7 @@ class Live:
             return
         if (notes := self.notes.take()) or states != self._states:
             self._states = states
-            self._hand_out(self.encoder.encode_meanwhile(since, notes, states))
-
-    def _hand_out(self, packet: Packet) -> None:
-        """Pass a packet to every output and the flight recorder."""
-        for output in self._outputs:
-            output.put(packet)
-        self.flight.put(packet)
+            self.outputs.put(self.encoder.encode_meanwhile(since, notes, states))
 
     def _topic_states(self) -> dict[str, str]:
         """Return the states of the topics, by entity path."""
@@ -373,61 +306,21 @@ class Live:
 
     def _drops(self) -> dict[str, int]:
         """Return the dropped frames and messages, by cause."""
-        drops = {"source": self._source.dropped, **self._dropping.dropped}
-        for output in self._outputs:
-            drops[output.name] = drops.get(output.name, 0) + output.dropped
-        if self.raw_saver is not None:
-            drops[self.raw_saver.name] = self.raw_saver.dropped
-        return drops
+        return {"source": self._source.dropped, **self._dropping.dropped, **self.outputs.dropped}
 
     # --- changes -------------------------------------------------------------------------------
 
     def update(self, settings: Sequence[str], without: Sequence[str] = ()) -> None:
-        """Apply settings, ``key=value`` as after ``--set``. Any thread may call it.
+        """Apply settings, see ``LiveSettings.update``. Any thread may call it."""
+        self._settings.update(settings, without)
 
-        Args:
-            settings: settings that override all earlier ones.
-            without: settings of an earlier call to revert.
-
-        Raises:
-            UserError: a setting is wrong. Nothing is changed then.
-        """
-        with self._changing:
-            self._apply(self._settings.read(settings, without))
-            self._settings.keep(self._settings.config, settings, without)
-
-    def _reload(self) -> None:
-        """Read the configuration file again. Keep the old configuration if it is wrong."""
-        try:
-            with self._changing:
-                self._apply(self._settings.read())
-        except UserError as error:
-            self.notes.warn(f"{error}; the configuration stays as it was")
-
-    def _apply(self, config: Config) -> None:
-        """Apply a configuration and report what changed."""
-        nice = self.config.live.nice
-        changed = self.session.configure(config)
-        self._settings.keep(config)
+    def _follow(self, config: Config) -> None:
+        """Pass a new configuration to the buffers and to the comparison."""
         self.flight.config = self._triggers.config = config.live
         if self.raw is not None:
             self.raw.config = config.live
         if self.against is not None:
             self.against.config = config.live
-        if config.live.nice != nice:
-            self._set_nice(config.live.nice)
-        for key, change in changed.items():
-            if ".params." in key and "absent" in (change.before, change.after):
-                continue  # the change of the method is reported instead
-            late = "; takes effect at the next start" if key.startswith(FIXED_KEYS) else ""
-            self.notes.info(f"configuration: {key} {change}{late}")
-
-    def _set_nice(self, nice: int) -> None:
-        """Set the priority of the process, or warn if that is not permitted."""
-        try:
-            set_nice(nice)
-        except PermissionError:
-            self.notes.warn(f"live.nice={nice}: only root may take priority back")
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> None:

@@ -10,7 +10,8 @@ from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
-from bevviz.live.runtime import Live, Outputs
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
 from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.workbench.running_robot import RunningRobot
