@@ -256,6 +256,7 @@ class FrameExplainer:
         """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
         if answer.empty:
             return answer
+        answer = self.with_restoring_stages(answer)
         search, verdict = self.search(answer), answer.verdict
         answer = replace(answer, hints=search.hints, tried=search.tried)
         if search.hints:
@@ -270,12 +271,24 @@ class FrameExplainer:
         remark = f"{remark[:1].upper()}{remark[1:]}." if remark else ""
         return replace(answer, verdict=replace(verdict, advice=advice), remark=remark)
 
+    def with_restoring_stages(self, answer: Answer) -> Answer:
+        """Add the stages that restore the object that an image box shows, for a frame without ground truth.
+
+        Lists do without them: each subject takes some runs of the stages.
+        """
+        subject, verdict = answer.subject, answer.verdict
+        if subject.kind == "truth" or not (restored_by := self._runs.restored_by(subject)):
+            return answer
+        blamed = stage_of(verdict.reason.kind, answer.evidence)
+        verdict = make_verdict(subject, verdict.reason, verdict.reported, restored_by, blamed)
+        return replace(answer, verdict=verdict, likely=())
+
     def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
         evidence = collect_evidence(subject, self.traces)
-        restored_by = self._runs.restored_by(subject.row) if subject.kind == "truth" else ()
+        restored_by = self._runs.restored_by(subject) if subject.kind == "truth" else ()
         reason, reported = find_reason(subject, evidence, self.traces, restored_by)
         likely = () if reported else likely_reasons(subject, evidence, self.traces, reason.kind)
         blamed = stage_of(reason.kind, evidence)

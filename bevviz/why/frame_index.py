@@ -97,6 +97,12 @@ class FrameIndex:
         other.directions = self.directions
         return other
 
+    def with_truth(self, truth: Truth) -> FrameIndex:
+        """Return the index of the same result with another ground truth. Arrays without it are shared."""
+        other = FrameIndex(self.result, self.classes, truth)
+        other._uv, other._in_image = self._uv, self._in_image
+        return other
+
     def origin(self, section: str) -> StageOwner:
         """Return the owner of the stage of a section."""
         return self._origins[section]

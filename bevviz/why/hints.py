@@ -204,12 +204,12 @@ class HintFinder:
             yield from new(stage_changes(stage, config))
         for needed in restored_by:
             if len(needed) > 1:
-                yield from new(self._combined(question.subject.row, needed))
+                yield from new(self._combined(question.subject, needed))
         others = [stage for stage in STAGES if stage not in nearest]
         yield from new(change for stage in others for change in stage_changes(stage, config))
         yield from new(change for stage in nearest for change in stepped_numbers(stage, config, FAR_STEPS))
 
-    def _combined(self, row: int, needed: StageSet) -> Iterator[Change]:
+    def _combined(self, subject: Subject, needed: StageSet) -> Iterator[Change]:
         """Yield combined changes of several stages.
 
         Each one alone brings the object back if the other stages have their ideal results.
@@ -220,7 +220,7 @@ class HintFinder:
             changes = (
                 change
                 for change in stage_changes(stage, self._traces.result.config)
-                if self._runs.is_found(row, change, others)
+                if self._runs.is_found(subject, change, others)
             )
             helpful.append([*islice(changes, HELPFUL)])
         for changes_of_stages in product(*helpful):
@@ -235,10 +235,8 @@ class HintFinder:
 
     def _stays_missed(self, question: _Question, change: Change) -> bool:
         """Return whether a missed object of the ground truth is missed with a change, too."""
-        subject, matches = question.subject, self._traces.matches
-        if subject.kind != "truth" or matches is None or not matches.missed[subject.row]:
-            return False
-        return not self._runs.is_found(subject.row, change, ())
+        subject = question.subject
+        return self._runs.wanted(subject) is not None and not self._runs.is_found(subject, change, ())
 
     def _try_on_missed(
         self,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -18,12 +17,22 @@ from bevviz.model.results import Detections, DetectionState
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.pipeline.stage_log import Memo
+from bevviz.why.assumed_truth import assumed_truth
 from bevviz.why.changes import Change, with_changes
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.ideal import IdealStages, StageSet, ideal_config, restoring_stages
+from bevviz.why.subject import Subject
 
 RUNS = 12  # whole results in the cache, for other subjects of the frame
 STAGE_RESULTS = 60  # results of single stages in the cache; one of a large cloud takes some megabytes
+
+
+class _Wanted(NamedTuple):
+    """A missed object, in the ground truth of the frame or in an assumed one."""
+
+    traces: FrameIndex  # with this ground truth
+    row: int
+    missed: tuple[int, ...]  # rows of all missed objects
 
 
 class FrameRuns:
@@ -39,6 +48,8 @@ class FrameRuns:
         self._loader, self._memo = loader, Memo(STAGE_RESULTS)
         self._runs: dict[tuple[tuple[str, Any], ...], FrameIndex | None] = {}
         self._found: dict[tuple[object, ...], frozenset[int]] = {}
+        self._restored: dict[FrameIndex, Mapping[int, tuple[StageSet, ...]]] = {}
+        self._assumed: dict[tuple[object, ...], FrameIndex | None] = {}  # by subject
 
     def with_change(self, change: Change) -> FrameIndex | None:
         """Run the frame with a change. None: the configuration cannot be run."""
@@ -56,49 +67,64 @@ class FrameRuns:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]
 
-    def is_found(self, row: int, change: Change, ideal: StageSet) -> bool:
+    def is_found(self, subject: Subject, change: Change, ideal: StageSet) -> bool:
         """Return whether a missed object is found with a change, if other stages have their ideal results."""
-        key = (*sorted(change.items()), *ideal)
+        wanted = self.wanted(subject)
+        if wanted is None:
+            return False
+        key = (id(wanted.traces), *sorted(change.items()), *ideal)
         if key not in self._found:
-            self._found[key] = self._find(change, ideal)
-        return row in self._found[key]
+            self._found[key] = self._find(wanted, change, ideal)
+        return wanted.row in self._found[key]
 
-    def _find(self, change: Change, ideal: StageSet) -> frozenset[int]:
+    def _find(self, wanted: _Wanted, change: Change, ideal: StageSet) -> frozenset[int]:
         """Return the missed objects that are found with a change and the ideal results of other stages."""
-        truth = self._traces.labels_in_evaluate
+        truth = wanted.traces.labels_in_evaluate
         assert truth is not None
         try:
             config = with_changes(self._result.config, change)
             stages = self._loader.load(config, self._known_detections(config, change))
         except (UserError, ValidationError):
             return frozenset()
-        edits = IdealStages(self._traces, self._missed, ideal, self._memo)
+        edits = IdealStages(wanted.traces, wanted.missed, ideal, self._memo)
         after = perceive(self._result.frame, ideal_config(config, ideal), stages, self._memo, edits=edits)
         if after.objects is None:
             return frozenset()
-        return frozenset(self._missed) - {*np.flatnonzero(judge(after.objects, truth).missed).tolist()}
+        return frozenset(wanted.missed) - {*np.flatnonzero(judge(after.objects, truth).missed).tolist()}
 
-    @cached_property
-    def _missed(self) -> tuple[int, ...]:
-        """Rows of the missed objects of the ground truth."""
-        matches = self._traces.matches
-        return () if matches is None else tuple(np.flatnonzero(matches.missed).tolist())
+    def restored_by(self, subject: Subject) -> tuple[StageSet, ...]:
+        """Return the smallest sets of stages whose ideal results bring a missed object back.
 
-    def restored_by(self, row: int) -> tuple[StageSet, ...]:
-        """Return the smallest sets of stages whose ideal results bring a missed ground truth object back.
-
-        It is empty where no set does, and for objects that need not be found.
+        It is empty where no set does, and for objects that need not be found. Without ground truth, the
+        object is the one that the image box of the subject seems to show.
         """
-        return self._restored.get(row, ())
+        wanted = self.wanted(subject)
+        if wanted is None or not self._traces.origin("objects").ours:
+            return ()
+        if wanted.traces not in self._restored:
+            stages = self._loader.load(self._result.config, self._detections)
+            self._restored[wanted.traces] = restoring_stages(wanted.traces, wanted.missed, stages, self._memo)
+        return self._restored[wanted.traces].get(wanted.row, ())
 
-    @cached_property
-    def _restored(self) -> Mapping[int, tuple[StageSet, ...]]:
-        matches = self._traces.matches
-        if matches is None or not self._traces.origin("objects").ours:
-            return {}
-        config = self._result.config
-        stages = self._loader.load(config, self._detections)
-        return restoring_stages(self._traces, self._missed, stages, self._memo)
+    def wanted(self, subject: Subject) -> _Wanted | None:
+        """Return the missed object of a subject. None: there is none, or nothing tells where it is."""
+        traces = self._traces
+        if traces.labels_in_evaluate is None:
+            key = (*subject.key, *(() if subject.asked is None else subject.asked.tolist()))
+            if key not in self._assumed:
+                truth = assumed_truth(subject, traces)
+                self._assumed[key] = None if truth is None else traces.with_truth(truth)
+            if (assumed := self._assumed[key]) is None:
+                return None
+            traces, row = assumed, 0
+        elif subject.kind == "truth":
+            row = subject.row
+        else:
+            return None
+        if traces.matches is None:
+            return None
+        missed = tuple(np.flatnonzero(traces.matches.missed).tolist())
+        return _Wanted(traces, row, missed) if row in missed else None
 
     def _detections(self, camera: Camera) -> Detections | None:
         """Return the detections of a camera in the frame's result."""

@@ -38,7 +38,7 @@ def make_verdict(
     because = (FALSE_SENTENCES if is_false else SENTENCES)[reason.kind](reason, subject)
     head = subject.name[0].upper() + subject.name[1:]
     if reason.kind is ReasonKind.REPORTED:
-        text = f"{head} was reported: {because}."
+        text = f"{head} was reported: {because}{_elsewhere_text(restored_by)}."
     elif because.startswith(_ONLY):
         content, _, rest = because.partition(": ")
         text = f"There is {content} {subject.name.removeprefix('what is ')}: {rest}."
@@ -72,6 +72,14 @@ def _restored_text(sets: Sequence[StageSet], blamed: str) -> str:
         others = " or ".join(_IDEAL[stage] for (stage,) in sets if stage != blamed)
         return f"; {others} alone brings it back, too"
     return f"; {' or '.join(ideals)} alone brings it back"
+
+
+def _elsewhere_text(sets: Sequence[StageSet]) -> str:
+    """Return a clause with the ideal results that report an object at another place; empty: it is right."""
+    if not sets:
+        return ""
+    ideals = " or ".join(" and ".join(_IDEAL[stage] for stage in stages) for stages in sets)
+    return f"; its image box fits an object at another place better, which {ideals} would report"
 
 
 def _by(reason: Reason) -> str:

@@ -360,9 +360,9 @@ class _Decider:
             return ReasonKind.NOT_DETECTED
         most_points = max((part.points for part in evidence.parts if part.kept), default=0)
         lost = evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles)
-        if not best.kept:  # Without labels, an earlier stage that lost the points is blamed first.
-            blind = self.result.frame.truth is None and self.result.clusters is not None
-            return self._unclustered() if lost and blind else self._weakness(best)
+        if not best.kept:  # The fusion may give noise to a detection, but never ground.
+            is_ground = lost and self.ground >= max(evidence.noise, evidence.aside_points, FEW)
+            return ReasonKind.GROUND if is_ground else self._weakness(best)
         _, fusion = camera_and_fusion(self.result, best.camera)
         if fusion is None:
             return ReasonKind.NOT_FUSED
