@@ -295,6 +295,8 @@ class _CameraFrustums:
             np.array(work.sizes.get(name.lower()) or unknown, np.float64).reshape(-1, 6)
             for name in detections.names
         ]
+        self._lengths = [float(size[0, 0]) for size in self._sizes]
+        self._overlap: list[list[float]] = geometry.iou(detections.xyxy, detections.xyxy).tolist()
 
     def best(self, d: int) -> _Candidate:
         """Return the best rated candidate among the free points in a detection's frustum, for any size."""
@@ -327,10 +329,9 @@ class _CameraFrustums:
         Returns:
             Whether both detections keep enough points.
         """
-        lengths = self._sizes[d][0, 0], self._sizes[e][0, 0]
-        overlap = geometry.iou(self._detections.xyxy[[d]], self._detections.xyxy[[e]])[0, 0]
-        is_similar = bool(np.max(lengths) <= min(SIMILAR * np.min(lengths), SHORT))
-        if not is_similar or not 0 < overlap < SAME_OBJECT_IOU:
+        long, other = self._lengths[d], self._lengths[e]  # NaN, that is unlike any other, without a size
+        is_similar = long <= min(SIMILAR * other, SHORT) and other <= min(SIMILAR * long, SHORT)
+        if not is_similar or not 0 < self._overlap[d][e] < SAME_OBJECT_IOU:
             return False
         shared = np.intersect1d(rows_d, rows_e)
         if len(shared) < self._work.fewest:
@@ -393,9 +394,11 @@ class _CameraFrustums:
         """Drop the points beside a detection's box that a box of another class shows."""
         others = np.array([name != self._detections.names[d] for name in self._detections.names])
         boxes = self._boxes[[d, *np.flatnonzero(others & self._detections.kept)]]
-        uv = self._uv[rows, None]
-        inside = np.asarray(((uv >= boxes[:, :2]) & (uv <= boxes[:, 2:])).all(axis=2))
-        return rows[inside[:, 0] | ~inside[:, 1:].any(axis=1)]
+        u, v = self._uv[rows].T
+        x0, y0, x1, y1 = boxes.T[:, :, None]
+        inside = (u >= x0) & (u <= x1) & (v >= y0) & (v <= y1)
+        kept: I64 = rows[inside[0] | ~inside[1:].any(axis=0)]
+        return kept
 
     def settle(self, d: int, candidate: _Candidate, grow: bool) -> tuple[I64, F64, Bool]:
         """Return the object's points, its box (centre, size, heading), and which of its sides were seen."""

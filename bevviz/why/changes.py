@@ -122,8 +122,8 @@ def restored_values(config: Config) -> Iterator[Change]:
         yield restored
 
 
-def stage_changes(stage: str, config: Config) -> Iterator[Change]:
-    """Yield changes of one of our stages: the preset's values, other methods, and steps of its numbers."""
+def stage_changes(stage: str, config: Config, factors: Sequence[float] = STEPS) -> Iterator[Change]:
+    """Yield changes of one of our stages: the preset's values, other methods, and factors of its numbers."""
     present, differing = values(config), preset_differences(config)
     prefixes = ("clustering.", "voxel.") if stage == "clustering" else (f"{stage}.",)
     restored = {key: value for key, value in differing.items() if key in _TUNED and key.startswith(prefixes)}
@@ -133,7 +133,7 @@ def stage_changes(stage: str, config: Config) -> Iterator[Change]:
     for change in _METHODS.get(stage, ()):
         if any(present[key] != value for key, value in change.items()):
             yield change
-    yield from stepped_numbers(stage, config, STEPS)
+    yield from stepped_numbers(stage, config, factors)
 
 
 def stepped_numbers(stage: str, config: Config, factors: Sequence[float]) -> Iterator[Change]:

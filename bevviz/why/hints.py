@@ -206,7 +206,7 @@ class HintFinder:
             if len(needed) > 1:
                 yield from new(self._combined(question.subject, needed))
         others = [stage for stage in STAGES if stage not in nearest]
-        yield from new(change for stage in others for change in stage_changes(stage, config))
+        yield from new(change for stage in others for change in stage_changes(stage, config, ()))
         yield from new(change for stage in nearest for change in stepped_numbers(stage, config, FAR_STEPS))
 
     def _combined(self, subject: Subject, needed: StageSet) -> Iterator[Change]:

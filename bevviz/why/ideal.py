@@ -32,7 +32,6 @@ from bevviz.pipeline.stage_loader import Stages
 from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.clustering import describe_clusters
 from bevviz.stages.frustum_fusion import claim_clusters
-from bevviz.why.changes import with_changes
 from bevviz.why.frame_index import FEW, FrameIndex
 from bevviz.why.subject import LINK
 
@@ -133,7 +132,10 @@ class IdealStages:
 
 def ideal_config(config: Config, stages: Container[str]) -> Config:
     """Return the configuration of a run with ideal stages: no limit removes an ideal cluster."""
-    return with_changes(config, {"clustering.min_cluster_points": 1}) if "clustering" in stages else config
+    if "clustering" not in stages:
+        return config
+    clustering = config.clustering.model_copy(update={"min_cluster_points": 1})
+    return config.model_copy(update={"clustering": clustering})
 
 
 def _with_own_detections(
@@ -279,8 +281,7 @@ def restoring_stages(
         )
 
     stages_to_try = STAGES if _on_ground(traces, rows) else STAGES[1:]
-    curable = found(stages_to_try)
-    left = [row for row in rows if curable[row]]
+    left = list(rows)
     for size in (1, 2):
         for chosen in combinations(stages_to_try, size) if left else ():
             is_found = found(chosen)
@@ -288,6 +289,9 @@ def restoring_stages(
                 if is_found[row]:
                     restored[row].append(chosen)
         left = [row for row in left if not restored[row]]
+        if size == 1 and left:
+            curable = found(stages_to_try)
+            left = [row for row in left if curable[row]]
     for row in left:
         restored[row].append(stages_to_try)
     return {row: tuple(sets) for row, sets in restored.items()}
