@@ -904,7 +904,7 @@ def test_the_size_in_a_header_is_that_of_the_image(width: int, height: int, grey
         ".webp": [cv2.IMWRITE_WEBP_QUALITY, 80 + 21 * (width % 2)],  # above 100: without loss
     }.get(form, [])
     data = bytes(cv2.imencode(form, pixels, options)[1].tobytes())
-    assert images._size_of(data) == (width, height)
+    assert images.encoded_size(data) == (width, height)
 
 
 DECODERS: dict[str, Callable[[Any], object]] = {
