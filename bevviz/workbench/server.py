@@ -15,6 +15,7 @@ import uvicorn
 
 from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
+from bevviz.support.freed_memory import return_freed_memory
 from bevviz.workbench.access import HOSTS, persistent_token
 from bevviz.workbench.routes import VIEWER, Site
 from bevviz.workbench.startup import SessionStartup
@@ -44,6 +45,7 @@ def serve(
         UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
     """
     viewer = viewer_folder()
+    return_freed_memory()
     with bound_socket(port) as listening:
         port = listening.getsockname()[1]
         with persistent_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
