@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +17,9 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
-from bevviz.model.frame import F64, Camera
+from bevviz.model.frame import F64
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import Detections, FrameResult
-from bevviz.pipeline.session import Session
 from tests.support.small_bags import frozen_after
 
 
@@ -254,35 +252,9 @@ def test_a_detector_without_any_candidate_is_named(results: list[FrameResult]) -
         assert not [finding for finding in checks.findings if finding.kind == "detector"]
 
 
-# --- clouds of one plane -----------------------------------------------------------------------
-
-
-def test_the_method_for_a_flat_cloud_is_offered(results: list[FrameResult]) -> None:
-    """Image boxes enclose a height that a 2D LiDAR does not measure."""
-    with bevviz.simulate(1) as drive:
-        config = load(settings=["fusion.split=false"])
-        checks = InputChecks(drive.frames, config)
-        for result in results:
-            (cloud,) = result.frame.clouds
-            chest = np.abs(cloud.xyz[:, 2] + 0.6) < 0.05
-            flat = replace(cloud, xyz=cloud.xyz[chest] * np.array([1, 1, 0], np.float32), fields={})
-            frame = replace(result.frame, points=flat.xyz, clouds=(flat,), fields={})
-            detections = result.cameras[0].detections
-            session = Session(config, partial(_known, detections))
-            checks.observe(session.run_single(frame))
-        (finding,) = [finding for finding in checks.findings if finding.kind == "fusion"]
-    assert finding.remedy is not None and finding.remedy.settings == ("fusion.method=centroid",)
-    assert "have one then" in finding.remedy.tried
-
-
-def test_a_cloud_with_heights_is_not_flat(results: list[FrameResult]) -> None:
+def test_a_right_drive_has_no_finding(results: list[FrameResult]) -> None:
     with bevviz.simulate(1) as drive:
         checks = InputChecks(drive.frames, drive.config)
         for result in results:
             checks.observe(result)
     assert not checks.findings
-
-
-def _known(detections: Detections | None, _: Camera) -> Detections | None:
-    """Return detections that are known already."""
-    return detections

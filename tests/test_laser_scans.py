@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 
 import bevviz
-from bevviz.config import SourceConfig
+from bevviz.config import SourceConfig, load
 from bevviz.messages.roles import find_roles
 from bevviz.messages.topics import Topic
+from bevviz.model.frame import Camera, Cloud, Frame, Image, Intrinsics
+from bevviz.model.results import Detections, FrameResult
+from bevviz.pipeline.perceive import suited_to_planes
+from bevviz.pipeline.session import Session
 from tests.support import bags
 
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -66,3 +70,41 @@ def test_scans_of_one_plane_are_the_lidar_without_clouds() -> None:
     assert find_roles([scan, cloud], SourceConfig()).lidars == ("/points",)
     stated = find_roles([scan, cloud], SourceConfig(lidar_topics=("/scan",)))
     assert stated.lidars == ("/scan",) and stated.around == ()
+
+
+def seen_in_room(*legs: tuple[float, float]) -> FrameResult:
+    """Run a scan of a room with legs 0.2 m above the floor, and a camera that sees one person at 3 m."""
+    angles = np.radians(np.arange(-180, 180, 0.25))
+    cos, sin = np.cos(angles), np.sin(angles)
+    ranges = 5 / np.maximum(np.abs(cos), np.abs(sin))
+    for x, y in legs:  # of radius 0.08 m
+        along = cos * x + sin * y
+        inside = along**2 - (x * x + y * y - 0.08**2)
+        hit = (inside > 0) & (along > 0)
+        ranges[hit] = np.minimum(ranges, along - np.sqrt(np.maximum(inside, 0)))[hit]
+    points = np.column_stack([ranges * cos, ranges * sin, 0 * ranges]).astype(np.float32)
+    image = Image(0, "camera", np.full((480, 640, 3), 90, np.uint8))
+    lens = Intrinsics(640, 480, np.array([[450.0, 0, 320], [0, 450, 240], [0, 0, 1]]))
+    pose = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0.2], [1, 0, 0, 0], [0, 0, 0, 1]])
+    camera = Camera("camera", image, lens, pose, np.eye(4))
+    cloud = Cloud(0, "laser", points, {}, name="laser")
+    frame = Frame(0, 0, 0, "laser", points, "laser", clouds=(cloud,), cameras=(camera,))
+    zeros, box = np.zeros(1, np.int32), np.array([[210, 37, 281, 301]], np.float32)
+    score = np.array([0.9], np.float32)
+    person = Detections(box, score, zeros, ("person",), zeros, zeros - 1, np.zeros(1, np.float32))
+    return Session(load(), lambda _: person).run_single(frame)
+
+
+def test_a_person_of_two_legs_is_found_by_default() -> None:
+    """A plane shows no height, so that the widths are compared; a leg has few points."""
+    result = seen_in_room((3, 0.4), (3, 0.6))
+    assert result.objects is not None and result.objects.names == ("person",)
+    np.testing.assert_allclose(result.objects.boxes.center[0, :2], [2.95, 0.5], atol=0.05)
+    assert result.config.clustering.min_points == 4, "the answers name the values in use"
+
+
+def test_a_stated_value_holds_for_scans_of_one_plane() -> None:
+    stated = load(settings=["clustering.min_points=10", "voxel.size=0.05"])
+    suited = suited_to_planes(stated)
+    assert (suited.clustering.min_points, suited.voxel.size) == (10, 0.05)
+    assert suited.clustering.min_cluster_points == 4

@@ -10,8 +10,6 @@ from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks.camera_views import CameraView, view_of
 from bevviz.checks.detector import silent_detector
 from bevviz.checks.extrinsics import wrong_extrinsics
-from bevviz.checks.flat_clouds import flat_clouds
-from bevviz.checks.flat_matches import FlatMatches
 from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.config import Config
 from bevviz.model.frame import Frame
@@ -39,7 +37,7 @@ def sensor_faults(read: ReadInput) -> Iterator[InputFinding]:
         yield InputFinding(anomaly.kind, anomaly.subject, text)
 
 
-CHECKS: tuple[Check, ...] = (source_warnings, wrong_extrinsics, flat_clouds, silent_detector, sensor_faults)
+CHECKS: tuple[Check, ...] = (source_warnings, wrong_extrinsics, silent_detector, sensor_faults)
 
 
 class InputChecks(Observer[FrameResult]):
@@ -87,9 +85,6 @@ class InputChecks(Observer[FrameResult]):
                     self._read.faults.first.setdefault(key, anomaly)
                     self._read.faults.count[key] += 1
             for row, camera in enumerate(result.cameras):
-                if camera.fusion is not None and result.frame.is_planar:
-                    self._read.flat = self._read.flat or FlatMatches()
-                    self._read.flat.add(result, camera)
                 if camera.detections is not None:
                     self._read.images += 1
                     self._read.answered += bool(len(camera.detections))

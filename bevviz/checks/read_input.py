@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from bevviz.bags.source import BagSource
 from bevviz.checks.camera_views import CameraView
-from bevviz.checks.flat_matches import FlatMatches
 from bevviz.config import Config
 from bevviz.model.input_findings import InputFinding
 from bevviz.model.protocols import Items
@@ -52,7 +51,6 @@ class ReadInput:
         cameras: sample of the images of each placed camera, by name.
         images: images that the detector judged.
         answered: those for which it had a candidate, however weak.
-        flat: matches with clusters of a flat cloud; None: no cloud was flat.
     """
 
     source: Items[object]
@@ -61,7 +59,6 @@ class ReadInput:
     cameras: dict[str, CameraSample] = field(default_factory=dict)
     images: int = 0
     answered: int = 0
-    flat: FlatMatches | None = None
 
     @property
     def bag(self) -> BagSource | None:

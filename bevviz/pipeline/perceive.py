@@ -43,6 +43,8 @@ from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
 from bevviz.support.compile_clock import common_clock, thread_clock
 
+# Values for scans of one plane, whose points are in a row: a person has those of two legs.
+PLANAR = {"voxel.size": 0.02, "clustering.min_points": 4, "clustering.min_cluster_points": 4}
 LEAST_SCORE = 0.01  # of candidates that are decoded, so that configurations and runs can share them
 
 
@@ -78,7 +80,7 @@ def perceive(
 
     Args:
         frame: the frame.
-        config: configuration, which the result refers to.
+        config: configuration. The result refers to it, or to the one that suits scans of one plane.
         stages: stages that the configuration names, from ``StageLoader.load``.
         memo: results shared by configurations that run on the same frame.
         network: executor of the detector. It runs beside the LiDAR stages, since it does not need Python's
@@ -87,6 +89,9 @@ def perceive(
     """
     log, detector_log = StageLog(memo), StageLog(memo)
     start = common_clock()
+    is_planar = frame.is_planar
+    if is_planar:
+        config = suited_to_planes(config)
 
     def detect(camera: Camera) -> Detections | None:
         detections = _detect(detector_log, frame, camera, config, stages)
@@ -123,7 +128,7 @@ def perceive(
     splits: Splits | None = None
     first_labels = None if clusters is None else clusters.labels
     claims: Sequence[Claims | None] = [None] * len(cameras)
-    if obstacles is not None and clusters is not None and _splits(config):
+    if obstacles is not None and clusters is not None and _splits(config) and not is_planar:
         height = None if ground is None else log.run("fusion", _obstacle_heights, ground)
         camera_results = tuple(cameras)
         sections = config.fusion, config.objects, config.clustering
@@ -135,9 +140,8 @@ def perceive(
     for i, (result, camera_claims) in enumerate(zip(cameras, claims, strict=True)):
         uv, depth, detected = result.uv, result.depth, result.detections
         if uv is not None and depth is not None and clusters is not None and detected is not None:
-            fusion = log.run(
-                "fusion", _fuse, uv, depth, clusters, detected, result.camera, config.fusion, camera_claims
-            )
+            evidence = uv, depth, clusters, detected, result.camera, config.fusion, camera_claims
+            fusion = log.run("fusion", _fuse, *evidence, is_planar)
             cameras[i] = replace(result, fusion=fusion)
     log.timings.update(detector_log.timings)
     log.failures.extend(detector_log.failures)
@@ -306,6 +310,21 @@ def _project(points: F32, camera: Camera) -> tuple[F32, F32] | None:
     return uv, depth
 
 
+def suited_to_planes(config: Config) -> Config:
+    """Return the configuration for scans of one plane: defaults that nobody stated are those of few points.
+
+    A leg at 3 m has a dozen points in such a scan, in one row.
+    """
+    changes: dict[str, dict[str, float | int]] = {}
+    for key, value in PLANAR.items():
+        section, _, name = key.partition(".")
+        present, default = getattr(config, section), getattr(Config(), section)
+        if key not in config.stated and getattr(present, name) == getattr(default, name):
+            changes.setdefault(section, {})[name] = value
+    sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
+    return config.model_copy(update=sections)
+
+
 def _splits(config: Config) -> bool:
     """Return whether detections split clusters. The robot's clusters stay as it published them."""
     is_own_clustering = not _topic(config.clustering.method)
@@ -320,11 +339,13 @@ def _fuse(
     camera: Camera,
     config: FusionConfig,
     claims: Claims | None,
+    is_planar: bool,
 ) -> Fusion | None:
     """Match detections and clusters of a camera. Return None if its pose is unknown."""
     if camera.intrinsics is None or camera.camera_from_points is None:
         return None
-    return fuse(uv, depth, clusters, detections, camera.intrinsics, camera.camera_from_points, config, claims)
+    pose = camera.camera_from_points
+    return fuse(uv, depth, clusters, detections, camera.intrinsics, pose, config, claims, is_planar)
 
 
 def _objects(

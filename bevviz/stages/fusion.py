@@ -26,6 +26,7 @@ def fuse(
     camera_from_points: F64,
     config: FusionConfig,
     claims: Claims | None = None,
+    is_planar: bool = False,
 ) -> Fusion:
     """Match one camera's detections with the clusters.
 
@@ -54,6 +55,7 @@ def fuse(
         camera_from_points: (4, 4) optical frame from the clusters' frame.
         config: method and its thresholds.
         claims: points that each detection claimed, if detections split the clusters.
+        is_planar: whether the scan is of one plane, without heights. The IoU is then that of the widths.
 
     Returns:
         The matches, and the decision and the evidence for every detection and cluster.
@@ -74,7 +76,9 @@ def fuse(
         nearest = _first_of_each(pairs.cluster, order)
         matched = nearest[np.isfinite(pairs.cost[nearest])]
     else:
-        pairs, reason = _frustum_pairs(inside, depth, labels, cluster_uv, clusters, detections, config)
+        overlap = (_width_iou if is_planar else iou)(detections.xyxy, cluster_uv)
+        around = detections, cluster_uv, overlap
+        pairs, reason = _frustum_pairs(inside, depth, labels, clusters, *around, config)
         if claims is None:
             allowed = np.flatnonzero(reason == Decision.TAKEN)
             matched = allowed[_assign_pairs(pairs, allowed)]
@@ -262,12 +266,23 @@ def _frustum_pairs(
     inside: list[I64],
     depth: F32,
     labels: I32,
-    cluster_uv: F32,
     clusters: Clusters,
     detections: Detections,
+    cluster_uv: F32,
+    overlaps: F32,
     config: FusionConfig,
 ) -> tuple[Pairs, I32]:
     """Pair every kept detection with every kept cluster in its frustum.
+
+    Args:
+        inside: points in the box of each detection.
+        depth: of the points.
+        labels: cluster of each point.
+        clusters: all clusters.
+        detections: all detections.
+        cluster_uv: box around each projected cluster.
+        overlaps: (D, K) IoU of both.
+        config: thresholds.
 
     Returns:
         The pairs, and for each TAKEN or the rule that forbids it.
@@ -286,7 +301,7 @@ def _frustum_pairs(
     detection, cluster = np.divmod(key, max(len(clusters), 1))
 
     box, around = detections.xyxy[detection], cluster_uv[cluster]
-    overlap = iou(detections.xyxy, cluster_uv)[detection, cluster]
+    overlap = overlaps[detection, cluster]
     reason = np.select(
         [median > config.max_depth, points < config.min_points, overlap < config.min_iou],
         [Decision.TOO_FAR, Decision.TOO_FEW_POINTS, Decision.LOW_OVERLAP],
@@ -309,6 +324,13 @@ def _frustum_pairs(
         cost=np.where(allowed, 1 - detections.score[detection] * fit, np.inf).astype(np.float32),
     )
     return pairs, reason
+
+
+def _width_iou(a: F32, b: F32) -> F32:
+    """Return the (A, B) intersection over union of the widths of image boxes."""
+    shared = np.minimum(a[:, None, 2], b[:, 2]) - np.maximum(a[:, None, 0], b[:, 0])
+    whole = np.maximum(a[:, None, 2], b[:, 2]) - np.minimum(a[:, None, 0], b[:, 0])
+    return np.asarray(np.nan_to_num(np.clip(shared, 0, None) / np.maximum(whole, 1e-6)), np.float32)
 
 
 def _assign_pairs(pairs: Pairs, allowed: I64) -> I64:
