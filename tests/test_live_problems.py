@@ -13,11 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.messages.encode import encode_camera_info, encode_cloud, encode_image, encode_transforms
+from bevviz.messages.encode import (
+    encode_camera_info,
+    encode_cloud,
+    encode_compressed_image,
+    encode_image,
+    encode_transforms,
+)
 from bevviz.model.frame import Cloud, Image, Intrinsics
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from tests.support import videos
 from tests.support.fed_graph import FedGraph, Session, fed_graph, joined
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -204,3 +211,25 @@ def test_several_robots_are_named(robot: Robot) -> None:
             "the topics are of 2 robots, truck and van: truck is shown; "
             "--set source.lidar_topics=[/van/lidar] shows van"
         )
+
+
+def test_a_video_that_waits_for_its_key_frame_is_named(robot: Robot) -> None:
+    """The encoder began before us: its next key frame is packet 60."""
+    packets = videos.encode(videos.numbered(80), group=60)[1:]
+    robot.withdraw()
+    video = robot.graph.advertise("/video/h264", "sensor_msgs/msg/CompressedImage")
+    with joined(robot.graph) as session:
+
+        def play(packets: list[bytes]) -> None:
+            for data in packets:
+                robot.play(STEP)
+                message = encode_compressed_image(robot.graph.time_ns(), "camera", data, "h264")
+                robot.graph.publish(video, message)
+
+        play(packets[:30])
+        waiting = "/video/h264: the video has no key frame yet; its camera shows nothing until one comes"
+        assert session.source.problems.of("/video/h264")[0].finding.text == waiting
+        session.said.clear()
+        play(packets[30:])
+        assert session.told("/video/h264: a key frame has come")
+        assert not session.source.problems.of("/video/h264")

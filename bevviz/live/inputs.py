@@ -12,6 +12,7 @@ from statistics import median
 from typing import Any, Literal
 
 from bevviz.config import Config, SourceConfig, stage_topics
+from bevviz.drivers.video import is_video
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic
 from bevviz.live.live_message import LiveMessage
@@ -22,7 +23,7 @@ from bevviz.messages.foreign_boxes import holds_boxes
 from bevviz.messages.guard import guard
 from bevviz.messages.packet_topics import PacketTopics, packet_stream
 from bevviz.messages.roles import STAGE_KINDS, Roles, find_roles
-from bevviz.messages.topics import CLOUDS, Topic, unsupported_reason
+from bevviz.messages.topics import CLOUDS, IMAGES, Topic, unsupported_reason
 from bevviz.sync.feed import Handler, make_around_handlers, make_handlers
 from bevviz.sync.report import UnusableMessages
 from bevviz.sync.synchronizer import Synchronizer
@@ -160,17 +161,18 @@ class Inputs:
         self.handlers: dict[str, Handler[LiveMessage]] = {}
         self.frame_ids: dict[str, str] = {}  # topic -> frame id of its first message
         self.changed = time.monotonic()  # seconds, last change of roles
+        self._videos: set[str] = set()  # topics of compressed images that hold video
         self._packets = PacketTopics()
 
     @cached_property
     def stated(self) -> dict[str, tuple[str, tuple[str, ...]]]:
         """Topics of the configuration, each with its key and its permitted types. None: any type."""
-        source, images = self._source, ("Image", "CompressedImage")
+        source = self._source
         stated: dict[str, tuple[str, tuple[str, ...]]] = {}
         for key, names, kinds in (
             ("source.lidar_topics", source.lidar_topics, CLOUDS),
-            ("source.camera_topics", source.camera_topics, images),
-            ("source.camera_info_topics", source.camera_info_topics, images),
+            ("source.camera_topics", source.camera_topics, IMAGES),
+            ("source.camera_info_topics", source.camera_info_topics, IMAGES),
             ("source.camera_info_topics", source.camera_info_topics.values(), ("CameraInfo",)),
             ("source.odometry_topic", filter(None, [source.odometry_topic]), ("Odometry",)),
             ("source.boxes", filter(None, [source.boxes.get("topic", "")]), ()),
@@ -257,6 +259,20 @@ class Inputs:
         self.handlers |= dict.fromkeys(metadata_topics, self._add_metadata)
         return True
 
+    def learn(self, message: LiveMessage) -> bool:
+        """Learn from the first message of a topic. Return whether roles must be assigned again.
+
+        Raises:
+            MessageError: the message has no header.
+        """
+        kind = Topic(message.topic, message.type).kind
+        if not kind.endswith((*CLOUDS, "Image")):
+            return False
+        self.frame_ids[message.topic] = message.header()[1]
+        if kind == "CompressedImage" and guard(message, is_video, message.decode()):
+            self._videos.add(message.topic)
+        return True
+
     def handle(self, message: LiveMessage) -> bool:
         """Pass a message to its handler. Return whether roles must be assigned again.
 
@@ -270,7 +286,14 @@ class Inputs:
     def _describe(self, topics: Iterable[PublishedTopic]) -> list[Topic]:
         boxes = self._source.boxes.get("topic", "")
         known = [
-            Topic(t.name, t.type, None, self.frame_ids.get(t.name, ""), boxes=t.name == boxes) for t in topics
+            Topic(
+                t.name,
+                t.type,
+                frame_id=self.frame_ids.get(t.name, ""),
+                boxes=t.name == boxes,
+                video=t.name in self._videos,
+            )
+            for t in topics
         ]
         return [self._packets.describe(topic, self._source.lidar_calibration) for topic in known]
 
@@ -306,7 +329,7 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     """
     names = {topic.name for topic in topics}
     changes: dict[str, Any] = {}
-    for key, kinds in (("lidar_topics", {*CLOUDS}), ("camera_topics", {"Image", "CompressedImage"})):
+    for key, kinds in (("lidar_topics", {*CLOUDS}), ("camera_topics", {*IMAGES})):
         stated_names = getattr(config, key)
         changes[key] = tuple(name for name in stated_names if name in names)
         if stated_names and not changes[key]:

@@ -21,7 +21,6 @@ from bevviz.live.raw_recorder import RawRecorder, RawTopics
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_message
 from bevviz.messages.roles import MARK, Roles
-from bevviz.messages.topics import CLOUDS, Topic
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.pipeline.run import MAX_BURST
 from bevviz.support.contexts import Closable
@@ -269,8 +268,7 @@ class LiveSource(Closable):
         first = self._watch.count(topic, len(data))
         before = inputs.sync.cameras.intrinsics.get(topic)
         try:
-            if first and Topic(topic, published.type).kind.endswith((*CLOUDS, "Image")):
-                inputs.frame_ids[topic] = message.header()[1]
+            if first and inputs.learn(message):
                 self._assign()
             if inputs.handle(message):
                 self._assign()
