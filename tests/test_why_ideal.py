@@ -51,7 +51,7 @@ def test_the_stage_of_a_planted_value_brings_objects_back(planted: str, stage: s
     assert asked.traces.matches is not None
     lost = [row for row in np.flatnonzero(asked.traces.matches.missed).tolist() if row in found]
     assert lost, "the planted value loses an object that is found without it"
-    answers = [asked.about(Selection(truth=row)) for row in lost]
+    answers = [asked.with_restoring_stages(asked.about(Selection(truth=row))) for row in lost]
     right = [answer for answer in answers if (stage,) in answer.restored_by]
     assert len(right) >= 0.8 * len(answers)
 

@@ -272,12 +272,13 @@ class FrameExplainer:
         return replace(answer, verdict=replace(verdict, advice=advice), remark=remark)
 
     def with_restoring_stages(self, answer: Answer) -> Answer:
-        """Add the stages that restore the object that an image box shows, for a frame without ground truth.
+        """Add all smallest sets of stages that bring a missed object back.
 
-        Lists do without them: each subject takes some runs of the stages.
+        Lists do without them: each set takes a run of the stages. With ground truth they have the first set,
+        if it has the stage of the reason. Without it, the object is the one that an image box shows.
         """
         subject, verdict = answer.subject, answer.verdict
-        if subject.kind == "truth" or not (restored_by := self._runs.restored_by(subject)):
+        if not (restored_by := self._runs.restored_by(subject)):
             return answer
         blamed = stage_of(verdict.reason.kind, answer.evidence)
         verdict = make_verdict(subject, verdict.reason, verdict.reported, restored_by, blamed)
@@ -288,8 +289,11 @@ class FrameExplainer:
         if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
         evidence = collect_evidence(subject, self.traces)
-        restored_by = self._runs.restored_by(subject) if subject.kind == "truth" else ()
-        reason, reported = find_reason(subject, evidence, self.traces, restored_by)
+        reason, reported = find_reason(subject, evidence, self.traces)
+        restored_by: tuple[StageSet, ...] = ()
+        if subject.kind == "truth":
+            restored_by = self._runs.restored_by(subject, stage_of(reason.kind, evidence))
+            reason, reported = find_reason(subject, evidence, self.traces, restored_by)
         likely = () if reported else likely_reasons(subject, evidence, self.traces, reason.kind)
         blamed = stage_of(reason.kind, evidence)
         verdict = make_verdict(subject, reason, reported, restored_by, blamed, likely)

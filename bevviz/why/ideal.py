@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.evaluate.matching import image_boxes_of, judge
+from bevviz.evaluate.matching import image_boxes_of
 from bevviz.model import geometry
-from bevviz.model.frame import F32, I64, Bool, Boxes3D, Camera
+from bevviz.model.frame import F32, I64, Boxes3D, Camera
 from bevviz.model.results import (
     CameraResult,
     Clusters,
@@ -27,8 +26,6 @@ from bevviz.model.results import (
     Objects,
     Voxels,
 )
-from bevviz.pipeline.perceive import perceive
-from bevviz.pipeline.stage_loader import Stages
 from bevviz.pipeline.stage_log import Memo
 from bevviz.stages.clustering import describe_clusters
 from bevviz.stages.frustum_fusion import claim_clusters
@@ -243,55 +240,9 @@ def _with_own_clusters(
     return replace(described, state=state)
 
 
-def _on_ground(traces: FrameIndex, rows: tuple[int, ...]) -> bool:
-    """Return whether a point of some objects was taken for ground. Else the ground is ideal already."""
+def takes_from_ground(traces: FrameIndex, row: int) -> bool:
+    """Return whether a point of an object was taken for ground. Else the ground is ideal already."""
     voxels, ground = traces.result.voxels, traces.result.ground
     if voxels is None or ground is None:
         return False
-    return any(ground.mask[_voxels_of(traces, row, voxels)].any() for row in rows)
-
-
-def restoring_stages(
-    traces: FrameIndex, rows: tuple[int, ...], stages: Stages, memo: Memo
-) -> dict[int, tuple[StageSet, ...]]:
-    """Return the smallest sets of stages whose ideal results bring each missed object back.
-
-    All objects get their ideal results in one run. Pairs are tried for those that no single stage brings
-    back, and all stages together for the rest.
-
-    Args:
-        traces: index of the frame's result, with ground truth.
-        rows: missed objects of the ground truth.
-        stages: stages of the result's configuration.
-        memo: shared results of the frame's stages.
-    """
-    result, truth = traces.result, traces.labels_in_evaluate
-    restored: dict[int, list[StageSet]] = {row: [] for row in rows}
-    if truth is None or result.objects is None:
-        return dict.fromkeys(rows, ())
-
-    def found(chosen: StageSet) -> Bool:
-        """Return (K,) whether each object is found with the ideal results of some stages."""
-        edits = IdealStages(traces, rows, chosen, memo)
-        after = perceive(result.frame, ideal_config(result.config, chosen), stages, memo, edits=edits)
-        return (
-            np.zeros(len(truth.must), np.bool_)
-            if after.objects is None
-            else ~judge(after.objects, truth).missed
-        )
-
-    stages_to_try = STAGES if _on_ground(traces, rows) else STAGES[1:]
-    left = list(rows)
-    for size in (1, 2):
-        for chosen in combinations(stages_to_try, size) if left else ():
-            is_found = found(chosen)
-            for row in left:
-                if is_found[row]:
-                    restored[row].append(chosen)
-        left = [row for row in left if not restored[row]]
-        if size == 1 and left:
-            curable = found(stages_to_try)
-            left = [row for row in left if curable[row]]
-    for row in left:
-        restored[row].append(stages_to_try)
-    return {row: tuple(sets) for row, sets in restored.items()}
+    return bool(ground.mask[_voxels_of(traces, row, voxels)].any())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from bevviz.pipeline.stage_log import Memo
 from bevviz.why.assumed_truth import assumed_truth
 from bevviz.why.changes import Change, with_changes
 from bevviz.why.frame_index import FrameIndex
-from bevviz.why.ideal import IdealStages, StageSet, ideal_config, restoring_stages
+from bevviz.why.ideal import STAGES, IdealStages, StageSet, ideal_config, takes_from_ground
 from bevviz.why.subject import Subject
 
 RUNS = 12  # whole results in the cache, for other subjects of the frame
@@ -48,7 +48,6 @@ class FrameRuns:
         self._loader, self._memo = loader, Memo(STAGE_RESULTS)
         self._runs: dict[tuple[tuple[str, Any], ...], FrameIndex | None] = {}
         self._found: dict[tuple[object, ...], frozenset[int]] = {}
-        self._restored: dict[FrameIndex, Mapping[int, tuple[StageSet, ...]]] = {}
         self._assumed: dict[tuple[object, ...], FrameIndex | None] = {}  # by subject
 
     def with_change(self, change: Change) -> FrameIndex | None:
@@ -82,7 +81,7 @@ class FrameRuns:
         truth = wanted.traces.labels_in_evaluate
         assert truth is not None
         try:
-            config = with_changes(self._result.config, change)
+            config = with_changes(self._result.config, change) if change else self._result.config
             stages = self._loader.load(config, self._known_detections(config, change))
         except (UserError, ValidationError):
             return frozenset()
@@ -92,23 +91,39 @@ class FrameRuns:
             return frozenset()
         return frozenset(wanted.missed) - {*np.flatnonzero(judge(after.objects, truth).missed).tolist()}
 
-    def restored_by(self, subject: Subject) -> tuple[StageSet, ...]:
+    def restored_by(self, subject: Subject, blamed: str = "") -> tuple[StageSet, ...]:
         """Return the smallest sets of stages whose ideal results bring a missed object back.
 
-        It is empty where no set does, and for objects that need not be found. Without ground truth, the
+        It is empty where no set does, and for objects that need not be found. Pairs are tried if no single
+        stage brings the object back, and all stages together if no pair does. Without ground truth, the
         object is the one that the image box of the subject seems to show.
+
+        Args:
+            subject: the subject in question.
+            blamed: stage whose sets are tried first. The first one that does is enough. Empty: return all.
         """
         wanted = self.wanted(subject)
-        if wanted is None or not self._traces.origin("objects").ours:
+        if wanted is None:
             return ()
-        if wanted.traces not in self._restored:
-            stages = self._loader.load(self._result.config, self._detections)
-            self._restored[wanted.traces] = restoring_stages(wanted.traces, wanted.missed, stages, self._memo)
-        return self._restored[wanted.traces].get(wanted.row, ())
+        tried = STAGES if takes_from_ground(wanted.traces, wanted.row) else STAGES[1:]
+        for size in (1, 2, len(tried)):
+            if size == 2 and not self.is_found(subject, {}, tried):
+                return ()
+            sets = []
+            for chosen in sorted(combinations(tried, size), key=lambda stages: blamed not in stages):
+                if self.is_found(subject, {}, chosen):
+                    sets.append(chosen)
+                    if blamed in chosen:
+                        return (chosen,)
+            if sets:
+                return tuple(sets)
+        return ()
 
     def wanted(self, subject: Subject) -> _Wanted | None:
         """Return the missed object of a subject. None: there is none, or nothing tells where it is."""
         traces = self._traces
+        if not traces.origin("objects").ours:
+            return None
         if traces.labels_in_evaluate is None:
             key = (*subject.key, *(() if subject.asked is None else subject.asked.tolist()))
             if key not in self._assumed:
