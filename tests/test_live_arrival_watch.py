@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from bevviz.config import load
 from bevviz.live.inputs import AGAIN, TopicWatch
 from bevviz.live.problems import CurrentProblems
+from bevviz.live.result_problems import LASTING, OVER, ResultProblems
+from bevviz.model.frame import Frame
+from bevviz.model.results import Anomaly, FrameResult
 
 
 class Watched:
@@ -94,3 +100,24 @@ def test_problems_are_told_when_they_begin_change_and_end() -> None:
     blind = "/lidar2: all 900 points are NaN in 900 frames"
     assert said == [first, second, blind, "seen", "right again", "found out"]
     assert problems.sentences == []
+
+
+def test_a_faulty_sensor_is_a_problem_while_it_lasts() -> None:
+    """One frame without an image is none, and a flickering object is no matter of the input."""
+    said: list[str] = []
+    problems = CurrentProblems(said.append)
+    checks, text = ResultProblems(problems), "camera zed: frozen image"
+    frame = Frame(0, 0, 0, "lidar", np.zeros((0, 3), np.float32), "lidar")
+    clean = FrameResult.unprocessed(frame, load())
+    flicker = Anomaly("flicker", "car 3", "flickers")
+    faulty = replace(clean, anomalies=(Anomaly("sensor", "zed", text), flicker))
+    for result in [faulty] * (LASTING - 1) + [clean] + [faulty] * (LASTING - 1):
+        checks.observe(result)
+    assert not said
+    checks.observe(faulty)
+    assert said == [text] and [str(problem) for problem in problems.of("zed")] == [text]
+    for _ in range(OVER - 1):
+        checks.observe(clean)
+    assert said == [text]
+    checks.observe(clean)
+    assert said == [text, f"over: {text}"] and not problems.current

@@ -91,8 +91,7 @@ class CurrentProblems:
             before = self._problems.pop(key, None)
             if text:
                 since = now if before is None else before.since
-                over = over or f"{subject}: over: {text}"
-                self._problems[key] = Problem(finding, since, over)
+                self._problems[key] = Problem(finding, since, over or f"over: {text}")
                 past = self._past.setdefault(key, PastProblem(finding, now))
                 past.finding, past.end = finding, None
                 past.times += before is None

@@ -31,9 +31,9 @@ class ResultProblems:
             self._lasted[key] = lasted = max(1, lasted + 1) if key in found else min(-1, lasted - 1)
             kind, subject = key
             if lasted >= LASTING:
-                self._problems.set(kind, subject, found[key], f"{subject}: over")
+                self._problems.set(kind, subject, found[key])
             elif lasted <= -OVER:
-                self._problems.set(kind, subject, "", f"{subject}: over")
+                self._problems.set(kind, subject, "")
                 del self._lasted[key]
 
     def _found(self, result: FrameResult) -> Iterator[tuple[tuple[str, str], str]]:
