@@ -29,7 +29,6 @@ from bevviz.messages.roles import Roles, find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import perceive
 from bevviz.recording.provenance import model_path
 from bevviz.support import progress, table
 from bevviz.support.compile_clock import thread_clock
@@ -212,6 +211,8 @@ def _detected(frames: Sequence[Frame], config: Config) -> Iterator[FrameResult]:
         stages = _alone(config, "detector")
     except UserError:  # It is listed as missing.
         return
+    from bevviz.pipeline.perceive import perceive  # onnxruntime takes as long as half of all other imports.
+
     config = config.restated({"objects": ObjectsConfig()})
     for frame in frames:
         yield perceive(frame, config, stages)
