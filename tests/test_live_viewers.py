@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from bevviz.config.reloading import ReloadableConfig
 from bevviz.live.encoder import Packet
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.indexing import Indexer
+from bevviz.live.outputs import Output
 from bevviz.live.run_outputs import Outputs
 from bevviz.live.runtime import Live
 from bevviz.live.status import Notes
@@ -139,3 +141,18 @@ def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None
             bench.recording._take(packet, False)
         assert bench.recording.since(None)[1] == 2
         live.encoder.close()
+
+
+def test_a_viewer_is_behind_until_it_keeps_up(results: list[FrameResult]) -> None:
+    with live_bench(results) as bench:
+        outputs, problems = bench.live.outputs, bench.live.problems
+        viewer = Mock(spec=Output, dropped=1)
+        viewer.name = "web"
+        outputs.attach(viewer)
+        for lag, is_behind in ((2.9, False), (3.5, True), (1.5, True), (0.5, False), (2.0, False)):
+            viewer.lag = lag
+            outputs.check()
+            assert bool(problems.of("web viewer")) == is_behind
+        (past,) = problems.past.values()
+        assert past.finding.text == "the web viewer is 1.5 s behind" and past.times == 1
+        assert bench.live.numbers["lag of the web viewer, ms"] == 2000.0

@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from bevviz.live.encoder import Encoder, Packet
-from bevviz.live.problems import CurrentProblems
 from bevviz.live.status import Notes
 from bevviz.recording import rerun_cli
 from bevviz.recording.frame_logger import RecordingContext
@@ -30,7 +29,7 @@ from bevviz.recording.sinks import check_viewer
 from bevviz.support.queues import NewestQueue
 
 RETRY = 3.0  # seconds between two attempts to reach a lost viewer
-BEHIND = 3.0  # seconds of lag at which the user is warned
+BEHIND = 3.0  # seconds of lag at which the user is warned, until it is less than ``LATE``
 LATE = 1.0  # seconds of lag from which on no old packets are sent
 
 
@@ -254,35 +253,3 @@ class Viewer(Output):
         except OSError:
             return False
         return True
-
-
-class LagWatch:
-    """Check for viewers that fall behind.
-
-    Args:
-        problems: takes the viewers that are behind.
-    """
-
-    def __init__(self, problems: CurrentProblems) -> None:
-        self._problems = problems
-        self._behind: set[str] = set()
-
-    def check(self, outputs: Sequence[Output]) -> None:
-        """Note each viewer that falls behind, until it keeps up again."""
-        for output in outputs:
-            name, lag = output.name, output.lag
-            if lag is None:
-                continue
-            if lag > BEHIND:
-                self._behind.add(name)
-            elif lag < LATE:
-                self._behind.discard(name)
-            missed = f"{output.dropped} frames" if output.dropped != 1 else "1 frame"
-            self._problems.set(
-                "behind",
-                f"{name} viewer",
-                f"the {name} viewer is {lag:.1f} s behind" if name in self._behind else "",
-                f"the {name} viewer keeps up again; it has missed {missed} so far",
-                "it gets the newest frames, the others it misses; --set live.viewer_points=20000 and --set "
-                "live.viewer_rate=2 send it less",
-            )

@@ -12,7 +12,7 @@ from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.files import BagSaver, RecordingSaver, free_names
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.indexing import Indexer
-from bevviz.live.outputs import LagWatch, Output, Viewer, remote, server, window
+from bevviz.live.outputs import BEHIND, LATE, Output, Viewer, remote, server, window
 from bevviz.live.problems import CurrentProblems
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.status import Notes
@@ -61,9 +61,8 @@ class RunOutputs(Closable):
         problems: CurrentProblems,
         raw: RawRecorder | None,
     ) -> None:
-        self._encoder, self._notes = encoder, notes
+        self._encoder, self._notes, self._problems = encoder, notes, problems
         self._indexer = Indexer()
-        self._lag_watch = LagWatch(problems)
         self.flight = FlightRecorder(config, encoder, self._indexer, notes, raw)
         self.urls: list[str] = []
         programs = [remote(url, encoder.application, encoder.recording_id) for url in wanted.connect]
@@ -127,8 +126,21 @@ class RunOutputs(Closable):
         return [saver.paths for saver in (self._recording, self._bag) if saver is not None and saver.paths]
 
     def check(self) -> None:
-        """Note the viewers that are behind."""
-        self._lag_watch.check(self._outputs)
+        """Note each viewer that falls behind, until it keeps up again."""
+        for output in self._outputs:
+            name, lag = f"{output.name} viewer", output.lag
+            if lag is None:
+                continue
+            behind = lag >= (LATE if self._problems.of(name) else BEHIND)
+            missed = f"{output.dropped} frame{'' if output.dropped == 1 else 's'}"
+            self._problems.set(
+                "behind",
+                name,
+                f"the {name} is {lag:.1f} s behind" if behind else "",
+                f"the {name} keeps up again; it has missed {missed} so far",
+                "it gets the newest frames, the others it misses; --set live.viewer_points=20000 and --set "
+                "live.viewer_rate=2 send it less",
+            )
 
     def close(self) -> None:
         """Close all outputs and finish the recordings."""

@@ -60,7 +60,6 @@ class ThinnedSource:
     def __init__(
         self, source: RobotFrames, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.thinned = 0
         self._source, self._config, self._clock = source, config, clock
 
     @property
@@ -87,7 +86,6 @@ class ThinnedSource:
         for number, frame in enumerate(self._source):
             live, now = self._config().live, self._clock()
             if number % live.every or now < earliest:
-                self.thinned += 1
                 continue
             if live.max_rate is not None:
                 # A frame that comes a little early keeps its turn. A pause permits no burst afterwards.
