@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from bevviz.config import Config, parameters, plugin_of, preset_differences, values
 from bevviz.errors import UserError
-from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.model.reasons import STAGES, Reason, ReasonKind
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
@@ -49,39 +49,12 @@ _METHODS: Mapping[str, tuple[Change, ...]] = {  # other methods of each stage
 
 # Parameters that bevviz applies to the output of user functions, too.
 _SHARED_PARAMETERS = {"min_cluster_points", "max_cluster_points", "conf_threshold"}
-_SECTION = {  # kind of reason -> section whose parameters may help
-    ReasonKind.GROUND: "ground",
-    ReasonKind.NOISE: "clustering",
-    ReasonKind.NO_CLUSTER: "clustering",
-    ReasonKind.MERGED: "clustering",
-    ReasonKind.SPLIT: "clustering",
-    ReasonKind.NOT_DETECTED: "detector",
-    ReasonKind.BELOW_THRESHOLD: "detector",
-    ReasonKind.NOT_AMONG: "objects",
-    ReasonKind.MISNAMED: "objects",
-}
-_CLUSTERING = ("clustering", "ground", "fusion")
-_DETECTION = ("detector", "fusion")
-_FUSION = ("fusion", "clustering", "detector")
-_STAGES = {  # kind of reason -> sections whose values may be the cause, the nearest first
-    ReasonKind.GROUND: ("ground", "clustering"),
-    ReasonKind.NOISE: _CLUSTERING,
-    ReasonKind.NO_CLUSTER: _CLUSTERING,
-    ReasonKind.TOO_SMALL: _CLUSTERING,
-    ReasonKind.TOO_LARGE: _CLUSTERING,
-    ReasonKind.MERGED: _CLUSTERING,
-    ReasonKind.SPLIT: _CLUSTERING,
-    ReasonKind.NOT_DETECTED: _DETECTION,
-    ReasonKind.BELOW_THRESHOLD: _DETECTION,
-    ReasonKind.SUPPRESSED: _DETECTION,
-}
-_NO_STAGE = {  # No value of a stage lost these.
-    ReasonKind.REPORTED,
-    ReasonKind.FAILED,
-    ReasonKind.OUT_OF_VIEW,
-    ReasonKind.HIDDEN,
-    ReasonKind.NO_POINTS,
-    ReasonKind.NOT_RUN,
+_NEAR = {  # stage that lost a subject -> sections whose values may be the cause, the nearest first
+    "ground": ("ground", "clustering"),
+    "clustering": ("clustering", "ground", "fusion"),
+    "detector": ("detector", "fusion"),
+    "fusion": ("fusion", "clustering", "detector"),
+    "objects": ("fusion", "clustering", "detector"),
 }
 _OTHER_OWNER = {  # another subject has the detection or the cluster
     ReasonKind.SHARED_BOX,
@@ -161,8 +134,9 @@ def changes_for(
         is_false: whether it is a false object.
     """
     result = traces.result
-    section = _SECTION.get(reason.kind, "")
-    if section and not traces.origin(section).ours:
+    stage = STAGES.get(reason.kind, "")
+    section = "objects" if stage == "fusion" else stage
+    if stage in _NEAR and not traces.origin(section).ours:
         yield from _function_changes(result, section)
     if not traces.origin("objects").ours:
         return
@@ -263,7 +237,7 @@ def _stated_height(reason: Reason, result: FrameResult) -> Iterator[Change]:
 def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
     """Yield the preset's value of each number that was changed in a stage that may have lost the subject."""
     differing = preset_differences(config)
-    for section in () if kind in _NO_STAGE else _STAGES.get(kind, _FUSION):
+    for section in _NEAR.get(STAGES.get(kind, ""), ()):
         for key, value in differing.items():
             if key.startswith(f"{section}.") and isinstance(value, int | float):
                 yield {key: value}

@@ -11,7 +11,15 @@ import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.reasons import Reason, ReasonKind
-from bevviz.why.changes import FAR_STEPS, Change, changes_for, restored_values, stage_changes, stepped_numbers
+from bevviz.why.changes import (
+    FAR_STEPS,
+    STEPS,
+    Change,
+    changes_for,
+    restored_values,
+    stage_changes,
+    stepped_numbers,
+)
 from bevviz.why.collect import collect_evidence
 from bevviz.why.evidence import Evidence
 from bevviz.why.false_objects import false_reasons
@@ -205,6 +213,8 @@ class HintFinder:
         for needed in restored_by:
             if len(needed) > 1:
                 yield from new(self._combined(question.subject, needed))
+        if "detector" in nearest:  # Lower limits of the fusion let weaker detections pass.
+            yield from new(stepped_numbers("fusion", config, STEPS[:1]))
         others = [stage for stage in STAGES if stage not in nearest]
         yield from new(change for stage in others for change in stage_changes(stage, config, ()))
         yield from new(change for stage in nearest for change in stepped_numbers(stage, config, FAR_STEPS))
