@@ -25,14 +25,14 @@ from bevviz.support.colors import GROUND, Color, class_color
 
 SPACE, ABOVE = "space", "above"  # names of the views of a scene
 FROM_ABOVE = "Bird's-eye view"  # title of the view from above
-IMAGE_WIDTH = 1000.0  # width of a whole image in its view
+IMAGE_WIDTH, IMAGE_HEIGHT = 1000.0, 562.5  # width of a whole image in its view, and height of the view
 _AHEAD = 12.0  # metres from the robot to the middle of the view from above, without a subject
 _FLAT = 0.05  # height of objects in the view from above, so that they hide nothing
 _AWAY, _AWAY_SIZES = 4.0, 1.2  # metres from the eye to a subject, and further lengths of it
 _USUAL = float(np.linalg.norm(np.subtract(EYE, LOOK_TARGET)))  # metres from the eye to what it looks at
 _SIZES = 4.0  # sizes of a subject that its view of an image is wide or high
 _LEAST = 0.35  # of the width of an image is shown at least
-_BORDER = 0.3  # of the width of a view is the least distance of a subject from its border
+_BORDER = 0.35  # of the width of a view is the least distance of a subject from its border
 _VEIL, _VEIL_ORDER = 165, 38.0  # opacity of what covers the rest of an image, and its order over the image
 _DIM = 0.35  # brightness of what is no subject
 _BEFORE, _STEP, _MOST = 1_000_000, 1_000, 999  # nanoseconds before a frame, between two poses, and poses
@@ -203,11 +203,10 @@ def _image_size(camera: Camera) -> tuple[int, int] | None:
 def _part(size: tuple[int, int], box: F32) -> ImagePose:
     """Return the part of an image around a box. The box stays away from the border of its view."""
     lengths, image = box[2:] - box[:2], np.array(size, np.float64)
-    share = min(1.0, max(_LEAST, *(_SIZES * lengths / image)))
+    needed = _SIZES * max(lengths[0], lengths[1] * IMAGE_WIDTH / IMAGE_HEIGHT)
+    share = min(1.0, max(_LEAST, needed / image[0]))
     shown = share * image
     center = np.clip((box[:2] + box[2:]) / 2, (0.5 - _BORDER) * shown, image - (0.5 - _BORDER) * shown)
-    if share == 1.0:
-        center = image / 2
     u, v = (center - shown / 2).tolist()
     return ImagePose((u, v), float(shown[0] / IMAGE_WIDTH))
 

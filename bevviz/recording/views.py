@@ -14,14 +14,13 @@ from bevviz.model.counts import OPINIONS
 from bevviz.model.frame import Scene
 from bevviz.recording import entities
 from bevviz.recording.cloud import quantity_visualizer
-from bevviz.recording.focus import ABOVE, FROM_ABOVE, IMAGE_WIDTH, SPACE, frame_name
+from bevviz.recording.focus import ABOVE, FROM_ABOVE, IMAGE_HEIGHT, IMAGE_WIDTH, SPACE, frame_name
 from bevviz.recording.health import COUNTS
 from bevviz.recording.labels import EYE, LOOK_TARGET
 from bevviz.recording.marks import MARK_COLORS
 
 _DARK = (13, 14, 18)
 _FROM_ABOVE = (0.0, 0.0, 40.0)  # eye over the origin of its view
-_IMAGE_HEIGHT = 562.5  # of the view of an image of the width ``IMAGE_WIDTH``
 HIDDEN = rrb.EntityBehavior(visible=False)
 LINKED = rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
 
@@ -155,7 +154,7 @@ def camera(scene: Scene, name: str, *, why: bool = False, weak: bool = False) ->
     options: dict[str, Any] = {}
     if scene.moving:
         options["spatial_information"] = rrb.SpatialInformation(target_frame=frame_name(name))
-        x_range, y_range = (0.0, IMAGE_WIDTH), (0.0, _IMAGE_HEIGHT)
+        x_range, y_range = (0.0, IMAGE_WIDTH), (0.0, IMAGE_HEIGHT)
         options["visual_bounds"] = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     return rrb.Spatial2DView(
         name=name,

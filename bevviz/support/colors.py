@@ -2,7 +2,7 @@
 
 Context is grey: ground, points, clusters without a name, tracks. A class has one hue, far from the red of
 missed and the yellow of false objects: found is calm. Any two states differ by at least 20 (CIEDE2000), also
-for people without green cones; a class and a state by at least 10, whichever cones somebody lacks.
+for people without green cones; any two classes or states by at least 10, whichever cones somebody lacks.
 """
 
 from __future__ import annotations

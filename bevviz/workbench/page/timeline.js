@@ -65,7 +65,9 @@ export function draw() {
   canvas.style.height = `${height}px`;
   const scale = window.devicePixelRatio || 1;
   const [first, last] = [times[0], times.at(-1)];
-  const each = Math.max(2, (width - NAMES) / times.length - 1);
+  const gap = times.reduce((least, time, row) => (row ? Math.min(least, time - times[row - 1]) : least), last - first);
+  const share = Math.min(1 / times.length, gap / (last - first + gap)); // of the width, for each frame
+  const each = Math.max(2, (width - NAMES) * share - 1);
   const x = (stamp) => NAMES + each / 2 + ((Number(stamp) - first) / (last - first)) * (width - NAMES - each);
   const wanted = [changes, first, last, times.length, width, scale].join();
   if (wanted !== pictured) {
