@@ -46,6 +46,7 @@ accuracy: $(VENV)/.tested
 	$(BIN)/python -m benchmarks.ideal --half unseen --write benchmarks/RESULTS.md
 	$(BIN)/python -m benchmarks.ground --write benchmarks/RESULTS.md
 	$(BIN)/python -m benchmarks.anomalies --write benchmarks/RESULTS.md
+	$(BIN)/python -m benchmarks.rigs --write benchmarks/RESULTS.md
 
 # Renew the versions. Commit the result when make test and make check pass with it.
 constraints: .venv-release/.installed

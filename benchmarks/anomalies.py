@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import bevviz
 from benchmarks.pages import write_section
-from benchmarks.sensor_faults import SensorTally, results
+from benchmarks.sensor_faults import SensorTally, play_forth_and_back, results
 from benchmarks.sensor_faults import measure as measure_sensors
 from bevviz.anomalies import Onsets
 from bevviz.config import Config, load
@@ -333,7 +333,8 @@ def table(tally: Tally, sensors: SensorTally) -> str:
     lines += [
         "",
         f"{len(tally.alarms)} false alarms in {tally.seconds:.0f} s undisturbed: {rate:.1f} in 10 s.",
-        f"{len(sensors.alarms)} of a sensor in {sensors.seconds:.1f} s, the real drive among them. "
+        f"{len(sensors.alarms)} of a sensor in {sensors.seconds:.1f} s, the real drive among them, and "
+        f"{len(sensors.played_alarms)} in {sensors.played:.0f} s of it played forth and back. "
         f"{sensors.misnamed} of the {sum(map(len, sensors.delays.values()))} faults of sensors were told by "
         "another name, too.",
     ]
@@ -354,6 +355,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     sensors = SensorTally()
     for drive in sensor_drives(options.seed or SEEDS, options.real):
+        if options.real.is_dir() and not sensors.played:  # The real drive comes first.
+            play_forth_and_back(drive, sensors)
         measure_sensors(drive, sensors)
     tally = measure(options.seed or SEEDS, load(settings=options.set))
     if options.write:
@@ -363,7 +366,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(table(tally, sensors))
     for seed, index, anomaly in tally.alarms:
         print(f"- drive {seed}, frame {index}: {anomaly.kind}: {anomaly.text}")
-    for anomaly in sensors.alarms:
+    for anomaly in (*sensors.alarms, *sensors.played_alarms):
         print(f"- {anomaly.text}")
 
 

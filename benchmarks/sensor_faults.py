@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from tests.support.sensor_plants import (
 FIRST, EVERY = 8, 8  # frames, when faults are planted in a drive
 NEWEST = 150_000_000  # nanoseconds by which a fault may be dated back
 HORIZON = 6  # frames that a fault is watched for
+PLAYED, STEP = 60.0, 0.1  # seconds that a real drive is played, and between its frames
 LONGEST = 100  # frames that a transform which was always wrong is watched for
 DEGREES = 3.0
 TURNS = [(axis, sign * DEGREES) for axis in range(3) for sign in (1, -1)]
@@ -127,6 +129,8 @@ class SensorTally:
     delays: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # s; inf: not told
     alarms: list[Anomaly] = field(default_factory=list)
     seconds: float = 0.0  # undisturbed
+    played: float = 0.0  # seconds of a real drive, forth and back
+    played_alarms: list[Anomaly] = field(default_factory=list)
     misnamed: int = 0  # planted faults that were told by another name, too
 
 
@@ -154,6 +158,38 @@ def measure(drive: Results, tally: SensorTally) -> None:
         wrong = [turned_transform(result, axis, degrees) for result in drive[:LONGEST]]
         tally.delays[ALWAYS].append(_delay(SensorWatch(), wrong, "not where its transform says", tally))
     tally.seconds += 0.1 * len(drive)
+
+
+def play_forth_and_back(drive: Results, tally: SensorTally) -> None:
+    """Count the false alarms of a short real drive that is played forth and back for a minute.
+
+    The content is real at every step, and no frame follows itself.
+    """
+    watch, seen = SensorWatch(), set[tuple[str, int]]()
+    rows = [*range(len(drive)), *range(len(drive) - 2, 0, -1)]
+    start = drive[0].frame.stamp
+    for number, row in zip(range(round(PLAYED / STEP)), itertools.cycle(rows), strict=False):
+        result = _moved(drive[row], start + round(number * STEP * 1e9) - drive[row].frame.stamp)
+        new = [a for a in watch.update(result) if (a.subject, a.since) not in seen]
+        seen |= {(a.subject, a.since) for a in new}
+        tally.played_alarms += new
+    tally.played += PLAYED
+
+
+def _moved(result: FrameResult, by: int) -> FrameResult:
+    """Return a result with later stamps, in nanoseconds."""
+    frame, cameras = result.frame, []
+    for camera in result.cameras:
+        image = camera.camera.image
+        moved = image and replace(image, stamp=image.stamp + by)
+        cameras.append(replace(camera, camera=replace(camera.camera, image=moved)))
+    frame = replace(
+        frame,
+        stamp=frame.stamp + by,
+        clouds=tuple(replace(cloud, stamp=cloud.stamp + by) for cloud in frame.clouds),
+        cameras=tuple(camera.camera for camera in cameras),
+    )
+    return replace(result, frame=frame, cameras=tuple(cameras))
 
 
 def _delay(watch: SensorWatch, window: Sequence[FrameResult], told_by: str, tally: SensorTally) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, anomalies, calib, ground, ideal, kitti, large, performance, size
+from benchmarks import accuracy, anomalies, calib, ground, ideal, kitti, large, performance, rigs, size
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.pages import write_section
@@ -110,9 +110,10 @@ def test_the_page_has_a_section_for_each_benchmark() -> None:
     for module in (calib, performance):
         assert page.count(module.BEGIN) == page.count(module.END) == 1
     headings = [text.strip().splitlines()[0] for text in (ideal.HEADING, accuracy.SYNTHETIC, anomalies.INTRO)]
+    headings.append(rigs.INTRO.splitlines()[0])
     sources = (inspect.getsource(module) for module in (kitti, size, large, ground))
     headings += [heading for source in sources for heading in re.findall(r'"(## [^"\n]+)', source)]
-    assert len(headings) == 7
+    assert len(headings) == 8
     for heading in headings:
         assert page.count(f"\n{heading}\n") == 1, heading
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import bevviz
 from bevviz.config import SourceConfig, load
 from bevviz.messages.roles import find_roles
 from bevviz.messages.topics import Topic
 from bevviz.model.frame import Camera, Cloud, Frame, Image, Intrinsics
-from bevviz.model.results import Detections, FrameResult
+from bevviz.model.results import Detections, FrameResult, Objects
 from bevviz.pipeline.perceive import suited_to_planes
 from bevviz.pipeline.session import Session
+from bevviz.stages.clustering import cluster
+from bevviz.stages.planar_boxes import whole_boxes
 from tests.support import bags
 
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -108,3 +112,17 @@ def test_a_stated_value_holds_for_scans_of_one_plane() -> None:
     suited = suited_to_planes(stated)
     assert (suited.clustering.min_points, suited.voxel.size) == (10, 0.05)
     assert suited.clustering.min_cluster_points == 4
+
+
+def test_a_car_of_which_the_rear_is_seen_is_whole() -> None:
+    """Its centre is half a length behind the points."""
+    rear = np.column_stack([np.full(40, 10.0), np.linspace(-0.9, 0.9, 40), np.zeros(40)]).astype(np.float32)
+    clusters = cluster(rear, load().clustering)
+    zero, score = np.zeros(1, np.int32), np.array([0.9], np.float32)
+    seen = Objects(clusters.obb, ("car",), score, zero, ("camera",), zero, measured=clusters.obb)
+    whole = whole_boxes(seen, rear, clusters, load().objects.sizes)
+    assert seen.boxes.center[0, 0] == pytest.approx(10)
+    assert 11.5 < whole.boxes.center[0, 0] < 13 and abs(whole.boxes.center[0, 1]) < 0.2
+    assert whole.boxes.size[0, 0] > 3 and whole.measured is clusters.obb
+    person = whole_boxes(replace(seen, names=("person",)), rear, clusters, load().objects.sizes)
+    np.testing.assert_array_equal(person.boxes.center, seen.boxes.center)

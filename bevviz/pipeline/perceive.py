@@ -38,6 +38,7 @@ from bevviz.stages.frustum_fusion import claim_clusters
 from bevviz.stages.fusion import fuse, merge
 from bevviz.stages.ground import no_ground, segment_ground
 from bevviz.stages.opinions import opinions
+from bevviz.stages.planar_boxes import whole_boxes
 from bevviz.stages.user_stages import UserStage
 from bevviz.stages.visibility import range_image
 from bevviz.stages.voxel import spread_to_points, voxel_grid
@@ -370,7 +371,12 @@ def _objects(
                 _call(log, function, cloud, frame), function.name, obstacles, clusters
             ),
         )
-    return None if clusters is None else log.run("fusion", merge, clusters, cameras, config.clustering)
+    if clusters is None:
+        return None
+    merged = log.run("fusion", merge, clusters, cameras, config.clustering)
+    if merged is None or obstacles is None or not frame.is_planar:
+        return merged
+    return log.run("fusion", whole_boxes, merged, obstacles, clusters, config.objects.sizes)
 
 
 def _detects(config: Config, stages: Stages) -> bool:
