@@ -432,16 +432,19 @@ def _cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-def section(misses: Sequence[Miss], half: str, seeds: Sequence[int]) -> str:
+def section(misses: Sequence[Miss], half: str, seeds: Sequence[int], *, blind: bool = False) -> str:
     """Format the section of benchmarks/RESULTS.md."""
     where = f"the {half} half of the frames" if half else "all frames"
-    return f"""{HEADING}
+    command = "python -m benchmarks.ideal" + " --blind" * blind
+    data = ", ".join(f"`{name}`" for name in dict.fromkeys(miss.data for miss in misses))
+    hidden = " The labels are hidden: the question is the box around what the image shows." if blind else ""
+    return f"""{HEADING}{" without labels" * blind}
 
-`python -m benchmarks.ideal` asks about objects that `evaluate` counts as missed, on {where}:
-synthetic drives {seeds[0]} to {seeds[-1]} with noisy boxes (`drives`) or the demo network (`demo`), KITTI
-with YOLOX or the labels' boxes, SUSTechPOINTS (`sus`). One stage, or two, get the ideal result at the object,
-and the other stages run. An answer is right if it names a stage that restores the object so, or the pair that
-does. KITTI's neighbouring frames are other places. Brackets hold 95 % intervals.
+`{command}` asks about objects that `evaluate` counts as missed, on {where} of {data}: synthetic drives
+{seeds[0]} to {seeds[-1]} with noisy boxes (`drives`) or the demo network (`demo`), KITTI with YOLOX or the
+labels' boxes, SUSTechPOINTS (`sus`). One stage, or two, get the ideal result at the object, and the other
+stages run. An answer is right if it names a stage that restores the object so, or the pair that does. KITTI's
+neighbouring frames are other places. Brackets hold 95 % intervals.{hidden}
 
 {table(misses)}
 """
@@ -518,7 +521,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(f"{where}: restored by {said}: {m.text}")
     print(table(misses), confusion(misses), sep="\n")
     if options.write:
-        write_section(options.write, section(misses, options.half, options.seeds))
+        write_section(options.write, section(misses, options.half, options.seeds, blind=options.blind))
 
 
 if __name__ == "__main__":

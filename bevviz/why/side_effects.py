@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.evaluate import Truth, match
-from bevviz.evaluate.differences import Change, SideResult, compare_objects
+from bevviz.evaluate.differences import Change, compare_objects, side_of
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
 from bevviz.why.subject import Subject, count
@@ -124,7 +124,8 @@ def effects(
         own: row in ``after`` of the object in question, -1: unknown.
         doubtful: number of doubtful objects that ``after`` has more.
     """
-    a, b = _seen(before), _seen(after)
+    before, after = before or Objects.empty(), after or Objects.empty()
+    a, b = side_of(before), side_of(after)
     truth_before, truth_after = _truth_of(before, truth), _truth_of(after, truth)
     made: list[tuple[bool, str, Effect]] = []
     more, gone = [], []
@@ -157,22 +158,13 @@ def effects(
     )
 
 
-def _seen(objects: Objects | None) -> SideResult:
-    """Return objects in the form that the comparison needs."""
-    if objects is None:
-        return SideResult(Boxes3D.empty(), (), np.zeros(0, np.float32))
-    return SideResult(objects.boxes, objects.names, objects.score)
-
-
 def _name(name: str, boxes: Boxes3D, row: int) -> str:
     """Return the class and distance of an object."""
     return f"{name} at {boxes.distance[row]:.1f} m"
 
 
-def _truth_of(objects: Objects | None, subjects: Sequence[Subject]) -> list[int]:
+def _truth_of(objects: Objects, subjects: Sequence[Subject]) -> list[int]:
     """Return the ground truth row of each object by the rule of ``evaluate``, -1: none."""
-    if objects is None:
-        return []
     boxes = Boxes3D.joined([subject.box for subject in subjects if subject.box is not None])
     accepted = tuple(subject.accepted for subject in subjects)
     labels = tuple(subject.label for subject in subjects)
