@@ -220,7 +220,7 @@ def test_a_run_can_be_stopped() -> None:
 
     numbers = Numbers(10_000)
     assert run(numbers, Squares(), [Stopping()], stop=stop) == RunEnd(1)
-    assert numbers.drawn <= 4
+    assert numbers.drawn <= 5
 
 
 def test_the_collector_is_left_as_it_was() -> None:
@@ -302,8 +302,8 @@ def test_closing_ends_the_threads() -> None:
     drawn = iterate_results(numbers, Squares())
     assert next(drawn) == 1
     drawn.close()
-    assert numbers.drawn == 3
-    assert not [t for t in threading.enumerate() if t.name.startswith(("stages", "network"))]
+    assert numbers.drawn <= 4
+    assert not [t for t in threading.enumerate() if t.name.startswith(("read", "stages", "finish", "network"))]
 
 
 def test_prefetched_items_come_in_order() -> None:

@@ -159,12 +159,28 @@ def iterate_results(items: Iterable[T], processor: Processor[T, R]) -> Generator
 def _process(
     items: Iterable[T], processor: Processor[T, R], network: Executor, depth: int
 ) -> Generator[R, None, None]:
-    """Yield the result of each item, in order. ``perceive`` and ``finish`` have a thread each.
+    """Yield the result of each item, in order. Items, ``perceive`` and ``finish`` have a thread each.
 
-    One of the ``depth`` items that are read ahead is in ``finish``.
+    One of the ``depth`` items that are read ahead is in ``finish``. A further item is being read.
     """
-    with closing(map_ahead(items, lambda item: processor.perceive(item, network), depth - 1)) as perceived:
+    with (
+        closing(_read_ahead(items)) as read,
+        closing(map_ahead(read, lambda item: processor.perceive(item, network), depth - 1)) as perceived,
+    ):
         yield from map_ahead(perceived, processor.finish, 1, "finish")
+
+
+def _read_ahead(items: Iterable[T]) -> Generator[T, None, None]:
+    """Yield the items. A thread reads the next one while the caller works on the last one."""
+    source, end = iter(items), object()
+    reader = ThreadPoolExecutor(1, "read")
+    try:
+        upcoming: Future[Any] = reader.submit(next, source, end)
+        while (item := upcoming.result()) is not end:
+            upcoming = reader.submit(next, source, end)
+            yield item
+    finally:
+        reader.shutdown(cancel_futures=True)
 
 
 class _Loop(Generic[T, R]):
