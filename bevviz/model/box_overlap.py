@@ -86,7 +86,8 @@ def shared_area(a: F64, b: F64) -> float:
     Sutherland and Hodgman 1974 for the clipping, the shoelace formula for the area.
     """
     polygon, clipped = np.empty((16, 2)), np.empty((16, 2))
-    polygon[:4] = a
+    for k in range(4):
+        polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
     count = 4
     for k in range(4):
         x0, y0 = b[k]

@@ -129,7 +129,8 @@ def _paint(cell: I32, image: U8, color: U8) -> None:
     pixels = image.reshape(-1, 3)
     for i in range(len(cell)):
         if cell[i] >= 0:
-            pixels[cell[i]] = color
+            for channel in range(3):
+                pixels[cell[i], channel] = color[channel]
 
 
 @kernel
@@ -213,9 +214,11 @@ def _shade(
     for cell in seen:
         if state[cell] == OCCUPIED:
             level = (top[cell] - bottom) / span * len(heights)
-            pixels[cell] = heights[max(0, min(len(heights) - 1, int(level)))]
+            color = heights[max(0, min(len(heights) - 1, int(level)))]
         else:
-            pixels[cell] = ground[min(points[cell], len(ground)) - 1]
+            color = ground[min(points[cell], len(ground)) - 1]
+        for channel in range(3):
+            pixels[cell, channel] = color[channel]
 
 
 def _ground_level(points: F32, ground: Bool) -> float:

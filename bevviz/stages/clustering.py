@@ -172,7 +172,8 @@ def _adjacent(keys: I64, strides: I64, box: F64, eps2: float) -> tuple[I32, I32]
             while o < cells and keys[o] <= middle + reach:
                 if used == len(pairs):
                     longer = np.empty(2 * used, np.int32)
-                    longer[:used] = pairs
+                    for k in range(used):
+                        longer[k] = pairs[k]
                     pairs = longer
                 dx = _gap(box[c, 0], box[c, 3], box[o, 0], box[o, 3])
                 dy = _gap(box[c, 1], box[c, 4], box[o, 1], box[o, 4])

@@ -266,7 +266,8 @@ def _near_ground(points: F32, lowest: I32, expected: float, max_step: float, ste
     kept = 0
     for k in range(count):
         if near < 3 or distance[k] < FIRST_PLANE_RADIUS:
-            low[kept] = points[chosen[k]]
+            for axis in range(3):
+                low[kept, axis] = points[chosen[k], axis]
             kept += 1
     return low
 

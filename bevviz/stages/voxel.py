@@ -43,7 +43,8 @@ def _thin(points: F32, keys: I64, average: bool) -> tuple[F32, I32]:
     number, first = group(keys)
     kept = np.empty((len(first), 3), np.float32)
     for k in range(len(first)):
-        kept[k] = points[first[k]]
+        for axis in range(3):
+            kept[k, axis] = points[first[k], axis]
     if average:
         total = np.zeros((len(first), 3))
         size = np.zeros(len(first))

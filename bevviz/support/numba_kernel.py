@@ -47,7 +47,11 @@ class _Kernel:
 
 
 def kernel(function: F) -> F:
-    """Compile a function at its first call. Division by zero is IEEE's, as in numpy."""
+    """Compile a function at its first call. Division by zero is IEEE's, as in numpy.
+
+    A kernel copies rows number by number. For ``a[i] = b[j]`` of arrays numba compiles the text of an error
+    about shapes as well, which takes longer than most kernels.
+    """
     return cast(F, _Kernel(function, nogil=True, error_model="numpy"))
 
 
