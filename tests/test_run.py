@@ -303,7 +303,9 @@ def test_closing_ends_the_threads() -> None:
     assert next(drawn) == 1
     drawn.close()
     assert numbers.drawn <= 4
-    assert not [t for t in threading.enumerate() if t.name.startswith(("read", "stages", "finish", "network"))]
+    assert not [
+        t for t in threading.enumerate() if t.name.startswith(("read", "stages", "finish", "network"))
+    ]
 
 
 def test_prefetched_items_come_in_order() -> None:
