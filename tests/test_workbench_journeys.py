@@ -315,6 +315,62 @@ def test_keys_step_through_frames_and_findings(page: Page) -> None:
     until(page.locator("#help").is_hidden)
 
 
+def test_a_drive_is_played_and_a_span_is_marked(page: Page, bag: Path) -> None:
+    """With the keys, wherever the focus is. A span is noted and run alone, and stays over a reload."""
+    page.keyboard.press("Home")
+    until(lambda: frame(page) == 0)
+    page.select_option("#speed", "4")
+    page.click("#grouped")
+    page.click("#grouped")
+    page.keyboard.press("Space")
+    until(lambda: frame(page) == FRAMES - 1 and page.get_attribute("#play", "aria-label") == "play")
+    page.keyboard.press("l")
+    page.keyboard.press("Space")
+    until(lambda: frame(page) == 1)
+    page.click("#play")
+    assert f"of {(FRAMES - 1) / 10:.2f} s" in page.inner_text("#clock")
+    page.focus("#words")
+    page.keyboard.type("a b")
+    assert page.input_value("#words") == "a b"
+
+    canvas = page.locator("#events").bounding_box()
+    assert canvas is not None
+    width = (canvas["width"] - 64) / FRAMES
+    start = canvas["x"] + 64 + 1.5 * width
+    page.mouse.move(start, canvas["y"] + 6)
+    page.mouse.down()
+    page.mouse.move(start + 2 * width, canvas["y"] + 6, steps=4)
+    page.mouse.up()
+    assert page.inner_text("#span-text") == "0.10 to 0.30 s marked"
+    page.click("#note")
+    until(lambda: page.locator("#found .note").count())
+    (note,) = Notes([bag])
+    assert (note.end - note.stamp, note.about) == (pytest.approx(0.2e9, abs=1e6), subject_name(page))
+    page.click("#verdict")
+    page.keyboard.press("x")
+    assert page.locator("#span").is_hidden()
+    page.locator("#found button", has=page.locator(".note")).click()
+    until(lambda: page.inner_text("#span-text") == "0.10 to 0.30 s marked")
+    page.fill("#search", "clustering.eps")
+    control = page.locator("[id='control-clustering.eps']")
+    control.fill("0.3")
+    control.press("Enter")
+    page.click("#drive-span")
+    until(lambda: "clustering.eps=0.3; of 0.10 to 0.30 s" in page.inner_text("#trial-set"))
+    until(lambda: "; 3 frames" in page.inner_text("#trial-text"))
+    page.reload()
+    until(lambda: page.locator("#span-text").is_visible())
+    assert page.inner_text("#span-text") == "0.10 to 0.30 s marked"
+    assert page.input_value("#speed") == "4"
+    page.locator("#found").get_by_label("remove this note").click()
+    until(lambda: not Notes([bag]).path.exists())
+
+
+def subject_name(page: Page) -> str:
+    """Return the name of the object that the answer is about."""
+    return page.inner_text("#where").split(" · ")[0].removeprefix("the ")
+
+
 def test_a_click_and_a_row_are_answered_with_what_would_help(page: Page) -> None:
     """The first rows show remarks without a click. A hint does what it says."""
     page.evaluate("window.clickInViewer({ entity_path: '/nowhere', instance_id: 0 })")

@@ -28,6 +28,7 @@ class Note:
         text: text of the user.
         about: the object in words. Empty: the note is about the frame.
         pick: query parameter that selects the object in the workbench.
+        end: sensor time of the last frame of the span that it is about, in nanoseconds. 0: a single frame.
     """
 
     stamp: int
@@ -35,6 +36,7 @@ class Note:
     text: str
     about: str = ""
     pick: str = ""
+    end: int = 0
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}" if self.about else self.text

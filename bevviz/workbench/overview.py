@@ -27,15 +27,16 @@ def overview_order(total: int) -> list[int]:
     return numbers
 
 
-class OverviewFrames:
-    """Frames of the overview as the items of a run. Those that cannot be read are left out.
+class NumberedFrames:
+    """Some frames of a drive as the items of a run. Those that cannot be read are left out.
 
     Args:
         source: the drive.
+        numbers: numbers of the frames.
     """
 
-    def __init__(self, source: FrameSource) -> None:
-        self._source, self._numbers = source, overview_order(len(source.scans))
+    def __init__(self, source: FrameSource, numbers: Sequence[int]) -> None:
+        self._source, self._numbers = source, numbers
 
     @property
     def scene(self) -> Scene:
@@ -44,7 +45,7 @@ class OverviewFrames:
 
     @property
     def total(self) -> int:
-        """Number of frames of the overview."""
+        """Number of the frames."""
         return len(self._numbers)
 
     @property

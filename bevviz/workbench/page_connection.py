@@ -371,8 +371,8 @@ class PageConnection:
 
     async def _drive(self, number: int, message: Message) -> None:
         """Run the drive with other values."""
-        settings = _settings(message)
-        await asyncio.to_thread(self._workbench.tools.trials.begin, settings, self._name)
+        settings, span = _settings(message), _span(message)
+        await asyncio.to_thread(self._workbench.tools.trials.begin, settings, self._name, span)
 
     async def _fix(self, number: int, message: Message) -> None:
         """Search values that repair the drive."""
@@ -400,9 +400,9 @@ class PageConnection:
         file = self._workbench.tools.notes.path.name
         frame, text, identity = await self._frame(message), str(message["text"]), _identity(message)
         about = await self._in_turn(
-            number, lambda: self._workbench.note(frame, text, identity, self._overlay)
+            number, lambda: self._workbench.note(frame, text, identity, self._overlay, _span(message))
         )
-        said = f"Noted about {about} in frame {frame}."
+        said = f"Noted about {about}{'' if _span(message) else f' in frame {frame}'}."
         await self._send({"type": "noted", "id": number, "file": file, "text": said})
 
     async def _unnote(self, number: int, message: Message) -> None:
@@ -434,6 +434,12 @@ class PageConnection:
 
 def _settings(message: Message) -> Settings:
     return tuple(str(setting) for setting in message.get("set") or ())
+
+
+def _span(message: Message) -> tuple[int, int] | None:
+    """Return the first and the last stamp of the span that a message names, if it names one."""
+    low_high = [int(stamp) for stamp in message.get("span") or ()]
+    return (low_high[0], low_high[1]) if low_high else None
 
 
 def _identity(message: Message) -> Identity | None:

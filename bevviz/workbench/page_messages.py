@@ -52,7 +52,7 @@ def remark_dict(answer: Answer) -> dict[str, str]:
 
 def note_dict(note: Note) -> dict[str, Any]:
     """Return a note. Its times are text, as JavaScript numbers cannot hold them."""
-    return {**asdict(note), "stamp": str(note.stamp), "received": str(note.received)}
+    return {**asdict(note), "stamp": str(note.stamp), "received": str(note.received), "end": str(note.end)}
 
 
 def handled_dict(finding: HandledFinding) -> dict[str, Any]:

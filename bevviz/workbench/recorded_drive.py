@@ -30,7 +30,7 @@ from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_ques
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
-from bevviz.workbench.overview import LEAST, OverviewFrames, SingleFrames
+from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.thumbnails import Thumbnails
 
@@ -79,7 +79,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self._overlays = 0  # number of overlays until now
         self._open_overlays: list[PageOverlay] = []
         self.over = False
-        self._overview: OverviewFrames | None = None  # while it is made
+        self._overview: NumberedFrames | None = None  # while it is made
         self._done, self._error = 0, ""
         self._reached = 0  # newest stamp that the run has reached
         self.robot_bag: BagSource | None = None
@@ -173,7 +173,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     def _make_overview(self) -> None:
         """List the findings of single frames all over the drive."""
-        self._overview = OverviewFrames(self.again)
+        self._overview = NumberedFrames(self.again, overview_order(len(self.again.scans)))
         processor = SingleFrames(self.drive.session)
         run(self._overview, processor, [_OverviewObserver(self)], stop=self._stop)
         self._overview, self._done = None, 0

@@ -287,9 +287,14 @@ class WorkbenchSession(Closable):
     # --- notes ---------------------------------------------------------------------------------
 
     def note(
-        self, number: int, text: str, identity: Identity | None, overlay: PageOverlay | None = None
+        self,
+        number: int,
+        text: str,
+        identity: Identity | None,
+        overlay: PageOverlay | None = None,
+        span: tuple[int, int] | None = None,
     ) -> str:
-        """Save a note about an object, or about the frame if the object is not in it. Return its subject.
+        """Save a note about a span, an object, or the frame if the object is not in it. Return its subject.
 
         Raises:
             UserError: the note cannot be written.
@@ -301,8 +306,12 @@ class WorkbenchSession(Closable):
             self.source.mark(result, answer, overlay)
             name = answer.subject.name
             pick = str(self.identity(number, (), selection, answer, identity))
-        frame = result.frame
-        self.tools.notes.add(Note(frame.stamp, frame.received, text.strip(), name.removeprefix("the "), pick))
+        stamp, received, end = result.frame.stamp, result.frame.received, 0
+        if span is not None:
+            first, end = self.source.look(self.source.number_at(span[0])).frame, span[1]
+            stamp, received = first.stamp, first.received
+            name = name or f"the span of {(end - stamp) / 1e9:.2f} s"
+        self.tools.notes.add(Note(stamp, received, text.strip(), name.removeprefix("the "), pick, end))
         self._tell_notes()
         return name or "the frame"
 

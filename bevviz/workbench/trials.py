@@ -18,7 +18,8 @@ from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
 from bevviz.model.counts import OPINIONS, count_opinions
-from bevviz.model.protocols import Observer
+from bevviz.model.frame import Frame
+from bevviz.model.protocols import Items, Observer
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
@@ -29,6 +30,7 @@ from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.growing_drive import Settings
 from bevviz.workbench.jobs import Job, Jobs
+from bevviz.workbench.overview import NumberedFrames
 from bevviz.workbench.recorded_drive import RecordedDrive
 
 RUNS = 6  # trials that are kept
@@ -45,6 +47,7 @@ class Trial(Job):
         scores: score before and after.
         known: whether there is ground truth.
         buffer: recording of its results, for the pages that show its settings.
+        span: first and last stamp of the frames that it runs over. None: the whole drive.
     """
 
     state: str = "waiting"
@@ -53,16 +56,14 @@ class Trial(Job):
     scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
     known: bool = False
     buffer: RecordingBuffer = field(default_factory=RecordingBuffer)
+    span: tuple[int, int] | None = None
 
     @property
     def text(self) -> str:
         """Its changes in a sentence. Empty: it has not run to its end."""
         counts = ", ".join(f"{self.counts[kind]} {kind}" for kind in DIFFERENCES if self.counts[kind])
-        return (
-            f"In the whole drive of {self.done} frames: {counts or 'no change'}."
-            if self.state == "over"
-            else ""
-        )
+        frames = f"the whole drive of {self.done}" if self.span is None else f"{self.done}"
+        return f"In {frames} frames: {counts or 'no change'}." if self.state == "over" else ""
 
     @property
     def lane(self) -> str:
@@ -73,6 +74,7 @@ class Trial(Job):
         """Return the trial as JSON for the page."""
         return Job.as_dict(self) | {
             "lane": self.lane,
+            "span": [str(stamp) for stamp in self.span or ()],
             "counts": {key: number for key, number in self.counts.items() if number},
             "better": sum(good > bad for _, good, bad in self.strip),
             "worse": sum(bad > good for _, good, bad in self.strip),
@@ -89,12 +91,13 @@ class TrialRunner(Jobs[Trial]):
         self._drive = drive
         self._begun = 0  # number of trials until now
 
-    def begin(self, settings: Settings, asked_by: str = "") -> None:
-        """Run the drive with these settings. A trial that is running is cancelled.
+    def begin(self, settings: Settings, asked_by: str = "", span: tuple[int, int] | None = None) -> None:
+        """Run the drive, or a span of it, with these settings. A trial that is running is cancelled.
 
         Args:
             settings: the settings.
             asked_by: name of the overlay of the page that asks.
+            span: first and last stamp of the frames. None: the whole drive.
 
         Raises:
             UserError: nothing is changed, a parameter is unknown, or a value is wrong.
@@ -106,22 +109,31 @@ class TrialRunner(Jobs[Trial]):
             raise UserError("nothing is changed: press a hint, or change a parameter first")
         session = Session(config, loader=drive.pipeline.loader)
         self.end()
-        total, known = drive.again.total, drive.truth_of is not None
-        trial = Trial(self._begun, settings, asked_by, total, known=known)
+        frames: Items[Frame] = drive.again
+        if span is not None:
+            frames = NumberedFrames(drive.again, _numbers(drive, span))
+        known = drive.truth_of is not None
+        trial = Trial(self._begun, settings, asked_by, frames.total or 0, known=known, span=span)
         self._begun += 1
         drive.lanes[trial.lane] = trial.buffer
         drive.findings.replace(tuple(DIFFERENCES))
-        self.start(trial, partial(self._run_drive, session))
+        self.start(trial, partial(self._run_drive, session, frames))
         for old in self.jobs[:-RUNS]:
             self.jobs.remove(old)
             drive.lanes.pop(old.lane).close()
 
-    def _run_drive(self, session: Session, trial: Trial) -> None:
+    def _run_drive(self, session: Session, frames: Items[Frame], trial: Trial) -> None:
         drive = self._drive
         while not drive.over and not trial.stop.wait(0.1):
             pass  # The results of the first run are needed for comparison.
         trial.state = "running"
-        run(drive.again, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
+        run(frames, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
+
+
+def _numbers(drive: RecordedDrive, span: tuple[int, int]) -> range:
+    """Return the numbers of the frames of a span."""
+    first, last = (drive.number_at(stamp) for stamp in span)
+    return range(first, last + 1)
 
 
 class _TrialObserver(Observer[FrameResult]):

@@ -1,6 +1,6 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
-import { $, at, element, remember, state, stated } from "./page_state.js";
+import { $, at, element, remember, spanText, state, stated } from "./page_state.js";
 import { away, cause, csv, hasCause, KINDS, matches, offerFilters, severity, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
@@ -47,7 +47,7 @@ export function notes(message) {
   for (const one of message.notes) {
     const key = `${one.stamp} ${one.text}`;
     const sights = [[null, one.stamp, null, one.pick, false, one.text]];
-    entries.set(key, { key, what: "note", name: one.about || "frame", sights, note: one });
+    entries.set(key, { key, what: "note", name: one.about || (one.end === "0" ? "frame" : "span"), sights, note: one });
   }
   handled = message.findings;
   $("note-error").textContent = message.error;
@@ -154,6 +154,8 @@ function kinds(shown) {
   }));
 }
 
+const isSpan = (entry) => Boolean(entry.note) && entry.note.end !== "0";
+
 function frames(entry) {
   const numbers = entry.sights.map((one) => one[0]);
   if (numbers.length < 2) return "";
@@ -170,7 +172,7 @@ function drawn(entry) {
   dots.title = reasons.join("; ") || "no reason to hurry";
   const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one[2] === null ? "" : `${one[2]} m`),
     element("span", "reason", one[5])];
-  const button = element("button", "", "", dots, element("span", "time", at(one[1], one[0])),
+  const button = element("button", "", "", dots, element("span", "time", isSpan(entry) ? spanText([one[1], entry.note.end]) : at(one[1], one[0])),
     element("span", entry.what.replace(" ", "-"), entry.what), name, away, reason);
   reason.title = state.meanings[one[5]] ?? one[5];
   button.title = [frames(entry), one[6]].filter((more) => more?.trim()).join("\n");
@@ -254,6 +256,7 @@ export function choose(entry, which, scrolls = true) {
   seek(stamp);
   showSide();
   remember();
+  if (isSpan(entry)) does.markSpan([stamp, entry.note.end]);
   if (pick) does.ask({ pick, from });
   else does.forget();
 }

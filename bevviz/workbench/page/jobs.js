@@ -1,6 +1,6 @@
 // Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
-import { $, at, element, state } from "./page_state.js";
+import { $, at, element, inSpan, spanText, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
 import { follow, isOthers, send } from "./connection.js";
 
@@ -21,17 +21,27 @@ export function start(using) {
     $(id).closest("section").hidden = false;
   };
   $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
+  $("drive-span").onclick = () => send({ type: "drive", set: state.set, span: state.span }, say("effect"));
   $("drive-cancel").onclick = () => send({ type: "cancel", what: "drive" });
   $("fix").onclick = () => send({ type: "fix" }, say("fix-text"));
   $("fix-cancel").onclick = () => send({ type: "cancel", what: "fix" });
   $("report").onclick = () => {
     const number = (id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
+    if (state.span) {
+      if (!inSpan(state.time)) {
+        say("noted")({ text: `The shown frame is not in the marked ${spanText(state.span)}: go into it, or clear the span.` });
+        return;
+      }
+      const from = (stamp) => Math.abs(Number(stamp) - Number(state.time)) / 1e9;
+      [range.before, range.after] = state.span.map(from);
+    }
     const set = isTried() ? state.set : []; // settings of the shown side
     const about = { time: Number(state.time), set, pick: state.pick };
     send({ type: "report", ...about, text: $("words").value, ...range }, say("noted"));
   };
-  $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value }, say("noted"));
+  $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value,
+    span: state.span ?? [] }, say("noted"));
   $("strip").onclick = (event) => {
     const trial = shownRun();
     if (!trial?.strip.length) return;
@@ -80,10 +90,10 @@ export function showRuns() {
   $("drive-cancel").hidden = !going;
   $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: message.error }[message.state] ?? summary(message);
   $("trial-text").className = message.state === "failed" ? "alarm" : "";
-  $("trial-set").textContent = message.settings.join(", ");
+  $("trial-set").textContent = named(message);
   const newest = trials.at(-1);
   $("trial-listed").hidden = message === newest;
-  $("trial-listed").textContent = `The table of findings has the differences of ${newest.settings.join(", ")}.`;
+  $("trial-listed").textContent = `The table of findings has the differences of ${named(newest)}.`;
   $("strip").hidden = going || !message.strip.length;
   if (!$("strip").hidden) strip(message.strip);
 }
@@ -92,8 +102,11 @@ function row(values, kind = "td") {
   return element("tr", "", "", ...values.map((value) => element(kind, "", "", value)));
 }
 
+// The values of a run, and the span that it was run over.
+const named = (run) => [run.settings.join(", "), ...(run.span.length ? [`of ${spanText(run.span)}`] : [])].join("; ");
+
 function runRow(run) {
-  const button = element("button", "", run.settings.join(", "));
+  const button = element("button", "", named(run));
   button.onclick = () => use(run.settings);
   const f1 = run.f1 ? run.f1.map((one) => one ?? "–").join(" → ") : "–";
   const ended = { over: "", cancelled: " (cancelled)", failed: " (failed)" }[run.state] ?? " ...";

@@ -13,6 +13,7 @@ export const state = {
   start: 0, // stamp that the held seconds of a robot begin with; frames before it were held by hand
   demand: false, // whether the viewer gets a frame only when it is looked at
   answer: null, // frame and settings of the shown answer
+  span: null, // first and last stamp of the marked span, as text
 };
 const frames = []; // stamp and number of each frame that the server has, sorted
 export function addFrames(message) {
@@ -51,11 +52,20 @@ export function neighbour(by) {
 export const asked = { released: 0, at: 0, sent: 0 };
 export const stated = new URLSearchParams(location.hash.slice(1));
 
+// What a user has chosen for all drives, which this browser keeps.
+export function kept(name, otherwise) {
+  try { return JSON.parse(localStorage.getItem(`bevviz.${name}`)) ?? otherwise; } catch { return otherwise; }
+}
+export function keep(name, value) {
+  try { localStorage.setItem(`bevviz.${name}`, JSON.stringify(value)); } catch { /* The browser keeps nothing. */ }
+}
+
 // Keep the state in the address. A new subject is a new step of the browser's history.
 export function remember(isNew = false) {
   const parts = new URLSearchParams({ bag: state.bag });
   if (state.time !== null) parts.set("at", state.time);
   if (state.pick) parts.set("pick", state.pick);
+  if (state.span) parts.set("span", state.span.join("-"));
   for (const one of state.set) parts.append("set", one);
   if (state.set.length && state.flipped) parts.set("side", "before");
   const address = `${location.pathname}${location.search}#${parts}`;
@@ -68,6 +78,11 @@ export const seconds = (stamp) => (
 
 // When a frame is, for the user: single frames have made up times.
 export const at = (stamp, frame) => (state.single ? `frame ${frame ?? frames[rowAt(stamp)]?.[1]}` : seconds(stamp));
+
+// Whether a stamp is in the marked span. Without one, all are.
+export const inSpan = (stamp) => !state.span
+  || (Number(stamp) >= Number(state.span[0]) - TOLERANCE && Number(stamp) <= Number(state.span[1]) + TOLERANCE);
+export const spanText = ([low, high]) => (state.single ? `${at(low)} to ${at(high)}` : `${at(low).replace(" s", "")} to ${at(high)}`);
 
 export function element(name, className, text, ...children) {
   const made = document.createElement(name);

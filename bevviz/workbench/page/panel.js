@@ -3,8 +3,9 @@
 import { connect, isConnected, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
-import { $, addFrames, asked, element, frameTimes, neighbour, remember, seconds, shownFrame, state, stated } from "./page_state.js";
+import { $, addFrames, asked, element, frameTimes, neighbour, remember, seconds, shownFrame, spanText, state, stated } from "./page_state.js";
 import * as parameters from "./parameters.js";
+import * as playback from "./playback.js";
 import * as share from "./share.js";
 import * as timeline from "./timeline.js";
 import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from "./viewer.js";
@@ -106,6 +107,7 @@ function freshness() {
     ? `This is about frame ${answer.frame}${withValues(answer.set)}; ${frameName(frame)}${withValues(shownSet())} is shown.` : "";
   for (const button of $("hints").querySelectorAll("button")) button.disabled = isOld;
   $("effect").classList.toggle("old", $("effect").dataset.frame !== String(frame));
+  if (kind !== "live") playback.tellTime();
   timeline.draw();
 }
 
@@ -357,6 +359,7 @@ function open({ stamp, first, demand }) {
   list.draw(); // An earlier run's list may be there already, without the time that seconds count from.
   if (!same) return;
   state.set = stated.getAll("set");
+  if (stated.get("span")) markSpan(stated.get("span").split("-"));
   state.pick = stated.get("pick") ?? "";
   state.from = { time: Number(state.opening), set: state.set };
   if (state.set.length) {
@@ -459,8 +462,40 @@ const toEnd = (isLast) => {
   const times = frameTimes();
   if (times.length) seek(frameTimes.stamp(isLast ? times.length - 1 : 0));
 };
+
+// Mark the frames from one stamp to another; null: none. It is played, noted, reported and run alone.
+function markSpan(span) {
+  state.span = span;
+  $("span").hidden = !span;
+  $("of-span").hidden = !span;
+  for (const label of document.querySelectorAll(".around")) label.hidden = Boolean(span);
+  if (span) {
+    $("span-text").textContent = `${spanText(span)} marked`;
+    $("of-span").textContent = `of ${spanText(span)}`;
+    $("drive-span").textContent = `run ${spanText(span)}`;
+  }
+  $("drive-span").hidden = !span;
+  timeline.draw();
+  remember();
+}
+// Begin or end the span at the shown frame. The other end stays where it was, if it can.
+function markHere(isEnd) {
+  const times = frameTimes();
+  if (kind === "live" || times.length < 2) return;
+  const [low, high] = state.span ?? [frameTimes.stamp(0), frameTimes.stamp(times.length - 1)];
+  const here = frameTimes.stamp(Math.max(0, times.findLastIndex((one) => one <= Number(state.time) + 1000)));
+  if (isEnd) markSpan([Number(low) <= Number(here) ? low : here, here]);
+  else markSpan([here, Number(high) >= Number(here) ? high : here]);
+}
+
 const actions = {
-  " ": playOrPause,
+  " ": kind === "live" ? playOrPause : playback.toggle,
+  "<": () => playback.faster(-1),
+  ">": () => playback.faster(1),
+  l: playback.toggleLoop,
+  i: () => markHere(false),
+  o: () => markHere(true),
+  x: () => markSpan(null),
   ArrowLeft: () => stepFrame(-1),
   ArrowRight: () => stepFrame(1),
   Home: () => toEnd(false),
@@ -482,24 +517,28 @@ $("copy").onclick = () => navigator.clipboard.writeText(state.set.map((one) => `
 $("try-cancel").onclick = cancelTry;
 $("keys").onclick = actions["?"];
 $("help").onclick = () => $("help").close();
+let hasTabbed = false; // the focus came by Tab
+window.addEventListener("pointerdown", () => { hasTabbed = false; }, true);
 window.addEventListener("keydown", (event) => {
+  if (event.key === "Tab") hasTabbed = true;
   const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
-  const typing = inPanel && event.target.matches("input:not([type=range], [type=checkbox]), select");
+  const typing = inPanel && event.target.matches("input:not([type=range], [type=checkbox])");
   if (typing && event.key === "Escape") event.target.blur();
-  const isText = event.target.matches?.("#words, #mark-text, [type=search], #found input");
-  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !isText) {
+  const hasText = typing && event.target.value !== event.target.defaultValue; // Its own undo takes back what was typed.
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !hasText) {
     event.preventDefault();
     event.stopPropagation();
     (event.shiftKey ? redo : undo)();
   }
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
-  if (event.key.length > 1 && event.target.matches?.("[type=range]")) return; // Arrows, Home and End move the slider.
-  if (event.key === " " && event.target.matches?.("[type=checkbox], summary")) return;
+  // A control that was reached by Tab keeps its own keys. One that was clicked does not.
+  const own = event.key === " " ? "[type=checkbox], [type=range], summary, button, select, a" : event.key.length > 1 ? "[type=range], select" : "";
+  if (own && hasTabbed && event.target.matches?.(own)) return;
   event.preventDefault();
   event.stopPropagation();
   actions[event.key]();
 }, true);
-
+$("span-clear").onclick = actions.x;
 if (kind === "live") {
   const robot = await import("./robot.js");
   Object.assign(actions, robot.actions);
@@ -511,11 +550,12 @@ const ofDrive = { // A robot has neither hints behind the list nor a bag to keep
   handle: (finding) => send({ type: "handle", ...finding }),
 };
 list.start({
-  ask, tryOut, forget, drawn: timeline.show, ...(kind === "live" ? {} : ofDrive),
+  ask, tryOut, forget, markSpan, drawn: timeline.show, ...(kind === "live" ? {} : ofDrive),
   unnote: (note) => send({ type: "unnote", stamp: note.stamp, text: note.text }),
 });
 parameters.start(change);
-timeline.start(list.choose);
+timeline.start(list.choose, markSpan);
+if (kind !== "live") playback.start();
 share.start();
 jobs.start((settings) => {
   if (settings.join() !== state.set.join()) use(settings);

@@ -78,7 +78,7 @@ const text = (value) => (typeof value === "object" && value !== null ? JSON.stri
 
 function field(value, set) {
   const input = element("input", "", "");
-  input.value = text(value);
+  input.value = input.defaultValue = text(value);
   input.onchange = () => set(input.value);
   return input;
 }

@@ -1,7 +1,7 @@
 // Timeline under the viewer: one lane for each sort of finding, the shown time, and a click that goes there.
 // The height of a bar is the number of findings at its time, its shade the distance of the nearest one.
 
-import { $, at, frameTimes, state } from "./page_state.js";
+import { $, at, frameTimes, shownFrame, spanText, state } from "./page_state.js";
 import { kind, seek } from "./viewer.js";
 
 const LANES = [
@@ -15,21 +15,38 @@ const LANES = [
 const NAMES = 64; // pixels for the names of the lanes
 const HIT = 6; // pixels from the middle of a narrow mark that a click may be off
 const ROW = 16; // pixels
+const DRAG = 5; // pixels that the pointer moves until it marks a span
 const LOWEST = 4; // pixels, of the bar of one finding
 const [NEAR, FAR] = [5, 40]; // metres: a nearer one has the full colour, a farther one the faintest
 const [FAINTEST, UNKNOWN] = [0.35, 0.7]; // opacities: of the farthest, and where the distance is unknown
 
 let rows = [];
 let choose = () => {};
+let markSpan = () => {};
+let dragged = null; // where the pointer went down, and whether it marks a span
 let marks = []; // x, y, half of the width, number of findings, and entry and row of the nearest, of each bar
 const picture = document.createElement("canvas"); // the marks, which are drawn again only when they change
 let pictured = ""; // findings, frames and size that the picture has
 let changes = 0; // number of changes of the findings
 
-export function start(choosing) {
-  choose = choosing;
-  $("events").onclick = clicked;
+export function start(choosing, marking) {
+  [choose, markSpan] = [choosing, marking];
+  $("events").onpointerdown = (event) => {
+    dragged = kind === "live" ? null : { x: event.offsetX, row: rowAt(event), marks: false };
+    $("events").setPointerCapture(event.pointerId);
+  };
+  $("events").onclick = (event) => { if (!dragged?.marks) clicked(event); };
+  $("events").onkeydown = (event) => {
+    const here = marks.filter((mark) => Math.abs(Number(mark.entry.sights[mark.row][1]) - Number(state.time)) < 2000);
+    if (event.key === "Enter" && here.length) choose(here[0].entry, here[0].row);
+  };
   $("events").onpointermove = (event) => {
+    if (event.buttons && dragged && (dragged.marks || Math.abs(event.offsetX - dragged.x) > DRAG)) {
+      dragged.marks = true;
+      const [low, high] = [dragged.row, rowAt(event)].sort((a, b) => a - b);
+      markSpan([frameTimes.stamp(low), frameTimes.stamp(high)]);
+      return;
+    }
     const mark = markAt(event);
     $("events").title = mark ? told(mark) : "";
     showThumbnail(event, rowAt(event));
@@ -58,10 +75,13 @@ export function draw() {
   const canvas = $("events");
   const times = frameTimes();
   const shown = lanes();
-  canvas.hidden = times.length < 2 || !shown.length;
+  canvas.hidden = times.length < 2 || (kind === "live" && !shown.length);
   if (canvas.hidden) return;
+  canvas.setAttribute("aria-valuetext", [at(state.time), state.span ? `${spanText(state.span)} marked` : ""].filter(Boolean).join(", "));
+  canvas.setAttribute("aria-valuenow", shownFrame() ?? 0);
+  canvas.setAttribute("aria-valuemax", frameTimes.number(times.length - 1));
   const width = canvas.clientWidth;
-  const height = ROW * shown.length + 4;
+  const height = ROW * Math.max(1, shown.length) + 4;
   canvas.style.height = `${height}px`;
   const scale = window.devicePixelRatio || 1;
   const [first, last] = [times[0], times.at(-1)];
@@ -77,8 +97,13 @@ export function draw() {
   [canvas.width, canvas.height] = [width * scale, height * scale];
   const pen = canvas.getContext("2d");
   pen.drawImage(picture, 0, 0);
+  pen.scale(scale, scale);
+  if (state.span) {
+    const [low, high] = state.span.map(x);
+    pen.fillStyle = "rgb(255 255 255 / 18%)";
+    pen.fillRect(low - each / 2, 0, high - low + each, height);
+  }
   if (state.time !== null) {
-    pen.scale(scale, scale);
     pen.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--text");
     pen.fillRect(x(state.time) - 0.5, 0, 1, height);
   }

@@ -18,7 +18,8 @@ const SETTLED = 150; // ms without a change of time, after which the user is loo
 const listeners = {};
 const settings = {
   _url: null, _width: "auto", _height: "auto", _theme: "dark", _fallback_token: null,
-  _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: "collapsed" },
+  // The time bar of a drive is the page's: the viewer's loses its buttons in a narrow view.
+  _panel_states: { top: "hidden", blueprint: "hidden", selection: "hidden", time: kind === "live" ? "collapsed" : "hidden" },
 };
 const callbacks = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {}, moved: () => {} }; // for its events
 export const viewerReady = new Promise((ready) => {
@@ -98,6 +99,7 @@ let trying = 0;
 let current = null; // timeline of the viewer
 let at = null; // time of the viewer
 const isAway = () => target !== null && (at !== Number(target) || (current ?? timeline()) !== timeline());
+export const isThere = () => !isAway();
 function approach() {
   if (!isAway() || tries === 0) return;
   tries -= 1;
