@@ -74,5 +74,6 @@ def test_notes_are_plain_json(bag: Path) -> None:
     Notes([bag]).add(EARLY)
     (note,) = json.loads(Notes([bag]).path.read_text())["notes"]
     assert note == {
-        "stamp": 100, "received": 110, "text": "Größe: 3 m", "about": "car at 3 m", "pick": "truth//1"
+        "stamp": 100, "received": 110, "text": "Größe: 3 m", "about": "car at 3 m", "pick": "truth//1",
+        "end": 0,
     }  # fmt: skip

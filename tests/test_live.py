@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
 import signal
@@ -38,7 +37,7 @@ from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.run_outputs import Outputs
 from bevviz.live.runtime import Live
 from bevviz.live.source_wrappers import ThinnedSource, thin
-from bevviz.live.status import Notes, keep_large_apart
+from bevviz.live.status import Notes
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
     CameraResult,
@@ -1061,20 +1060,6 @@ def test_jumping_stamps_end_no_run(run: Run, frames: list[Frame], drive: Synthet
     assert outcome.live.frames == 10
     p99 = Recording(Path("out.rrd")).column("/health/latency_ms/p99", "Scalars:scalars")
     assert all(value[0] < 60_000 for value in p99)
-
-
-def test_large_buffers_leave_no_gaps_in_the_heap() -> None:
-    class Counts(ctypes.Structure):
-        """glibc's mallinfo2; the fifth number is the bytes in mappings of their own."""
-
-        _fields_ = [(f"n{number}", ctypes.c_size_t) for number in range(10)]
-
-    library = ctypes.CDLL(None)
-    library.mallinfo2.restype = Counts
-    keep_large_apart()
-    before = library.mallinfo2().n4
-    kept = bytes(3_000_000)
-    assert library.mallinfo2().n4 - before >= len(kept)
 
 
 # --- files of earlier runs ---------------------------------------------------------------------

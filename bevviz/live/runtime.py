@@ -28,7 +28,7 @@ from bevviz.live.result_problems import ResultProblems
 from bevviz.live.robot_comparison import RobotComparison
 from bevviz.live.run_outputs import Outputs, RunOutputs
 from bevviz.live.source_wrappers import RobotFrames, ThinnedSource, warm_up
-from bevviz.live.status import Health, Notes, keep_large_apart
+from bevviz.live.status import Health, Notes
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -36,6 +36,7 @@ from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording import entities
+from bevviz.support.freed_memory import return_freed_memory
 
 LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 PAUSE = 1.0  # seconds without a frame after which the states of the topics are shown without one
@@ -219,7 +220,7 @@ class Live:
         observers: list[Observer[FrameResult]] = [LoggingObserver(self), self.checks]
         if self._on_result is not None:
             observers.append(PublishingObserver(self._on_result, self.notes))
-        keep_large_apart()
+        return_freed_memory()
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.enter_context(self.outputs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import threading
 import time
@@ -27,8 +26,6 @@ RECENT = 100  # frames that percentiles are taken over
 SAMPLE = 1.0  # seconds between two looks at CPU and memory
 LONGEST = 60.0  # seconds; a latency beyond it, or below zero, comes from a clock that jumped
 JUMP = 0.5  # seconds of drift against the monotonic clock that count as a jump
-M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
-LARGE = 2_000_000  # bytes; a smaller limit costs time: each frame has many arrays of 1 MB
 DIAGNOSTICS = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 PERIOD = 1.0  # seconds, the usual period of diagnostic_updater
@@ -128,16 +125,6 @@ def memory() -> float:
     """Return the resident memory of this process in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def keep_large_apart() -> None:
-    """Let the C library return each large buffer to the system when it is freed.
-
-    By itself it cuts them from its heap, where packets and messages that are kept for seconds leave gaps: the
-    memory grows by megabytes a minute.
-    """
-    with suppress(AttributeError):  # another C library than glibc
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 def give_way() -> None:
