@@ -216,9 +216,10 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
         bench.close()
     assert result.objects is not None
     assert result.frame.truth is not None
-    assert len(told["effects"]["lost"]) == len(result.objects)
     found, _ = match(result.objects, truth_of(result.frame, result.frame.truth))
-    assert len(told["effects"]["right"]) == (found >= 0).sum() > 0
+    effects = told["effects"]
+    assert len(effects["lost"]) == len(effects["right"]) == (found >= 0).sum() > 0
+    assert len(effects["false_gone"]) == (found < 0).sum() > 0
     assert recoloured["effects"] != told["effects"]
     rows: dict[str, list[tuple[set[str], bool]]] = {}
     for number, piece in enumerate(pieces):  # each is a whole file

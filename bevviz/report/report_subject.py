@@ -115,5 +115,5 @@ def _good_and_bad(effects: Effects) -> tuple[str, str]:
     worse = [f"{name} (false)" for name in effects.false]
     worse += [f"{name} (lost)" for name in (effects.right if effects.known else effects.lost)]
     worse += [f"{effects.doubtful} doubtful"] if effects.doubtful > 0 else []
-    gone = [f"{name} (false, gone)" for name in effects.lost if effects.known and name not in effects.right]
+    gone = [f"{name} (false, gone)" for name in effects.false_gone]
     return ", ".join([*effects.fixed, *gone]) or "nothing", ", ".join(worse) or "nothing"

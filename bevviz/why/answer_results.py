@@ -37,9 +37,11 @@ class HintResult:
     false: Sequence[str]
     """further objects that are false"""
     lost: Sequence[str]
-    """lost objects"""
+    """lost objects, without the false ones"""
     right: Sequence[str]
-    """lost objects that were false"""
+    """lost objects that were right"""
+    false_gone: Sequence[str]
+    """false objects that are gone"""
     changed: int
     """number of other changes"""
     beside: int | None
@@ -57,6 +59,7 @@ class HintResult:
             false=effects.false,
             lost=effects.lost,
             right=effects.right,
+            false_gone=effects.false_gone,
             changed=effects.changed,
             beside=hint.beside,
         )

@@ -74,6 +74,11 @@ class Effects:
         return tuple(effect.name for effect in self.gone if not self.known or effect.truth >= 0)
 
     @property
+    def false_gone(self) -> tuple[str, ...]:
+        """Names of the objects that are gone and that the ground truth calls false."""
+        return tuple(effect.name for effect in self.gone if self.known and effect.truth < 0)
+
+    @property
     def right(self) -> tuple[str, ...]:
         """Names of the lost objects that were right."""
         return tuple(effect.name for effect in self.gone if effect.missed)
@@ -81,7 +86,7 @@ class Effects:
     @property
     def good(self) -> int:
         """Number of objects that get better: new right ones, and false or doubtful ones that are gone."""
-        invented = sum(effect.truth < 0 for effect in self.gone) if self.known else max(-self.doubtful, 0)
+        invented = len(self.false_gone) if self.known else max(-self.doubtful, 0)
         return len(self.made) + invented
 
     @property
@@ -99,7 +104,7 @@ class Effects:
         """All effects in brief."""
         texts = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
         texts += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
-        texts += [f"removes {effect.name} (false)" for effect in self.gone if self.known and effect.truth < 0]
+        texts += [f"removes {name} (false)" for name in self.false_gone]
         texts += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
         texts += [f"adds {count(self.doubtful, 'doubtful object')}"] if self.doubtful > 0 else []
         texts += [f"changes {count(self.changed, 'other')}"] if self.changed else []

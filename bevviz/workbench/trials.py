@@ -249,6 +249,7 @@ def effects_dict(side_effects: Effects) -> dict[str, Any]:
         "false": list(side_effects.false),
         "lost": list(side_effects.lost),
         "right": list(side_effects.right),
+        "false_gone": list(side_effects.false_gone),
         "changed": side_effects.changed,
     }
 

@@ -207,7 +207,7 @@ function effects(effect) {
   const rest = (all, some) => all.filter((name) => !some.includes(name));
   const parts = Object.entries({
     fixed: effect.fixed, broken: effect.right, "new false": effect.false,
-    [state.truth ? "false gone" : "gone"]: rest(effect.lost, effect.right), new: rest(effect.added, effect.false),
+    "false gone": effect.false_gone, gone: rest(effect.lost, effect.right), new: rest(effect.added, effect.false),
   }).filter(([, names]) => names.length).map(([what, names]) => `${what}: ${names.join(", ")}`);
   if (effect.changed) parts.push(`${effect.changed} changed`);
   return parts.join("; ");
