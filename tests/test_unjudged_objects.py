@@ -116,7 +116,7 @@ def test_a_false_object_that_goes_is_no_loss() -> None:
     right, false = Effect("car at 5.0 m", truth=3, before=0, missed=True), Effect("car at 9.0 m", before=1)
     known = Effects(gone=(right, false), known=True)
     assert known.lost == ("car at 5.0 m",) and (known.good, known.harm) == (1, 1)
-    assert known.text == "removes car at 9.0 m (false), loses car at 5.0 m (right)"
+    assert known.text == "broken car at 5.0 m, false gone car at 9.0 m"
     unknown = Effects(gone=(right, false))
     assert unknown.lost == ("car at 5.0 m", "car at 9.0 m")
 

@@ -413,7 +413,7 @@ def test_a_hint_names_its_side_effects() -> None:
     answer = about("flat_car", "reference", row)
     effects = answer.hints[0].effects
     assert any(name.startswith("car at 10.") for name in effects.fixed)
-    assert f"(in this frame it {effects.text})" in answer.verdict.text
+    assert f"(in this frame: {effects.text})" in answer.verdict.text
     before = run("flat_car", "reference").objects
     after = Session(config_of("reference", *answer.hints[0].settings)).run(at("flat_car").frame).objects
     assert before is not None and after is not None

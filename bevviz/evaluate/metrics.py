@@ -22,7 +22,7 @@ EDGES = (0, 10, 20, 30, int(RANGE))  # metres, limits of the ranges that are cou
 METRICS = {  # name without class and range -> meaning
     "recall": "share of the objects that had to be found",
     "precision": "share of the objects that were reported",
-    "f1": "harmonic mean of the two",
+    "f1": "harmonic mean of recall and precision",
     "missed": "objects that had to be found and were not",
     "false": "objects that are nothing",
     "missed_per_frame": "the same, mean of a frame",

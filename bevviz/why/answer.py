@@ -261,7 +261,7 @@ class FrameExplainer:
         answer = replace(answer, hints=search.hints, tried=search.tried)
         if search.hints:
             hint = search.hints[0]
-            also = f" (in this frame it {hint.effects.text})" if hint.effects.text else ""
+            also = f" (in this frame: {hint.effects.text})" if hint.effects.text else ""
             clause = f"change {', '.join(hint.settings)}: {hint.text}{also}"
         else:
             clause = answer.tried_text()

@@ -82,7 +82,7 @@ class Hint:
         """The result, and what speaks against it."""
         if self.balance > 0:
             return f"{self.text}, but it breaks more than it fixes in the frames before and after"
-        return f"{self.text}, but it breaks as much as it fixes: it {self.effects.text}"
+        return f"{self.text}, but it breaks as much as it fixes: {self.effects.text}"
 
 
 @dataclass(frozen=True, slots=True)

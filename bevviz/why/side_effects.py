@@ -11,7 +11,7 @@ from bevviz.evaluate import Truth, match
 from bevviz.evaluate.differences import Change, compare_objects, side_of
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import Objects
-from bevviz.why.subject import Subject, count
+from bevviz.why.subject import Subject
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +101,18 @@ class Effects:
 
     @property
     def text(self) -> str:
-        """All effects in brief."""
-        texts = [f"fixes {' and '.join(self.fixed)}"] if self.fixed else []
-        texts += [f"adds {name}" + (" (false)" if name in self.false else "") for name in self.added]
-        texts += [f"removes {name} (false)" for name in self.false_gone]
-        texts += [f"loses {name}" + (" (right)" if name in self.right else "") for name in self.lost]
-        texts += [f"adds {count(self.doubtful, 'doubtful object')}"] if self.doubtful > 0 else []
-        texts += [f"changes {count(self.changed, 'other')}"] if self.changed else []
+        """All effects in brief, in the words of the page and of ``compare``."""
+        named = {
+            "fixed": self.fixed,
+            "broken": self.right,
+            "new false": self.false,
+            "false gone": self.false_gone,
+            "gone": [name for name in self.lost if name not in self.right],
+            "new": [name for name in self.added if name not in self.false],
+        }
+        texts = [f"{what} {' and '.join(names)}" for what, names in named.items() if names]
+        texts += [f"{self.doubtful} more doubtful"] if self.doubtful > 0 else []
+        texts += [f"{self.changed} changed"] if self.changed else []
         return ", ".join(texts)
 
 

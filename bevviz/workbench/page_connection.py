@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from bevviz.errors import UserError, first_line
+from bevviz.evaluate.metrics import METRICS
+from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.model.reasons import MEANINGS
 from bevviz.support.colors import class_color
 from bevviz.support.loggers import logger
@@ -112,7 +114,11 @@ class PageConnection:
             "opened": opened_values(self._opened),
             "classes": {name: f"rgb{class_color(name)}" for name in LEGEND},
             "controls": self._controls,
-            "meanings": {kind.value: text for kind, text in MEANINGS.items()},
+            "meanings": {
+                **{kind.value: text for kind, text in MEANINGS.items()},
+                **DIFFERENCES,
+                "F1": METRICS["f1"],
+            },
         }
 
     async def _tell(self, news: asyncio.Event) -> None:

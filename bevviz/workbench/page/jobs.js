@@ -99,7 +99,9 @@ export function showRuns() {
 }
 
 function row(values, kind = "td") {
-  return element("tr", "", "", ...values.map((value) => element(kind, "", "", value)));
+  const cells = values.map((value) => element(kind, "", "", value));
+  for (const [column, cell] of cells.entries()) if (kind === "th") cell.title = state.meanings[values[column]] ?? "";
+  return element("tr", "", "", ...cells);
 }
 
 // The values of a run, and the span that it was run over.

@@ -3,7 +3,7 @@
 export const $ = (id) => document.getElementById(id);
 
 export const state = {
-  bag: "", run: "", meanings: {}, // texts of the reasons
+  bag: "", run: "", meanings: {}, // texts of the reasons, of what other values change, and of F1
   truth: false, // whether there is ground truth
   single: false, // whether the frames are unrelated
   time: null, pick: "", from: null, set: [], undo: [], redo: [], flipped: false,
