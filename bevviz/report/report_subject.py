@@ -112,8 +112,8 @@ def _hint_text(hint: Hint) -> TriedText:
 
 def _good_and_bad(effects: Effects) -> tuple[str, str]:
     """Return the objects of a frame that get better, and those that get worse."""
-    worse = [f"{name} (false)" for name in effects.false]
-    worse += [f"{name} (lost)" for name in (effects.right if effects.known else effects.lost)]
+    worse = [f"new false {name}" for name in effects.false]
+    worse += [f"broken {name}" for name in (effects.right if effects.known else effects.lost)]
     worse += [f"{effects.doubtful} doubtful"] if effects.doubtful > 0 else []
-    gone = [f"{name} (false, gone)" for name in effects.false_gone]
+    gone = [f"false gone {name}" for name in effects.false_gone]
     return ", ".join([*effects.fixed, *gone]) or "nothing", ", ".join(worse) or "nothing"
