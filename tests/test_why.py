@@ -376,6 +376,7 @@ def test_without_a_model_no_detector_is_said_to_have_looked() -> None:
         answers = why(result, Selection(label="person"), CLASSES, hints=1)
         never = [a for a in answers if a.verdict.kind is ReasonKind.NOT_RUN]
         assert len(never) >= 2 and all(a.verdict.reason["problems"] == (what,) for a in never)
+        assert not any(a.tried for a in never), "no value of a stage gives it an image or a model"
         assert not any(a.verdict.reported or "no candidate" in str(AnswerResult.of(a)) for a in answers)
         assert "the detector never ran" in summary_line(answers)
         box = never[0].subject.box

@@ -204,7 +204,7 @@ class HintFinder:
         if question.is_false or not self._is_ours():
             return
         nearest = alone or stages or tuple(stage for stage in STAGES if stage == blamed)
-        if reason.kind in HOPELESS or not nearest:
+        if reason.kind in (*HOPELESS, ReasonKind.NOT_RUN) or not nearest:
             return
         yield from new(restored_values(traces.result.config))
         config = traces.result.config
