@@ -148,7 +148,7 @@ def test_the_viewer_shows_the_tried_side_after_a_reload(browser: Browser, addres
         until(lambda: listed(page))
         shown = len(events(page, "time_update"))
         page.locator("#found button", has=page.locator(".missed")).filter(has_not_text="0.00 s").first.click()
-        new_verdict(page, verdict(page))
+        until(lambda: verdict(page))
         until(lambda: len(events(page, "time_update")) > shown)
         page.fill("#search", "min_cluster_points")
         page.locator("[id='control-clustering.min_cluster_points']").fill("9")

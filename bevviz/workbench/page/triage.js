@@ -41,10 +41,10 @@ export function sorted(entries) {
   return [...groups.values()].flat();
 }
 
-// The filters, without the kinds. Reason and distance are those that the row shows.
+// The filters, without the kinds. They see what the rows show: not the sentences of the answers.
 export function matches(entry) {
   const words = $("find").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const text = [entry.what, entry.name, entry.handled?.text ?? "", ...entry.sights.flatMap((one) => [one[5], one[6]])]
+  const text = [entry.what, entry.name, entry.handled?.text ?? "", ...entry.sights.map((one) => one[5])]
     .join(" ").toLowerCase();
   return words.every((word) => text.includes(word))
     && (!$("class").value || entry.name === $("class").value)
