@@ -51,15 +51,14 @@ class ComparedFrame:
 
 
 class FirstSide(Observer[ComparedFrame]):
-    """Observer that shows the results of A to observers of a single run."""
+    """Observer that shows the results of A to an observer of a single run."""
 
-    def __init__(self, *observers: Observer[FrameResult]) -> None:
-        self._observers = observers
+    def __init__(self, observer: Observer[FrameResult]) -> None:
+        self._observer = observer
 
     def observe(self, result: ComparedFrame) -> None:
         """Show A's result of a frame."""
-        for observer in self._observers:
-            observer.observe(result.a)
+        self._observer.observe(result.a)
 
 
 class SideFailures(Observer[ComparedFrame]):

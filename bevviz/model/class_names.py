@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class LabelRule(NamedTuple):
-    """What counts as found, and what has to be found, for the objects with one label.
+    """Rule for the objects with one label: which names find them, and whether they have to be found.
 
     Attributes:
         names: right names of such an object, in lower case.

@@ -159,7 +159,7 @@ def frame_name(view: str) -> str:
 def log_focus(to: Writer, frame: Frame, focus: Focus, number: int) -> None:
     """Move the views from a frame on.
 
-    Of two poses at one time the viewer may take the older one. So each has its own time before the frame.
+    The viewer may take the older one of two poses at one time. So each has its own time before the frame.
 
     Args:
         to: writer of the answers, or of the first frame.
