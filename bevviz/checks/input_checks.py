@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 from bevviz.anomalies import Onsets
 from bevviz.anomalies.sensors import SensorWatch
@@ -106,6 +106,10 @@ class InputChecks(Observer[FrameResult]):
     def warnings(self) -> list[str]:
         """The same as sentences."""
         return [str(finding) for finding in self.findings]
+
+    def warnings_beside(self, printed: Collection[str]) -> list[str]:
+        """Return the sentences that are not among those printed before."""
+        return [text for text in self.warnings if text not in printed]
 
 
 def _needs_more(views: Sequence[CameraView], camera: CameraResult) -> bool:

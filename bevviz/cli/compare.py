@@ -125,8 +125,7 @@ def _run(
         return [ComparisonRecorder(recording, *configs, summary), summary, failures, FirstSide(checks)]
 
     def finish() -> None:
-        printed = source.warnings
-        warn([*(text for text in checks.warnings if text not in printed), *failures.warnings])
+        warn([*checks.warnings_beside(source.warnings), *failures.warnings])
         if summary.without:
             say(f"{summary.without} frames for which the robot published nothing are left out")
         print_result(output.json, "compare", summary.result(), summary.table)

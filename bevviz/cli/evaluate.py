@@ -137,8 +137,7 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
         return [recorder, *judges, EvaluationRecorder(recording, evaluation), marks]
 
     def finish() -> None:
-        printed = frames.warnings
-        warn([*(text for text in checks.warnings if text not in printed), *failures.warnings])
+        warn([*checks.warnings_beside(frames.warnings), *failures.warnings])
         if options.output.json != STDOUT:
             print(evaluation.table(), flush=True)
 

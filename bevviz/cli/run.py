@@ -63,8 +63,7 @@ def process(drive: Drive, outputs: Outputs, default: Path) -> int:
         return [*recorders, MarkRecorder(recording), anomalies, failures, drive.checks]
 
     def finish() -> None:
-        printed = drive.frames.warnings
-        warn(text for text in drive.checks.warnings if text not in printed)
+        warn(drive.checks.warnings_beside(drive.frames.warnings))
         warn(failures.warnings)
         warn(text for recorder in recorders for text in recorder.warnings)
         say(f"anomalies: {anomalies}")

@@ -100,7 +100,7 @@ def _why(options: WhyOptions) -> int:
         outputs = options.output
         result = session.run(frame) if outputs else session.run_explained(frame)
         checks.observe(result)
-        warn(text for text in checks.warnings if text not in early)
+        warn(checks.warnings_beside(early))
         beside = frames_beside(source, frame.index)
         questioner = FrameExplainer(result, loader, session.stages.class_names, neighbours=beside)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
