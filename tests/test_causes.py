@@ -126,6 +126,34 @@ def test_what_makes_objects_hard_is_no_cause() -> None:
     assert "without a condition in common" in text and "points" not in text
 
 
+@pytest.mark.parametrize(("reason", "stage"), [("not detected", ""), ("too small", "clustering")])
+def test_few_points_are_a_cause_where_a_stage_counts(reason: str, stage: str) -> None:
+    rng = np.random.default_rng(1)
+
+    def few_points(row: Row) -> str:
+        row["points"] = float(rng.integers(10, 100))
+        return reason if row["points"] < 20 else ""
+
+    causes = find_causes(findings(batch(few_points))).causes
+    assert [(c.text, c.reason) for c in causes] == (
+        [("all objects, with fewer than 20 points", reason)] if stage else []
+    )
+    if stage:
+        assert causes[0].decided_by == "stage clustering, clustering.min_cluster_points decides"
+
+
+def test_a_cause_of_several_reasons_names_the_most_frequent() -> None:
+    rng = np.random.default_rng(1)
+
+    def in_the_dark(row: Row) -> str:
+        return str(rng.choice(["not detected", "ground"], p=[0.7, 0.3])) if row["brightness"] < 60 else ""
+
+    cause = find_causes(findings(batch(in_the_dark))).causes[0]
+    assert cause.reason == "not detected" and set(cause.reasons) <= {"not detected", "ground", "noise"}
+    assert "missed (not detected) in" in cause.title
+    assert cause.decided_by == "stage detector"
+
+
 def test_the_page_of_a_batch_shows_the_causes() -> None:
     causes = find_causes(findings(batch(lambda row: far_persons(row) or dark(row))))
     text = page("runs", [], [], [], "", causes)

@@ -21,12 +21,14 @@ from bevviz.errors import UserError
 from bevviz.fleet.condition_search import LEAST_UNITS, Attribute, Condition, Slice, find_slices
 from bevviz.fleet.findings import FINDINGS
 from bevviz.model.frame import F32, I64, Bool
+from bevviz.model.reasons import PARAMETERS, STAGES, ReasonKind
 from bevviz.support import table as text_table
 from bevviz.support.json_form import LEFT_OUT, WhereKnown, json_form, rounded
 
 MOST = 30  # causes of one kind
 # Limits of a cause. A condition below them says which objects are hard, and not why they are lost.
 ONE_REASON = 0.5  # least share of its findings that have the same reason
+HARD = frozenset({"points", "range_m"})  # attributes that alone make an object hard, in any drive
 LEAST_LIFT, PLAIN_LIFT = 3.0, 5.0  # least ratio to the usual rate: where it is the rule, and elsewhere
 THE_RULE = 0.5  # rate under the condition from which it is the rule there
 EXAMPLES = 3
@@ -324,7 +326,7 @@ class Cause:
     kind: str
     """missed, false, contradicted, doubtful, lost, unexplained or anomaly"""
     reason: str
-    """empty: several reasons"""
+    """of all findings, or of most"""
     text: str
     """conditions in words"""
     conditions: Sequence[Bound]
@@ -344,6 +346,13 @@ class Cause:
         why = f" ({self.reason})" if self.reason else ""
         outcome = f"{self.count} {self.kind if self.count == 1 or self.kind != 'anomaly' else 'anomalies'}"
         return f"{outcome}{why} in {self.drives} drive{'s' * (self.drives != 1)}: {self.text}"
+
+    @property
+    def decided_by(self) -> str:
+        """The stage of its reason and the parameter that decides, in words; empty: an anomaly."""
+        stage = STAGES.get(self.reason, "")
+        parameter = "" if self.reason == ReasonKind.NOT_DETECTED else PARAMETERS.get(self.reason, "")
+        return f"stage {stage}{f', {parameter} decides' if parameter else ''}" if stage else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,6 +416,8 @@ class Causes:
             yield ""
             yield f"{number}. {cause.title}"
             share = 100 * cause.count / max(totals[cause.kind], 1)
+            if cause.decided_by:
+                yield f"   {cause.decided_by}"
             yield (
                 f"   {share:.0f} % of all {cause.kind}; {100 * cause.count / cause.among:.0f} % under this "
                 f"condition, {cause.lift:.1f} times the usual rate"
@@ -516,8 +527,11 @@ def _causes_of(findings: Findings, kind: str, rows: I64) -> list[Cause]:
         rate = len(found.positives) / len(found.rows)
         lift = rate / float(targets[found.target].mean())
         is_plain = lift >= (LEAST_LIFT if rate >= THE_RULE else PLAIN_LIFT)
-        [(_, most)] = _reasons(findings, rows[found.positives]).most_common(1)
-        return is_plain and most >= ONE_REASON * len(found.positives)
+        [(reason, most)] = _reasons(findings, rows[found.positives]).most_common(1)
+        named = {condition.attribute for condition in found.conditions} - {"class"}
+        # A far object of few points is lost by any detector. That is a cause where another stage loses it.
+        is_hard = bool(named) and named <= HARD and STAGES.get(reason) in (None, "sensors", "detector")
+        return is_plain and most >= ONE_REASON * len(found.positives) and not is_hard
 
     slices = find_slices([attribute for attribute, _ in scales], targets, units, MOST, accepts)
     resolve = {attribute.name: resolve for attribute, resolve in scales}
@@ -535,16 +549,17 @@ def _cause(
     """Return a slice as a cause."""
     positives = rows[found.positives]
     conditions = [resolve[condition.attribute](condition) for condition in found.conditions]
+    reasons = dict(_reasons(findings, positives).most_common())
     return Cause(
         kind=kind,
-        reason=found.target,
+        reason=next(iter(reasons)),
         text=_text(kind, conditions),
         conditions=conditions,
         count=len(positives),
         drives=len(np.unique(findings.words("recording")[1][positives])),
         among=len(found.rows),
         lift=len(positives) / len(found.rows) / float(targets[found.target].mean()),
-        reasons=dict(_reasons(findings, positives).most_common()),
+        reasons=reasons,
         examples=_findings_at(findings, _spread(findings, positives, EXAMPLES)),
         rows=positives,
     )
@@ -635,7 +650,7 @@ def _compared(cause: Cause, other: Findings, changed: str) -> ComparedCause:
         # Drives of another batch have other names.
         inside &= bound.holds(other) if bound.attribute != "recording" else True
     hits = inside & other.is_word("outcome", cause.kind)
-    if cause.reason:
+    if len(cause.reasons) == 1 and cause.reason:
         hits &= other.is_word("reason", cause.reason)
     n, p = int(inside.sum()), int(hits.sum())
     rate, other_rate = cause.count / cause.among, p / max(n, 1)

@@ -85,9 +85,9 @@ _OF_STAGE = {  # stage -> reasons for which it lost an object, or made a false o
     ),
     "objects": (ReasonKind.NOT_AMONG, ReasonKind.CONTRADICTED),
 }
-STAGES = {kind: stage for stage, kinds in _OF_STAGE.items() for kind in kinds}
+STAGES: Mapping[str, str] = {kind: stage for stage, kinds in _OF_STAGE.items() for kind in kinds}
 
-PARAMETERS = {  # the parameter that decides
+PARAMETERS: Mapping[str, str] = {  # the parameter that decides
     ReasonKind.GROUND: "ground.distance_threshold",
     ReasonKind.NOISE: "clustering.min_points",
     ReasonKind.MERGED: "clustering.eps",
