@@ -13,10 +13,12 @@ from benchmarks import accuracy, anomalies, calib, ground, ideal, kitti, large, 
 from benchmarks.bags import repeat
 from benchmarks.measure import interleaved, run
 from benchmarks.pages import write_section
+from benchmarks.robot import transforms_of
 from benchmarks.runs import counted, logged_points
 from benchmarks.stages import same_clusters, side_by_side
 from bevviz.bags.bag import Recording
 from bevviz.cli import main
+from bevviz.messages.definitions import typestore
 from bevviz.stages.clustering import dbscan
 from tests.support import bags
 
@@ -50,6 +52,20 @@ def test_every_point_of_a_bag_is_counted_in_its_recording(
     assert logged_points(Path("whole.rrd")) == 1500
     assert main(["bag", str(folder), "--frames", ":2", "--save", "part.rrd"]) == 0
     assert logged_points(Path("part.rrd")) == 1000
+
+
+def test_the_robot_of_the_soak_writes_transforms_as_ros_does() -> None:
+    values = [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]
+    data = transforms_of(7_000_000_001, [("map", "base_link", values), ("base_link", "lidar", values)])
+    message = typestore().deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
+    assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == [
+        ("map", "base_link"),
+        ("base_link", "lidar"),
+    ]
+    for transform in message.transforms:
+        assert (transform.header.stamp.sec, transform.header.stamp.nanosec) == (7, 1)
+        assert transform.transform.translation.z == 3.0
+        assert transform.transform.rotation.w == 0.8
 
 
 def test_clusters_are_equal_up_to_their_numbers() -> None:

@@ -118,7 +118,7 @@ class SnapOptions:
 )
 def _live(options: LiveOptions) -> int:
     # Silence Rerun's warning about files without an index. They get one when they are complete.
-    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=error")
+    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
