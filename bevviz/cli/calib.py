@@ -50,6 +50,7 @@ class CalibOptions:
 @command(
     "calib",
     description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
+    forms=("bevviz.calib.result:CalibrationResults",),
 )
 def _calib(options: CalibOptions) -> int:
     from bevviz.calib import calibrate, gather

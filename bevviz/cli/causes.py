@@ -24,6 +24,7 @@ class CausesOptions:
     "causes",
     description="Group the missed objects, false objects and anomalies of a batch by what they have in "
     "common: class, range, direction, size, brightness, speed, drive and so on.",
+    forms=("bevviz.fleet.causes:CausesResult",),
 )
 def _causes(options: CausesOptions) -> int:
     from bevviz.fleet.causes import Findings, compare_causes, comparison_lines, find_causes

@@ -210,6 +210,8 @@ class Command(Generic[T]):
         description: the text above its options.
         epilog: the text below them, printed as it is.
         extended_by: group of extensions whose options it has, too: a dataclass ``OPTIONS`` of each.
+        forms: results that it writes with ``--json``, as ``module:Class``; of several, their base comes first.
+            ``docs/schemas`` has their schemas.
     """
 
     name: str
@@ -218,6 +220,7 @@ class Command(Generic[T]):
     description: str
     epilog: str
     extended_by: Kind | None
+    forms: tuple[str, ...]
 
     def options(self, tell: Callable[[str], object]) -> Any:
         """Return the dataclass of its options: the type of the argument of ``run``, and what extends it.
@@ -260,10 +263,16 @@ class Command(Generic[T]):
 
 
 def command(
-    name: str, *, description: str, help: str = "", epilog: str = "", extended_by: Kind | None = None
+    name: str,
+    *,
+    description: str,
+    help: str = "",
+    epilog: str = "",
+    extended_by: Kind | None = None,
+    forms: tuple[str, ...] = (),
 ) -> Callable[[Callable[[T], int]], Command[T]]:
     """Return a decorator that makes a command of a function; see ``Command``."""
-    return lambda run: Command(name, run, help, description, epilog, extended_by)
+    return lambda run: Command(name, run, help, description, epilog, extended_by, forms)
 
 
 def commands_in(module: ModuleType) -> list[Command[Any]]:

@@ -73,7 +73,11 @@ class CompareOptions:
     output: CompareOutputs
 
 
-@command("compare", description=DESCRIPTION)
+@command(
+    "compare",
+    description=DESCRIPTION,
+    forms=("bevviz.compare.summary:ComparisonResult",),
+)
 def _compare(options: CompareOptions) -> int:
     return _configurations(options) if options.sides.robot is None else _robot(options, options.sides.robot)
 

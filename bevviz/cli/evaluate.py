@@ -71,6 +71,7 @@ class EvaluateOptions:
     "evaluate",
     description=DESCRIPTION,
     epilog=EPILOG,
+    forms=("bevviz.evaluate.evaluation:EvaluationResult",),
 )
 def _evaluate(options: EvaluateOptions) -> int:
     from bevviz.evaluate.evaluation import Evaluation

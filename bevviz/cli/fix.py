@@ -53,6 +53,7 @@ class FixOptions:
     description="Search the parameters that the misses depend on, several at a time, on frames of some "
     "drives with ground truth. Confirm the best on frames of other drives, and write them as YAML.",
     epilog="PATH may also be the folder of a batch: its drives, with its configuration.",
+    forms=("bevviz.fleet.fix:Fix",),
 )
 def _fix(options: FixOptions) -> int:
     from bevviz.config import parameter

@@ -47,6 +47,11 @@ class InfoOptions:
     "info",
     description="Topics, rates, gaps and frames of a bag, the role of each topic, what is missing, and "
     "faults of the sensors in the first seconds.",
+    forms=(
+        "bevviz.pipeline.bag_info:TopicContents",
+        "bevviz.pipeline.bag_info:BagInfo",
+        "bevviz.live.graph_info:LiveInfo",
+    ),
 )
 def _info(options: InfoOptions) -> int:
     from bevviz.pipeline.bag_info import BagInfo, describe_bag, render_bag_contents, render_missing

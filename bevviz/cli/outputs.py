@@ -267,6 +267,7 @@ def has_display() -> bool:
 
 OPTION = "--json"
 STDOUT = Path("-")
+FORM_VERSION = 1  # of the format of every command
 
 
 def json_option() -> Any:
@@ -285,12 +286,17 @@ def join_json_option(arguments: Iterable[str]) -> list[str]:
     return joined
 
 
+def form_name(command: str) -> str:
+    """Return the value of the key ``form`` in the JSON of a command."""
+    return f"bevviz.{command}/{FORM_VERSION}"
+
+
 def write_json(target: Path | None, form: str, result: object) -> None:
     """Print or write the result if ``--json`` is given.
 
     Args:
         target: value of ``--json``.
-        form: name of the format, see ``bevviz.cli.json_forms``.
+        form: name of the format, that of the command.
         result: a dataclass of that format.
 
     Raises:
@@ -300,7 +306,6 @@ def write_json(target: Path | None, form: str, result: object) -> None:
         return
     import json
 
-    from bevviz.cli.json_forms import form_name
     from bevviz.support.files import save_text
     from bevviz.support.json_form import json_tree
 

@@ -36,6 +36,7 @@ class SweepOptions:
     "sweep",
     description="Run every value of one or two parameters on the same frames. --set takes ranges "
     "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
+    forms=("bevviz.sweep.run:SweepResult",),
 )
 def _sweep(options: SweepOptions) -> int:
     from bevviz.checks import InputChecks

@@ -66,6 +66,7 @@ class WhyOptions:
     "and which change of the configuration would keep it, which is tried before it is said.",
     epilog=EXAMPLES,
     extended_by="questions",
+    forms=("bevviz.why.answer_results:FrameAnswers",),
 )
 @garbage_collection_off()
 def _why(options: WhyOptions) -> int:

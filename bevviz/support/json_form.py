@@ -7,8 +7,7 @@ from functools import cache
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, PlainSerializer, TypeAdapter, with_config
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, SkipJsonSchema
-from pydantic_core import core_schema
+from pydantic.json_schema import SkipJsonSchema
 
 T = TypeVar("T")
 
@@ -40,22 +39,3 @@ def json_tree(result: object) -> dict[str, Any]:
     form: Any = type(result)
     tree: dict[str, Any] = json.loads(_adapter(form).dump_json(result))
     return tree
-
-
-def json_schema(form: type) -> dict[str, Any]:
-    """Return the JSON schema of a result."""
-    return _adapter(form).json_schema(mode="serialization", schema_generator=_OutputSchema)
-
-
-class _OutputSchema(GenerateJsonSchema):
-    """Generator of schemas. An output has a key also where its field has a default."""
-
-    def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
-        return self.generate_inner(schema["schema"])
-
-    def field_is_required(
-        self,
-        field: core_schema.ModelField | core_schema.DataclassField | core_schema.TypedDictField,
-        total: bool,
-    ) -> bool:
-        return field.get("serialization_exclude_if") is None
