@@ -22,6 +22,7 @@ from bevviz.config import OpinionsConfig, changed_config, load
 from bevviz.config.trust import USER
 from bevviz.datasets.kitti_labels import label_files, read_labels
 from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.sweep.run import SweepOutcome
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
@@ -40,7 +41,6 @@ from bevviz.stages.opinions import matching_names, opinions
 from bevviz.stages.user_stages import make_objects
 from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.support.colors import OPINION_COLORS as OPINION_COLORS
-from bevviz.sweep.run import SweepOutcome
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
 from bevviz.why.experiment import Outcome

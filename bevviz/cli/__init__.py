@@ -38,7 +38,6 @@ CORE = {
     "compare": ("compare", "what if? two configurations, or the robot"),
     "evaluate": ("evaluate", "how right it is, where the truth is known; a gate for CI"),
     "export": ("export", "write frames as KITTI or nuScenes, with what was found as labels"),
-    "sweep": ("sweep", "a parameter over a range: counts, times, precision and recall"),
     "calib": ("calib", "is it the calibration or the clock?"),
     "report": ("report", "a bug report that stands on its own, and its check"),
     "recover": ("recover", "a sound copy of a damaged bag"),

@@ -210,7 +210,7 @@ class Command(Generic[T]):
         description: the text above its options.
         epilog: the text below them, printed as it is.
         extended_by: group of extensions whose options it has, too: a dataclass ``OPTIONS`` of each.
-        forms: results that it writes with ``--json``, as ``module:Class``; of several, their base comes first.
+        forms: classes of what it writes with ``--json``, as ``module:Class``; of several, the base first.
             ``docs/schemas`` has their schemas.
     """
 

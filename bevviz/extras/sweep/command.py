@@ -34,16 +34,17 @@ class SweepOptions:
 
 @command(
     "sweep",
+    help="a parameter over a range: counts, times, precision and recall",
     description="Run every value of one or two parameters on the same frames. --set takes ranges "
     "(clustering.eps=0.3:0.9:0.1) and lists (ground.method=polar,plane) besides plain values.",
-    forms=("bevviz.sweep.run:SweepResult",),
+    forms=("bevviz.extras.sweep.run:SweepResult",),
 )
 def _sweep(options: SweepOptions) -> int:
     from bevviz.checks import InputChecks
     from bevviz.config import flatten
+    from bevviz.extras.sweep import Sweep, combine, parse
+    from bevviz.extras.sweep.log import layout, log_sweep
     from bevviz.pipeline.session import common_frames
-    from bevviz.sweep import Sweep, combine, parse
-    from bevviz.sweep.log import layout, log_sweep
 
     parameters, constant = parse(options.config.set)
     unswept = replace(options, config=replace(options.config, set=tuple(constant)))

@@ -12,13 +12,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevviz.extras.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
 from bevviz.model.frame import F64
 from bevviz.recording import entities
 from bevviz.recording.primitives import document
 from bevviz.support import table
 from bevviz.support.colors import SERIES_COLORS, Color, StateColor
 from bevviz.support.text import markdown
-from bevviz.sweep.run import COUNTS, OPINIONS, SCORES, STAGES, Sweep
 
 Log = Callable[..., None]  # name of the entity below the chart, archetypes
 

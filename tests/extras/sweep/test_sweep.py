@@ -20,12 +20,12 @@ from bevviz.errors import UserError
 from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
+from bevviz.extras.sweep import Parameter, Sweep, combine, parse
+from bevviz.extras.sweep.log import HEIGHT, WIDTH, axis_scale
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import apply as move
 from bevviz.model.geometry import corners, project
 from bevviz.model.results import FrameResult, Objects
-from bevviz.sweep import Parameter, Sweep, combine, parse
-from bevviz.sweep.log import HEIGHT, WIDTH, axis_scale
 from tests.support import bags
 from tests.support.kitti_labels import labels
 from tests.support.recordings import Recording, verify
