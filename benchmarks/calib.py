@@ -17,15 +17,15 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.calib import AXES, Axis, AxisFinding, Calibration
-from bevviz.calib.result import SCALES, TIME
+from bevviz.extras.calib import AXES, Axis, AxisFinding, Calibration
+from bevviz.extras.calib.result import SCALES, TIME
 from bevviz.model.frame import F64
 from tests.support.miscalibrated_drives import EVERY, Drive, Kitti
 
 BEGIN, END = "<!-- benchmarks.calib: begin -->", "<!-- benchmarks.calib: end -->"
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZES = {"deg": (0.5, 1.0, 2.0), "cm": (5.0, 10.0, 20.0), "ms": (20.0, 40.0, 80.0)}
-CHOSEN = range(6)  # frames of KITTI on which the thresholds of bevviz.calib were chosen
+CHOSEN = range(6)  # frames of KITTI on which the thresholds of bevviz.extras.calib were chosen
 
 
 @dataclass(frozen=True, slots=True)

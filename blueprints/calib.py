@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from bevviz.calib.log import alignment, calibration, score_curves
+from bevviz.extras.calib.log import alignment, calibration, score_curves
 from bevviz.model.frame import Scene
 from bevviz.recording import views
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import tomllib
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -31,6 +33,15 @@ FIRST = (
     *("test_example_notebooks", "test_live", "test_batch", "test_workbench_live", "test_benchmarks"),
     *("test_commands", "test_docs", "test_damaged_bags", "test_why", "test_bag"),
 )
+
+
+def pytest_configure() -> None:
+    """End the run if the entry points of ``pyproject.toml`` are not installed: commands would be missing."""
+    project = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())["project"]
+    for group, points in project["entry-points"].items():
+        installed = {point.name: point.value for point in entry_points(group=group)}
+        if not points.items() <= installed.items():
+            pytest.exit(f"{group} of pyproject.toml changed: uv pip install --no-deps --editable .", 4)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

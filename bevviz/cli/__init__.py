@@ -38,7 +38,6 @@ CORE = {
     "compare": ("compare", "what if? two configurations, or the robot"),
     "evaluate": ("evaluate", "how right it is, where the truth is known; a gate for CI"),
     "export": ("export", "write frames as KITTI or nuScenes, with what was found as labels"),
-    "calib": ("calib", "is it the calibration or the clock?"),
     "report": ("report", "a bug report that stands on its own, and its check"),
     "recover": ("recover", "a sound copy of a damaged bag"),
     "cut": ("cut", "a window of a drive with chosen topics, as a bag"),

@@ -279,7 +279,7 @@ SWEEP_CHART = Entity("/sweep/{chart}", "LineStrips2D, Points2D", "curves of one 
 CALIB_RESULT = Entity(
     "/calib/{camera}/result",
     "TextDocument",
-    "of [`bevviz calib`](calib.md): the answer, the table and the corrected extrinsics",
+    "of [`bevviz calib`](extras/calib.md): the answer, the table and the corrected extrinsics",
 )
 CALIB_CURVE = Entity(
     "/calib/{camera}/score/{axis}",

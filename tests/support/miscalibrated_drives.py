@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.calib import Calibration, calibrate, gather
-from bevviz.calib.result import TIME, error_pose
+from bevviz.extras.calib import Calibration, calibrate, gather
+from bevviz.extras.calib.result import TIME, error_pose
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics

@@ -22,6 +22,7 @@ from bevviz.findings.frame_findings import KINDS
 from bevviz.fleet.summary import collect
 from bevviz.fleet.table import RunInfo
 from bevviz.pipeline.run import run
+from bevviz.support.extensions import find
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.answer_results import AnswerResult
@@ -235,8 +236,6 @@ class AgentTools:
 
     def calibration(self, drive: str = "") -> str:
         """Check mounting and stamps of each camera: offset, interval and finding by axis."""
-        from bevviz.calib import calibrate, gather
-
         asked = self._drive(drive)
         names = asked.source.scene.cameras
         if not names:
@@ -245,9 +244,10 @@ class AgentTools:
             )
         step = max(1, len(asked.drive) // CALIB_FRAMES)
         chosen = (frame for number, frame in enumerate(asked.source) if number % step == 0)
-        shots = gather(chosen, names, asked.source.pose)
         offsets = asked.drive.config.sync.offsets
-        results = [calibrate(shots[name], stamps=offsets).result() for name in names]
+        calibrate = find("commands", "calib").calibrate_cameras
+        calibrated, _ = calibrate(chosen, None, names, asked.source.pose, offsets)
+        results = [calibration.result() for calibration in calibrated]
         keep = ("camera", "answer", "frames", "axes", "notes")
         cameras = [{key: getattr(result, key) for key in keep} for result in results]
         return fitted({"command": asked.command("calib"), "cameras": cameras})

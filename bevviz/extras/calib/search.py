@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from bevviz.calib.result import AXES, PRIOR, error_pose
-from bevviz.calib.score import REACH, Scorer, Shot, Sums
+from bevviz.extras.calib.result import AXES, PRIOR, error_pose
+from bevviz.extras.calib.score import REACH, Scorer, Shot, Sums
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Bool
 from bevviz.stages.edges import SHARE, add_scores, densities, log_densities

@@ -8,7 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bevviz.calib.result import (
+from bevviz.errors import UserError
+from bevviz.extras.calib.result import (
     AXES,
     FLOOR,
     PRIOR,
@@ -21,16 +22,15 @@ from bevviz.calib.result import (
     error_pose,
     frames_text,
 )
-from bevviz.calib.score import REACH, Scorer, Shot, Shots
-from bevviz.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
-from bevviz.errors import UserError
+from bevviz.extras.calib.score import REACH, Scorer, Shot, Shots
+from bevviz.extras.calib.search import FINEST, SAMPLE, Peak, climb, search, thin
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Bool
 
 SAMPLES = 41  # points of a score curve
 EDGES = 500  # fewer edges give no result
 RIVALS = 2  # with more peaks about as high as the best one, there are probably more still
-FIT = 0.03  # mean score between that of unrelated images and of right calibrations (docs/calib.md)
+FIT = 0.03  # mean score between that of unrelated images and of right calibrations (docs/extras/calib.md)
 HALF = 3  # frames, least size of the halves that are compared
 CERTAIN = 1.25  # intervals, that is 2.5 standard deviations: a larger offset is significant
 ALONG = 0.005  # metres by which edges of other moving things shift the result along the robot's way
@@ -40,7 +40,7 @@ MOTIONLESS = "the motion of the robot is not known"
 STILL = 1.0  # metres per second; at lower speeds the time of an image has no effect
 REPLICATES = 24  # climbs with random weights
 SETTLED = 0.05  # pixels, last step of the climb of a replicate
-VIEW = 6.0  # hidden variance of a view, as a multiple of the variance of its parts (docs/calib.md)
+VIEW = 6.0  # hidden variance of a view, as a multiple of the variance of its parts (docs/extras/calib.md)
 LEAD = 2.0  # standard errors by which the best peak must be higher than another
 
 Progress = Callable[[float, str], None]
@@ -70,10 +70,9 @@ def calibrate(
 ) -> Calibration:
     """Measure the error of the stated calibration and clock of one camera.
 
-    The function maximises the score of ``bevviz.calib.score`` over three turns, three shifts and the time
-    together. It starts from a grid and goes from coarse to fine. A weak prior (``Axis.prior``) holds the
-    offsets that the scene does not determine. The uncertainty comes from ``bevviz.calib.solve`` and
-    includes ``Axis.floor``.
+    The function maximises the score of ``score.py`` over three turns, three shifts and the time together. It
+    starts from a grid and goes from coarse to fine. A weak prior (``Axis.prior``) holds the offsets that the
+    scene does not determine. The uncertainty comes from this module and includes ``Axis.floor``.
 
     Args:
         shots: shots of one camera, from ``gather``.

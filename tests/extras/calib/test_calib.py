@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from bevviz.bags.source import BagSource
-from bevviz.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
-from bevviz.calib.result import SCALES, TIME, correction_yaml, error_pose
-from bevviz.calib.score import Scorer
-from bevviz.calib.search import search
-from bevviz.calib.solve import FIT
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
+from bevviz.extras.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
+from bevviz.extras.calib.result import SCALES, TIME, correction_yaml, error_pose
+from bevviz.extras.calib.score import Scorer
+from bevviz.extras.calib.search import search
+from bevviz.extras.calib.solve import FIT
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import PERIOD, START, SyntheticSource
 from bevviz.model import geometry
@@ -458,7 +458,7 @@ def test_the_command_reports_and_records_the_calibration(turned: Path, capsys: C
 
     assert main(["calib", str(turned), "--config", "fixed.yaml", "--json", "--frames", ":8"]) == 0
     tree = json.loads(capsys.readouterr().out)
-    documented_json.check(tree, "bevviz.calib/1")
+    documented_json.check(tree, "bevviz.extras.calib/1")
     (again,) = tree["cameras"]
     assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 

@@ -8,9 +8,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bevviz.calib.result import AXES, TIME, AxisFinding, Calibration, error_pose
-from bevviz.calib.score import Shot
 from bevviz.config import LoggingConfig
+from bevviz.extras.calib.result import AXES, TIME, AxisFinding, Calibration, error_pose
+from bevviz.extras.calib.score import Shot
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Bool, Intrinsics
 from bevviz.recording import entities

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bevviz.calib.result import AXES, TIME, error_pose
+from bevviz.extras.calib.result import AXES, TIME, error_pose
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I32, I64, U8, Bool, Camera, Frame, Intrinsics
 from bevviz.stages.edges import (

@@ -20,7 +20,7 @@ class Axis:
 
     ``prior`` is larger than a usual error. It holds the offsets that the scene does not determine: an error
     of that size costs as much as one standard deviation of the edges. ``floor`` is the error that remains
-    between the edges of perfectly calibrated sensors (docs/calib.md). It is part of every reported
+    between the edges of perfectly calibrated sensors (docs/extras/calib.md). It is part of every reported
     uncertainty.
     """
 
@@ -165,7 +165,7 @@ class AxisError:
     interval: float | None
     """two standard deviations to either side of the offset"""
     finding: str
-    """one of the findings in docs/calib.md"""
+    """one of the findings in docs/extras/calib.md"""
     reason: str
 
 

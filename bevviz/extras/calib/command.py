@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +14,10 @@ from bevviz.cli.values import positive
 from bevviz.support import progress
 
 if TYPE_CHECKING:
-    from bevviz.calib import Calibration, Shots
     from bevviz.config import Config
-    from bevviz.model.frame import Scene
+    from bevviz.extras.calib import Calibration, Shots
+    from bevviz.extras.calib.score import Pose
+    from bevviz.model.frame import Frame, Scene
 
 FRAMES = 30  # Number of frames to use without --every.
 
@@ -49,14 +51,14 @@ class CalibOptions:
 
 @command(
     "calib",
+    help="is it the calibration or the clock?",
     description="Compare the edges of clouds and images: how wrong are the camera's mounting and stamps?",
-    forms=("bevviz.calib.result:CalibrationResults",),
+    forms=("bevviz.extras.calib.result:CalibrationResults",),
 )
 def _calib(options: CalibOptions) -> int:
-    from bevviz.calib import calibrate, gather
-    from bevviz.calib.result import CalibrationResults
     from bevviz.checks import InputChecks
     from bevviz.errors import UserError
+    from bevviz.extras.calib.result import CalibrationResults
 
     config = load_config(options)
     output = options.output
@@ -69,12 +71,42 @@ def _calib(options: CalibOptions) -> int:
     if not options.frames.every:
         frames = replace(frames, every=max(1, total // FRAMES))
     with open_bag(options.drive, frames, config) as source:
-        bar = progress.bar(source, total=source.total, unit="frame", desc="find edges")
         checks = InputChecks(source, config)
-        shots = gather(checks.watched(bar), names, source.pose)
-        warn(checks.warnings)
-    results = []
-    for name in names:
+
+        def watched() -> Iterator[Frame]:
+            yield from checks.watched(source)
+            warn(checks.warnings)
+
+        results, shots = calibrate_cameras(watched(), source.total, names, source.pose, config.sync.offsets)
+    tree = CalibrationResults([result.result() for result in results])
+    print_result(output.json, "calib", tree, lambda: "\n".join(map(_text, results)))
+    if output.write is not None:
+        _write(results, output.write)
+    _log(results, shots, scene, config, output.or_viewer())
+    return 0
+
+
+def calibrate_cameras(
+    frames: Iterable[Frame],
+    total: int | None,
+    cameras: Sequence[str],
+    pose: Pose,
+    offsets: Mapping[str, float],
+) -> tuple[list[Calibration], dict[str, Shots]]:
+    """Calibrate each camera, with bars of progress. Return the results, and the shots of each camera.
+
+    Args:
+        frames: frames in order of stamp.
+        total: number of frames. None: it is not known.
+        cameras: names of the cameras.
+        pose: see ``gather``.
+        offsets: stated offsets of the clocks.
+    """
+    from bevviz.extras.calib import calibrate, gather
+
+    bar = progress.bar(frames, total=total, unit="frame", desc="find edges")
+    shots, results = gather(bar, cameras, pose), []
+    for name in cameras:
         bar_format = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
         with progress.bar(total=100, desc=f"align {name}", bar_format=bar_format) as steps:
 
@@ -82,13 +114,8 @@ def _calib(options: CalibOptions) -> int:
                 steps.set_postfix_str(step, refresh=False)
                 steps.update(round(100 * share) - steps.n)
 
-            results.append(calibrate(shots[name], show, config.sync.offsets))
-    tree = CalibrationResults([result.result() for result in results])
-    print_result(output.json, "calib", tree, lambda: "\n".join(map(_text, results)))
-    if output.write is not None:
-        _write(results, output.write)
-    _log(results, shots, scene, config, output.or_viewer())
-    return 0
+            results.append(calibrate(shots[name], show, offsets))
+    return results, shots
 
 
 def _cameras(scene: Scene, requested: str | None, reason: str) -> tuple[str, ...]:
@@ -115,7 +142,7 @@ def _text(result: Calibration) -> str:
 
 
 def _write(results: list[Calibration], path: Path) -> None:
-    from bevviz.calib.result import correction_yaml
+    from bevviz.extras.calib.result import correction_yaml
     from bevviz.support.files import save_text
 
     save_text(path, correction_yaml(results), "--write")
@@ -126,7 +153,7 @@ def _log(
     results: list[Calibration], shots: dict[str, Shots], scene: Scene, config: Config, outputs: Outputs
 ) -> None:
     """Log the results to the requested outputs, or to the viewer if there is a display."""
-    from bevviz.calib.log import log_calibration
+    from bevviz.extras.calib.log import log_calibration
 
     if not outputs:
         say("no display: --save FILE.rrd keeps the pictures and curves, --serve shows them in a browser")
