@@ -11,7 +11,7 @@ import pytest
 import bevviz
 from bevviz.config import load
 from bevviz.evaluate import exemptions, match, truth_of
-from bevviz.findings.frame_findings import find_findings
+from bevviz.findings.frame_findings import find_findings, findings_of
 from bevviz.model.frame import Camera, Frame
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import Detections, FrameResult
@@ -197,6 +197,7 @@ def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None
         for result in (frame.result, unlabelled):
             listed = find_findings(FrameExplainer(result, classes=frame.explainer.traces.classes))
             again = FrameExplainer(result, classes=frame.explainer.traces.classes)
+            marked = {finding.selection: finding.distance for finding in findings_of(again.traces)}
             for finding in listed:
                 answer = again.ask(Selection.parse(str(finding.selection)))[0]
                 assert (answer.selection, answer.subject.label.lower() or "cluster") == (
@@ -205,6 +206,7 @@ def test_rows_of_lists_agree_with_their_answers(asked: dict[str, Asked]) -> None
                 )
                 assert answer.verdict.kind == finding.reason
                 assert answer.distance == pytest.approx(finding.distance, nan_ok=True)
+                assert answer.distance == pytest.approx(marked[finding.selection], nan_ok=True)
                 assert answer.false == (finding.what in ("false", "doubtful"))
                 assert answer.verdict.reported == answer.false, (frame.name, answer.verdict.text)
             if result is frame.result:

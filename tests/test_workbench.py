@@ -90,7 +90,7 @@ def test_rows_of_the_list_agree_with_their_answers(talk: Talk) -> None:
                 entry["name"],
                 reason,
             )
-            assert abs(answer["distance"] - distance) <= 0.06 and not tried
+            assert answer["distance"] == distance and not tried
             assert answer["reported"] == answer["false"] == (entry["what"] == "false")
 
 

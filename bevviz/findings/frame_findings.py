@@ -18,6 +18,7 @@ from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, Bool, Boxes3D, Frame
 from bevviz.model.results import Anomaly, Decision, FrameResult, Opinion
 from bevviz.why import Answer, FrameExplainer, Selection
+from bevviz.why.collect import center_of, ground_distance
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex, detection_subject
 from bevviz.why.subject import single_box
@@ -247,7 +248,9 @@ def _of_detection(traces: FrameIndex, what: str, camera_name: str, row: int) -> 
         factor = FACTORS.get(Decision(int(camera.fusion.detection_decision[row])), 1.0)
         severity *= factor * float(camera.detections.score[row])
     selection, name = Selection(detection=row, camera=camera_name), camera.detections.names[row]
-    distance = float(np.median(np.hypot(*frame.points[traces.place(subject), :2].T)))
+    cluster = -1 if camera.fusion is None else int(camera.fusion.detection_cluster[row])
+    center = center_of(subject, traces.result, cluster)
+    distance = ground_distance(center, frame.points[traces.place(subject)])
     return Finding(
         frame.index, frame.stamp, what, name, distance, selection, box=subject.xyxy, severity=severity
     )

@@ -125,7 +125,7 @@ class AnswerResult:
             camera=subject.camera,
             image_box=None if subject.xyxy is None else [round(float(value), 2) for value in subject.xyxy],
             position=None if box is None else [round(float(value), 3) for value in box.center[0]],
-            distance=None if np.isnan(answer.distance) else round(answer.distance, 2),
+            distance=None if np.isnan(answer.distance) else round(answer.distance, 1),
             points=answer.points,
             reported=verdict.reported,
             reason=verdict.kind.value,

@@ -46,7 +46,7 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
     named = find_reported_object(subject, traces, parts, candidates)
     if named is not None and named.cluster >= 0:
         main = named.cluster
-    center = _center(subject, result, main)
+    center = center_of(subject, result, main)
     candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
     mates = find_mates(subject, traces, main, obstacle)
     shared = separation(subject, traces, main, obstacle, mates)
@@ -57,7 +57,7 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         points=points,
         fate=fate,
         center=center,
-        distance=_distance(center, result.frame.points[points]),
+        distance=ground_distance(center, result.frame.points[points]),
         voxels=len(rows),
         ground=heights,
         noise=len(noise),
@@ -162,7 +162,7 @@ def _most_around(centers: F32, points: F32, eps2: float) -> int:
     return largest
 
 
-def _center(subject: Subject, result: FrameResult, main: int) -> tuple[float, float, float] | None:
+def center_of(subject: Subject, result: FrameResult, main: int) -> tuple[float, float, float] | None:
     """Return the centre of the subject's box, or of the box of its cluster."""
     boxes, row = subject.box, 0
     if boxes is None and main >= 0 and result.clusters is not None:
@@ -173,7 +173,7 @@ def _center(subject: Subject, result: FrameResult, main: int) -> tuple[float, fl
     return x, y, z
 
 
-def _distance(center: tuple[float, float, float] | None, points: F32) -> float:
+def ground_distance(center: tuple[float, float, float] | None, points: F32) -> float:
     """Return the metres on the ground to a centre, or the median of the points; NaN without both."""
     if center is not None:
         return float(np.hypot(*center[:2]))
