@@ -24,9 +24,9 @@ import numpy as np
 import pyarrow as pa
 
 from bevviz.config import load
+from bevviz.extras.batch.causes import NAMES, SCALES, Bound, Causes, Findings, compare_causes, find_causes
+from bevviz.extras.batch.findings import SCHEMA, FindingCollector
 from bevviz.findings.frame_findings import find_findings
-from bevviz.fleet.causes import NAMES, SCALES, Bound, Causes, Findings, compare_causes, find_causes
-from bevviz.fleet.findings import SCHEMA, FindingCollector
 from bevviz.model.results import Detections
 from bevviz.pipeline.session import Session
 from bevviz.why import FrameExplainer

@@ -19,8 +19,8 @@ import numpy as np
 
 from bevviz.config import Config, load
 from bevviz.evaluate.ground_truth import truth_of
-from bevviz.fleet.fix import Sample, SampleFrame, find_fix, keys_for, text_of
 from bevviz.pipeline.session import Variants
+from bevviz.why.fix import Sample, SampleFrame, find_fix, keys_for, text_of
 from tests.support import small_drives
 
 FRAMES = 5

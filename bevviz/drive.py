@@ -387,7 +387,7 @@ class Drive(Closable, Tabular):
     def _columns(self) -> Columns:
         """Run the whole drive and return a row for each frame: counts, times and problems."""
         from bevviz.findings.frame_findings import findings_of
-        from bevviz.fleet.table import row
+        from bevviz.findings.frame_row import row
         from bevviz.why.frame_index import FrameIndex
 
         return [

@@ -12,9 +12,9 @@ import pytest
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.evaluate.ground_truth import truth_of
-from bevviz.fleet.fix import Fix, Sample, SampleFrame, find_fix, keys_for
-from bevviz.fleet.parameter_search import Settings, choices_of, search
 from bevviz.pipeline.session import Variants
+from bevviz.why.fix import Fix, Sample, SampleFrame, find_fix, keys_for
+from bevviz.why.parameter_search import Settings, choices_of, search
 from tests.support import small_drives
 
 FRAMES = 2

@@ -46,7 +46,7 @@ def ended(session: WorkbenchSession) -> str:
 
 @pytest.mark.long
 def test_the_wrong_parameter_is_found(session: WorkbenchSession, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bevviz.fleet.fix.TRIALS", 6)
+    monkeypatch.setattr("bevviz.why.fix.TRIALS", 6)
     fix = session.tools.fix
     assert session.progress()["fix"]["state"] == ""
     fix.begin()

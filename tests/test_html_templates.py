@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
-from bevviz.fleet.causes import Causes, Findings, find_causes
-from bevviz.fleet.findings import SCHEMA
-from bevviz.fleet.summary import BagTotals, page
-from bevviz.fleet.table import RunInfo
+from bevviz.extras.batch.causes import Causes, Findings, find_causes
+from bevviz.extras.batch.findings import SCHEMA
+from bevviz.extras.batch.summary import BagTotals, page
+from bevviz.extras.batch.table import RunInfo
 from bevviz.model.frame import Scene
 from bevviz.report.pictures import plot
 from bevviz.support.html import render, template_environment

@@ -531,7 +531,7 @@ def test_workers_find_no_python_of_the_folder(received: Path) -> None:
     program = (
         f"import sys; sys.path[:] = {path!r}\n"
         "if __name__ == '__main__':\n"
-        "    from bevviz.fleet.processes import Processes\n"
+        "    from bevviz.extras.batch.processes import Processes\n"
         "    workers = Processes(1)\n"
         "    workers._idle[0].process.join(3)\n"
         "    workers.close()\n"
@@ -715,7 +715,7 @@ def test_settings_that_are_text_come_from_the_user_alone() -> None:
         "config/reloading.py",
         "drive.py",
         "extras/demo/command.py",
-        "fleet/fix.py",  # its own values of numbers and methods, over a configuration that is loaded
+        "why/fix.py",  # its own values of numbers and methods, over a configuration that is loaded
         "recording/source_lookup.py",
         "report/check.py",
     }

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 CORE = {
     "open": ("workbench", "the workbench: a page where a click on anything answers why"),
     "bag": ("bag", "run the pipeline over a recorded bag"),
-    "batch": ("batch", "run the pipeline over many bags"),
-    "causes": ("causes", "what the missed and false objects of a batch have in common"),
-    "fix": ("fix", "search parameters that find the missed objects, and check what they break"),
     "info": ("info", "what is in a bag, and what is missing for a full run"),
     "why": ("why", "why an object was reported, or was not"),
     "compare": ("compare", "what if? two configurations, or the robot"),

@@ -65,7 +65,7 @@ class FixSearch(Jobs[FixJob]):
 
     def _search(self, job: FixJob) -> None:
         """Search the parameters that decide what is missed or false."""
-        from bevviz.fleet.fix import TRIALS, DriveFrames, draw_samples, find_fix, keys_for, text_of
+        from bevviz.why.fix import TRIALS, DriveFrames, draw_samples, find_fix, keys_for, text_of
 
         def pause() -> None:
             """Tell the pages, and wait until no question is being answered."""

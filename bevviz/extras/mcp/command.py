@@ -9,6 +9,7 @@ from bevviz.cli.command import command, option, option_values
 from bevviz.cli.options import ConfigOptions, DriveOptions, TruthOptions, load_config
 from bevviz.cli.outputs import say, set_up_notes, warn
 from bevviz.errors import UserError
+from bevviz.support.extensions import find
 
 EXAMPLES = """examples:
   bevviz mcp drive.mcap --model yolo11n.onnx            over one drive
@@ -42,12 +43,10 @@ def _mcp(options: McpOptions) -> int:
         raise UserError(
             f"an agent's server needs further packages ({error.name}): pip install 'bevviz[mcp]'"
         ) from None
-    from bevviz.fleet.jobs import intact_results
-
     folder, paths = options.allow_write, options.drive.paths
     if folder is not None and not folder.is_dir():
         raise UserError(f"--allow-write {folder}: there is no such folder")
-    results = intact_results(paths[0].resolve(), lambda text: warn([text])) if paths[0].is_dir() else []
+    results = find("commands", "batch").complete_bags(paths[0]) if paths[0].is_dir() else []
     if results:
         drives = batch_drives(results)
     else:

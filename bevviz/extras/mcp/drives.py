@@ -25,7 +25,6 @@ from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
 from bevviz.findings.finding_list import FindingList
 from bevviz.findings.frame_findings import find_findings
-from bevviz.fleet.table import RunInfo
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run
@@ -127,7 +126,7 @@ def agent_config(config: Config, settings: Sequence[str]) -> Config:
     return changed_config(config, settings)
 
 
-def batch_drives(results: Sequence[tuple[Path, RunInfo]]) -> dict[str, Callable[[], AskedDrive]]:
+def batch_drives(results: Sequence[tuple[Path, object]]) -> dict[str, Callable[[], AskedDrive]]:
     """Return what opens each drive of a batch, as its recording was configured."""
 
     def opener(recording: Path) -> Callable[[], AskedDrive]:

@@ -19,8 +19,6 @@ from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
 from bevviz.extras.mcp.drives import AskedDrive, agent_config
 from bevviz.findings.frame_findings import KINDS
-from bevviz.fleet.summary import collect
-from bevviz.fleet.table import RunInfo
 from bevviz.pipeline.run import run
 from bevviz.support.extensions import find
 from bevviz.support.json_form import json_tree
@@ -45,7 +43,7 @@ class AgentTools:
     def __init__(
         self,
         opened: Mapping[str, Callable[[], AskedDrive]],
-        batch: Sequence[tuple[Path, RunInfo]] = (),
+        batch: Sequence[tuple[Path, Any]] = (),
         folder: Path | None = None,
     ) -> None:
         self._openers, self._batch, self._folder = dict(opened), batch, folder
@@ -66,7 +64,7 @@ class AgentTools:
         """List the drives, and the worst frames of a batch with the reason."""
         if not self._batch:
             return fitted({"drives": list(self._openers)})
-        table, bags = collect(self._batch, None)
+        table, bags = find("commands", "batch").sum_up(self._batch)
         columns = table.select(["recording", "frame", "badness", "remarks"])
         drives = [
             {

@@ -16,7 +16,7 @@ import bevviz
 from bevviz.cli import main
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_in
-from bevviz.fleet.jobs import find_bags
+from bevviz.extras.batch.jobs import find_bags
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Boxes3D, Frame
 from tests.support import datasets

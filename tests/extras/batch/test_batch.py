@@ -27,9 +27,8 @@ from bevviz.bags.source import BagSource, FrameSelection
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.findings.frame_findings import find_findings, findings_of
-from bevviz.fleet.bag_job import run
-from bevviz.fleet.jobs import (
+from bevviz.extras.batch.bag_job import run
+from bevviz.extras.batch.jobs import (
     PARTIAL,
     Job,
     find_bags,
@@ -40,7 +39,9 @@ from bevviz.fleet.jobs import (
     tables,
     unfinished_jobs,
 )
-from bevviz.fleet.table import SEVERITIES, row, severity
+from bevviz.extras.batch.table import SEVERITIES, severity
+from bevviz.findings.frame_findings import find_findings, findings_of
+from bevviz.findings.frame_row import row
 from bevviz.model.decisions import unmatched_detections
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
@@ -422,7 +423,7 @@ def test_a_query_reads_all_recordings_of_a_catalog(
 
 def test_a_new_recording_replaces_the_old_one(batch: Batch, tmp_path: Path) -> None:
     pytest.importorskip("datafusion", reason="needs datafusion: pip install 'bevviz[catalog]'")
-    from bevviz.fleet.catalog import register
+    from bevviz.extras.batch.catalog import register
 
     with rr.server.Server(host="127.0.0.1") as server:
         ((table, about), *_) = tables(batch.folder)

@@ -12,8 +12,8 @@ from multiprocessing.connection import Connection, wait
 
 import cv2
 
-from bevviz.fleet.bag_job import run
-from bevviz.fleet.jobs import Job, JobResult, JobResults
+from bevviz.extras.batch.bag_job import run
+from bevviz.extras.batch.jobs import Job, JobResult, JobResults
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
 from bevviz.support.worker_processes import WorkerProcess, start_worker

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from bevviz.errors import UserError, first_line
-from bevviz.fleet.bag_job import run
-from bevviz.fleet.jobs import Job, JobResult, JobResults
+from bevviz.extras.batch.bag_job import run
+from bevviz.extras.batch.jobs import Job, JobResult, JobResults
 from bevviz.recording.ports import is_listening
 from bevviz.support.contexts import Closable
 

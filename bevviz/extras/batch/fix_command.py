@@ -15,7 +15,8 @@ from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.fleet.fix import DriveFrames
+    from bevviz.extras.batch.causes import Cause, Findings
+    from bevviz.why.fix import DriveFrames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +51,16 @@ class FixOptions:
 
 @command(
     "fix",
+    help="search parameters that find the missed objects, and check what they break",
     description="Search the parameters that the misses depend on, several at a time, on frames of some "
     "drives with ground truth. Confirm the best on frames of other drives, and write them as YAML.",
     epilog="PATH may also be the folder of a batch: its drives, with its configuration.",
-    forms=("bevviz.fleet.fix:Fix",),
+    forms=("bevviz.why.fix:Fix",),
 )
 def _fix(options: FixOptions) -> int:
     from bevviz.config import parameter
-    from bevviz.fleet.fix import draw_samples, find_fix, keys_for
     from bevviz.support.files import save_text
+    from bevviz.why.fix import draw_samples, find_fix, keys_for
 
     search, truth = options.search, options.truth
     config, drives, keys = _of_batch(options) if _is_batch(options) else _of_drive(options)
@@ -84,7 +86,7 @@ def _fix(options: FixOptions) -> int:
 
 def _is_batch(options: FixOptions) -> bool:
     """Return whether the path is the folder of a batch."""
-    from bevviz.fleet.findings import FINDINGS
+    from bevviz.extras.batch.findings import FINDINGS
 
     paths = options.drive.paths
     is_batch = len(paths) == 1 and (paths[0] / f"{FINDINGS}.parquet").is_file()
@@ -95,9 +97,9 @@ def _is_batch(options: FixOptions) -> bool:
 
 def _of_batch(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]]:
     """Return the configuration and the drives of a batch, and the parameters to search."""
-    from bevviz.fleet.causes import Findings, find_causes
-    from bevviz.fleet.fix import PARAMETERS, drives_of, keys_for
+    from bevviz.extras.batch.causes import Findings, find_causes
     from bevviz.recording.source_lookup import find_source
+    from bevviz.why.fix import PARAMETERS, keys_for
 
     folder, search = options.drive.paths[0], options.search
     findings = Findings.load(folder)
@@ -115,7 +117,7 @@ def _of_batch(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]
         if not keys_for(cause.reasons) and not search.parameter:
             known = ", ".join(PARAMETERS)
             raise UserError(f"--cause {search.cause}: no parameter decides it; one does for: {known}")
-    drives = drives_of(findings, cause)
+    drives = _drives_of(findings, cause)
     if not drives:
         raise UserError(f"{folder}: none of its bags exists any more")
     if not any(drive.of_cause for drive in drives):
@@ -126,10 +128,42 @@ def _of_batch(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]
     return config, drives, keys_for(reasons, config)
 
 
+def _drives_of(findings: Findings, cause: Cause | None) -> list[DriveFrames]:
+    """Return the drives of a batch whose bags exist.
+
+    Args:
+        findings: of the batch.
+        cause: cause to fix; None: every missed and every false object.
+    """
+    import numpy as np
+
+    from bevviz.why.fix import DriveFrames
+
+    if cause is not None:
+        wanted = cause.rows
+    else:
+        wanted = np.flatnonzero(findings.is_word("outcome", "missed") | findings.is_word("outcome", "false"))
+    names, drive = findings.words("recording")
+    bags, bag = findings.words("bag")
+    frame = findings.table["frame"].to_numpy()
+    is_wanted = np.zeros(len(findings), bool)
+    is_wanted[wanted] = True
+    drives = []
+    for code, name in enumerate(names):
+        rows = np.flatnonzero(drive == code)
+        path = Path(bags[bag[rows[0]]])
+        if path.exists():
+            numbers = sorted(set(frame[rows].tolist()))
+            drives.append(
+                DriveFrames((path,), name, numbers, frozenset(frame[rows[is_wanted[rows]]].tolist()))
+            )
+    return drives
+
+
 def _of_drive(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]]:
     """Return the configuration and the frames of a drive. Its misses tell later what to search."""
     from bevviz.bags.source import BagSource
-    from bevviz.fleet.fix import DriveFrames
+    from bevviz.why.fix import DriveFrames
 
     config = load_config(options)
     with BagSource(options.drive.paths, config) as source:

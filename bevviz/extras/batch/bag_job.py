@@ -17,12 +17,13 @@ from bevviz.errors import UserError
 from bevviz.evaluate.evaluation import Evaluation
 from bevviz.evaluate.ground_truth import truth_in
 from bevviz.evaluate.log import EvaluationRecorder
+from bevviz.extras.batch.findings import FINDINGS, FindingCollector
+from bevviz.extras.batch.jobs import PARTIAL, Job, JobResult
+from bevviz.extras.batch.table import RunInfo, write_table
 from bevviz.findings.frame_findings import find_findings, has_detector
+from bevviz.findings.frame_row import row
 from bevviz.findings.marks import MarkRecorder
 from bevviz.findings.run_table import ListKeeper, list_keeper
-from bevviz.fleet.findings import FINDINGS, FindingCollector
-from bevviz.fleet.jobs import PARTIAL, Job, JobResult
-from bevviz.fleet.table import RunInfo, row, write_table
 from bevviz.model.protocols import Observer
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run as run_frames

@@ -22,12 +22,13 @@ class CausesOptions:
 
 @command(
     "causes",
+    help="what the missed and false objects of a batch have in common",
     description="Group the missed objects, false objects and anomalies of a batch by what they have in "
     "common: class, range, direction, size, brightness, speed, drive and so on.",
-    forms=("bevviz.fleet.causes:CausesResult",),
+    forms=("bevviz.extras.batch.causes:CausesResult",),
 )
 def _causes(options: CausesOptions) -> int:
-    from bevviz.fleet.causes import Findings, compare_causes, comparison_lines, find_causes
+    from bevviz.extras.batch.causes import Findings, compare_causes, comparison_lines, find_causes
 
     new = find_causes(Findings.load(options.folder))
     if options.against is None:

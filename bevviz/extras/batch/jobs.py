@@ -22,7 +22,7 @@ from bevviz.bags.source import FrameSelection
 from bevviz.config import Config
 from bevviz.datasets import find_loader
 from bevviz.errors import UserError
-from bevviz.fleet.table import RESERVED, RunInfo, find_damage, read_info
+from bevviz.extras.batch.table import RESERVED, RunInfo, find_damage, read_info
 from bevviz.recording.provenance import dependencies_of, with_absolute_files
 from bevviz.support import cleanup, progress
 from bevviz.support.files import absolute, bag_files, file_hash, is_path, sampled_files

@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bevviz.errors import UserError, first_line
-from bevviz.fleet.summary import Link
-from bevviz.fleet.table import RunInfo
+from bevviz.extras.batch.summary import Link
+from bevviz.extras.batch.table import RunInfo
 from bevviz.recording import blueprints, entities, rerun_cli
 from bevviz.recording.ports import LOOPBACK, allowed_origins, check_port, free_port, host_for, own_address
 

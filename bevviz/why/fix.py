@@ -1,4 +1,4 @@
-"""Search of parameters that repair a cause: chosen on some drives, confirmed on others."""
+"""Search of parameters that repair what is missed or false: chosen on some frames, confirmed on others."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from bevviz.evaluate import ObjectScore
 from bevviz.evaluate.differences import before_after
 from bevviz.evaluate.f1_change import f1, f1_change
 from bevviz.evaluate.ground_truth import Truth, truth_source
-from bevviz.fleet.causes import Cause, Findings
-from bevviz.fleet.parameter_search import Settings, search
 from bevviz.model.frame import F64, Frame
 from bevviz.pipeline.session import Variants
 from bevviz.support.json_form import json_form, rounded
 from bevviz.why.experiment import Experiment, Outcome
+from bevviz.why.parameter_search import Settings, search
 
 FRAMES = 60  # frames to choose on, and as many to confirm
 TRIALS = 72
@@ -346,34 +345,6 @@ class DriveFrames:
     name: str
     numbers: Sequence[int]
     of_cause: frozenset[int]
-
-
-def drives_of(findings: Findings, cause: Cause | None) -> list[DriveFrames]:
-    """Return the drives of a batch whose bags exist.
-
-    Args:
-        findings: of the batch.
-        cause: cause to fix; None: every missed and every false object.
-    """
-    if cause is not None:
-        wanted = cause.rows
-    else:
-        wanted = np.flatnonzero(findings.is_word("outcome", "missed") | findings.is_word("outcome", "false"))
-    names, drive = findings.words("recording")
-    bags, bag = findings.words("bag")
-    frame = findings.table["frame"].to_numpy()
-    is_wanted = np.zeros(len(findings), bool)
-    is_wanted[wanted] = True
-    drives = []
-    for code, name in enumerate(names):
-        rows = np.flatnonzero(drive == code)
-        path = Path(bags[bag[rows[0]]])
-        if path.exists():
-            numbers = sorted(set(frame[rows].tolist()))
-            drives.append(
-                DriveFrames((path,), name, numbers, frozenset(frame[rows[is_wanted[rows]]].tolist()))
-            )
-    return drives
 
 
 def draw_samples(

@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevviz.bags.source import iso
-from bevviz.fleet.causes import Causes, Findings, find_causes
-from bevviz.fleet.findings import FINDINGS, write_findings
-from bevviz.fleet.table import NAME, SCHEMA, SEVERITIES, RunInfo, severity
+from bevviz.extras.batch.causes import Causes, Findings, find_causes
+from bevviz.extras.batch.findings import FINDINGS, write_findings
+from bevviz.extras.batch.table import NAME, SCHEMA, SEVERITIES, RunInfo, severity
 from bevviz.support.files import atomic_write, save_text
 from bevviz.support.html import render
 

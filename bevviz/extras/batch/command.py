@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +29,14 @@ from bevviz.errors import UserError
 from bevviz.support import progress
 
 if TYPE_CHECKING:
+    from pyarrow import Table
+
     from bevviz.evaluate.metrics import Limit
-    from bevviz.fleet.dask_jobs import Cluster
-    from bevviz.fleet.jobs import Job, JobResults
-    from bevviz.fleet.processes import Processes
-    from bevviz.fleet.table import RunInfo
+    from bevviz.extras.batch.dask_jobs import Cluster
+    from bevviz.extras.batch.jobs import Job, JobResults
+    from bevviz.extras.batch.processes import Processes
+    from bevviz.extras.batch.summary import BagTotals
+    from bevviz.extras.batch.table import RunInfo
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,12 +121,13 @@ class BatchOptions:
 
 @command(
     "batch",
+    help="run the pipeline over many bags",
     description="Run the pipeline over many bags, each by itself, and sum up. Run again, it goes on.",
     epilog=TIMES,
 )
 def _batch(options: BatchOptions) -> int:
     from bevviz.evaluate.metrics import parse_limits
-    from bevviz.fleet.jobs import intact_results, lock_folder
+    from bevviz.extras.batch.jobs import lock_folder
 
     limits = parse_limits(options.limits.min, options.limits.max)
     if options.results.catalog and options.results.serve_catalog:
@@ -136,13 +140,27 @@ def _batch(options: BatchOptions) -> int:
             complete = [(job.table, info) for job in jobs if (info := job.complete())]
         else:
             interrupted = False
-            complete = intact_results(options.output.resolve(), _warn)
+            complete = complete_bags(options.output)
         return _sum_up(complete, failed, limits, options, interrupted)
+
+
+def complete_bags(folder: Path) -> list[tuple[Path, RunInfo]]:
+    """Return the table of each complete bag of a batch, with its description. Warn of damaged ones."""
+    from bevviz.extras.batch.jobs import intact_results
+
+    return intact_results(folder.resolve(), _warn)
+
+
+def sum_up(complete: Sequence[tuple[Path, RunInfo]]) -> tuple[Table, list[BagTotals]]:
+    """Return the frames of all bags, the worst first, and the totals of each bag."""
+    from bevviz.extras.batch.summary import collect
+
+    return collect(complete, None)
 
 
 def _jobs(options: BatchOptions) -> list[Job]:
     from bevviz.bags.source import FrameSelection
-    from bevviz.fleet.jobs import make_jobs
+    from bevviz.extras.batch.jobs import make_jobs
     from bevviz.model.frame import Scene
     from bevviz.recording import blueprints
     from bevviz.stages.detector import Detector
@@ -167,7 +185,7 @@ def _run(jobs: list[Job], workers: WorkerOptions, force: bool, failed: list[tupl
         force: whether to run the finished ones, too.
         failed: filled with the name and the error of each failed bag.
     """
-    from bevviz.fleet.jobs import unfinished_jobs
+    from bevviz.extras.batch.jobs import unfinished_jobs
 
     todo = unfinished_jobs(jobs, force, _warn)
     if len(todo) < len(jobs):
@@ -213,11 +231,11 @@ def _execute(
     with ExitStack() as stack:
         engine: Cluster | Processes
         if workers.dask:
-            from bevviz.fleet.dask_jobs import Cluster
+            from bevviz.extras.batch.dask_jobs import Cluster
 
             engine = stack.enter_context(Cluster(workers.dask))
         else:
-            from bevviz.fleet.processes import Processes
+            from bevviz.extras.batch.processes import Processes
 
             count = workers.jobs or max(1, (os.cpu_count() or 1) // 2)
             engine = stack.enter_context(Processes(min(count, len(todo))))
@@ -232,7 +250,7 @@ def _sum_up(
     interrupted: bool,
 ) -> int:
     """Write the summary of the complete bags, register them in a catalog, and return the exit status."""
-    from bevviz.fleet.summary import write_summary
+    from bevviz.extras.batch.summary import write_summary
 
     folder, results = options.output, options.results
     recordings = [(table.with_suffix(".rrd"), info) for table, info in complete]
@@ -241,11 +259,11 @@ def _sum_up(
         if interrupted:
             url = None
         elif results.serve_catalog:
-            from bevviz.fleet.catalog import serve_catalog
+            from bevviz.extras.batch.catalog import serve_catalog
 
             url, viewer = stack.enter_context(serve_catalog(results.serve_catalog, results.bind))
         if url:
-            from bevviz.fleet.catalog import register
+            from bevviz.extras.batch.catalog import register
 
             dataset = results.catalog_name or folder.resolve().name
             link = register(url, dataset, recordings, results.blueprint)

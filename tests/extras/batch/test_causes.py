@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from bevviz.cli import main
-from bevviz.fleet.causes import Bound, Findings, compare_causes, find_causes
-from bevviz.fleet.findings import SCHEMA
-from bevviz.fleet.summary import page
+from bevviz.extras.batch.causes import Bound, Findings, compare_causes, find_causes
+from bevviz.extras.batch.findings import SCHEMA
+from bevviz.extras.batch.summary import page
 from tests.support.documented_json import check
 
 Row = dict[str, Any]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bevviz.bags.source import iso
 from bevviz.errors import UserError
-from bevviz.fleet.condition_search import LEAST_UNITS, Attribute, Condition, Slice, find_slices
-from bevviz.fleet.findings import FINDINGS
+from bevviz.extras.batch.condition_search import LEAST_UNITS, Attribute, Condition, Slice, find_slices
+from bevviz.extras.batch.findings import FINDINGS
 from bevviz.model.frame import F32, I64, Bool
 from bevviz.model.reasons import PARAMETERS, STAGES, ReasonKind
 from bevviz.support import table as text_table

@@ -1,1 +1,0 @@
-"""Runs over many bags, on this machine or on a cluster. Imports `report` and below."""

@@ -1,0 +1,1 @@
+"""Tests of `bevviz batch` and `bevviz causes`."""
