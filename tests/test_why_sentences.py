@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
+import pytest
 
 from bevviz.config import Config, load
 from bevviz.model.reasons import PARAMETERS, Limit, Reason, ReasonKind, Scored, limit_of
-from bevviz.model.results import Pair
+from bevviz.model.results import Decision, Pair
 from bevviz.why.sentences import FALSE_SENTENCES, SENTENCES, make_verdict
 from bevviz.why.subject import Subject
+from bevviz.why.subject_matches import first_name
 from bevviz.why.verdict import FALSE as FALSE_KINDS
 
 REFERENCE = Path(__file__).parent / "references/why_sentences.txt"
@@ -122,6 +127,7 @@ CASES: list[tuple[ReasonKind, bool, dict[str, Any], Subject]] = [
         {**SEEN, "rival": Scored("truck", 0.6), "iou": 0.7, "rival_owner": "the van at 12.0 m"},
         CAR,
     ),
+    (K.SECOND_NAME, False, {"first": Scored("truck", 0.29), "cluster": 68}, DETECTION),
     (K.NOT_FUSED, False, {"cameras": ("zed", "left"), "problems": ("no transform",)}, CAR),
     (K.LOW_OVERLAP, False, PAIR, CAR),
     (K.TOO_FEW_POINTS, False, {**PAIR, "pair": None}, CAR),
@@ -218,6 +224,30 @@ def test_each_kind_has_its_sentence() -> None:
     assert made == REFERENCE.read_text(encoding="utf-8").splitlines()
     assert {case[0] for case in CASES} == SENTENCES.keys()
     assert {case[0] for case in FALSE_CASES} == FALSE_SENTENCES.keys() == FALSE_KINDS
+
+
+@pytest.mark.parametrize(
+    ("name", "box", "cluster", "is_second"),
+    [
+        ("car", (110, 110, 200, 190), 68, True),
+        ("truck", (90, 90, 300, 300), 68, True),  # the reported box lies in it
+        ("car", (180, 110, 260, 190), 68, False),  # beside the reported box
+        ("car", (110, 110, 200, 190), 67, False),  # its points are another thing's
+        ("person", (110, 110, 130, 190), 68, False),  # a person before a truck is no truck
+    ],
+)
+def test_a_second_name_is_in_the_box_of_the_first(
+    name: str, box: tuple[int, ...], cluster: int, is_second: bool
+) -> None:
+    boxes = np.array([(100, 100, 200, 200), box], np.float32)
+    detections = SimpleNamespace(xyxy=boxes, names=("truck", name), score=np.array([0.29, 0.59]))
+    decisions = np.array([Decision.MATCHED, Decision.TAKEN])
+    fusion = SimpleNamespace(detection_decision=decisions, detection_cluster=np.array([68, cluster]))
+    camera = SimpleNamespace(detections=detections, fusion=fusion)
+    traces: Any = SimpleNamespace(camera=lambda _: camera, result=SimpleNamespace(config=load()))
+    subject = Subject("detection", f"the {name} 0.59", name, frozenset({name}), 1, "zed", boxes[1])
+    evidence: Any = SimpleNamespace(main=cluster)
+    assert first_name(subject, evidence, traces) == (Scored("truck", 0.29) if is_second else None)
 
 
 def test_a_score_is_told_from_its_limit() -> None:

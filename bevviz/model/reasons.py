@@ -43,6 +43,7 @@ class ReasonKind(StrEnum):
     NOT_DETECTED = "not detected"
     BELOW_THRESHOLD = "below threshold"
     SUPPRESSED = "suppressed"
+    SECOND_NAME = "second name"  # not a miss: the thing is reported by another detection
     NOT_FUSED = "not fused"
     LOW_OVERLAP = "low overlap"
     TOO_FEW_POINTS = "too few points"
@@ -75,7 +76,7 @@ _OF_STAGE = {  # stage -> reasons for which it lost an object, or made a false o
     ),
     "detector": (
         *(ReasonKind.NOT_RUN, ReasonKind.NOT_DETECTED, ReasonKind.BELOW_THRESHOLD),
-        *(ReasonKind.SUPPRESSED, ReasonKind.DETECTOR_ERROR),
+        *(ReasonKind.SUPPRESSED, ReasonKind.SECOND_NAME, ReasonKind.DETECTOR_ERROR),
     ),
     "fusion": (
         *(ReasonKind.NOT_FUSED, ReasonKind.LOW_OVERLAP, ReasonKind.TOO_FEW_POINTS, ReasonKind.TOO_FAR),
@@ -126,6 +127,7 @@ MEANINGS = {  # of each reason that an answer can have, for the docs and the pag
     ReasonKind.NOT_DETECTED: "the detector has no candidate there",
     ReasonKind.BELOW_THRESHOLD: "the detector's score is too low",
     ReasonKind.SUPPRESSED: "a better detection overlaps it; the answer names it and the IoU",
+    ReasonKind.SECOND_NAME: "probably a second box of a reported thing: nothing was missed",
     ReasonKind.NOT_FUSED: "its camera lacks a calibration or a pose",
     ReasonKind.LOW_OVERLAP: "its points cover too little of the image box",
     ReasonKind.TOO_FEW_POINTS: "too few of its points are in the image box",

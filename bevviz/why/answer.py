@@ -256,6 +256,9 @@ class FrameExplainer:
         """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
         if answer.empty:
             return answer
+        if answer.verdict.kind is ReasonKind.SECOND_NAME:
+            remark = untried_text(answer.subject, answer.verdict)
+            return replace(answer, remark=f"{remark[0].upper()}{remark[1:]}.")
         answer = self.with_restoring_stages(answer)
         search, verdict = self.search(answer), answer.verdict
         answer = replace(answer, hints=search.hints, tried=search.tried)

@@ -13,7 +13,7 @@ from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.why.evidence import Evidence, camera_and_fusion
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import LINK, Subject
-from bevviz.why.subject_matches import find_fused, opinion_on
+from bevviz.why.subject_matches import find_fused, first_name, opinion_on
 
 _OWN_LIMIT = {  # section of a stage whose parameter decides only if the stage is ours
     ReasonKind.GROUND: "ground",
@@ -59,6 +59,7 @@ class ReasonValues:
             ReasonKind.NOT_DETECTED: self._detection,
             ReasonKind.BELOW_THRESHOLD: self._detection,
             ReasonKind.SUPPRESSED: self._suppressed,
+            ReasonKind.SECOND_NAME: self._second_name,
             ReasonKind.NOT_FUSED: self._not_fused,
             ReasonKind.TAKEN: self._taken,
             ReasonKind.NOT_AMONG: self._not_among,
@@ -265,6 +266,10 @@ class ReasonValues:
         rival = int(camera.detections.suppressed_by[best.row])
         owner = self._box_owner(best.camera, rival) if rival >= 0 else ""
         return {**detection_reason(camera.detections, best.row, self.config).values, "rival_owner": owner}
+
+    def _second_name(self) -> dict[str, Any]:
+        first = first_name(self.subject, self.evidence, self.traces)
+        return {"first": first, "cluster": self.evidence.main}
 
     # --- fusion --------------------------------------------------------------------------------
 

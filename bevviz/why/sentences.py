@@ -39,6 +39,9 @@ def make_verdict(
     head = subject.name[0].upper() + subject.name[1:]
     if reason.kind is ReasonKind.REPORTED:
         text = f"{head} was reported: {because}{_elsewhere_text(restored_by)}."
+    elif reason.kind is ReasonKind.SECOND_NAME:
+        first = f"the reported {reason['first']}, and nothing was missed"
+        text = f"{head} is probably a second name of {first}: {because}."
     elif because.startswith(_ONLY):
         content, _, rest = because.partition(": ")
         text = f"There is {content} {subject.name.removeprefix('what is ')}: {rest}."
@@ -461,6 +464,9 @@ SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words a
     ReasonKind.NOT_DETECTED: _not_detected,
     ReasonKind.BELOW_THRESHOLD: _below_threshold,
     ReasonKind.SUPPRESSED: _suppressed,
+    ReasonKind.SECOND_NAME: lambda reason, _: (
+        f"its image box is in that one's, and its points are in the same cluster {reason['cluster']}"
+    ),
     ReasonKind.NOT_FUSED: _not_fused,
     ReasonKind.LOW_OVERLAP: _low_overlap,
     ReasonKind.TOO_FEW_POINTS: _too_few_points,
@@ -486,6 +492,7 @@ _UNTRIED = {  # the reason why no parameter can be tried
     ReasonKind.NOT_DETECTED: "the detector has no candidate for it, only another model may have one",
     ReasonKind.BELOW_THRESHOLD: "a threshold below its score lets noise pass, only another model may help",
     ReasonKind.SUPPRESSED: "its score is too low as well",
+    ReasonKind.SECOND_NAME: "the thing is reported already",
     ReasonKind.NOT_FUSED: "the camera needs a pose and intrinsics",
     ReasonKind.DETECTOR_ERROR: "the detector is as sure of it as of right objects, another model may not be",
 }

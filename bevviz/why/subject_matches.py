@@ -9,6 +9,7 @@ import numpy as np
 
 from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, I64
+from bevviz.model.reasons import Scored, scored
 from bevviz.model.results import CameraResult, Decision, DetectionState, FrameResult, Fusion
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.frame_index import FEW, PART, FrameIndex
@@ -16,6 +17,8 @@ from bevviz.why.subject import LINK, Subject, points_in_box, projected_box, sing
 
 SURE = 0.5  # overlap from which a detection surely belongs to its object
 COVERED = 0.8  # share of a cluster's image box that a detection of it covers
+INSIDE = 0.7  # share of the smaller of two image boxes from which they show one thing
+ALIKE = 0.5  # least ratio of the usual widths of two classes that a detector may confuse
 
 
 def find_candidates(
@@ -134,6 +137,31 @@ def _candidate(result: CameraResult, row: int, overlap: float) -> Candidate:
         decision,
         cluster,
     )
+
+
+def first_name(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Scored | None:
+    """Return the detection that reports what a lost detection shows; None: there is none.
+
+    The image box of one lies in that of the other, both have one cluster, and their classes are alike.
+    """
+    camera = traces.camera(subject.camera)
+    if camera is None or camera.detections is None or camera.fusion is None or evidence.main < 0:
+        return None
+    detections, fusion, xyxy = camera.detections, camera.fusion, subject.xyxy
+    assert xyxy is not None
+    is_first = (fusion.detection_decision == Decision.MATCHED) & (fusion.detection_cluster == evidence.main)
+    sides = np.minimum(detections.xyxy[:, 2:], xyxy[2:]) - np.maximum(detections.xyxy[:, :2], xyxy[:2])
+    areas = (detections.xyxy[:, 2:] - detections.xyxy[:, :2]).prod(axis=1)
+    smaller = np.minimum(areas, (xyxy[2:] - xyxy[:2]).prod())
+    is_first &= sides.clip(0).prod(axis=1) >= INSIDE * smaller
+    rows = [row for row in np.flatnonzero(is_first).tolist() if row != subject.row]
+    sizes = traces.result.config.objects.sizes
+    for row in rows:
+        known = sizes.get(subject.label.lower()), sizes.get(detections.names[row].lower())
+        widths = [size[1] for size in known if size is not None]
+        if detections.names[row] == subject.label or (widths[1:] and min(widths) >= ALIKE * max(widths)):
+            return scored(detections, row)
+    return None
 
 
 HELD = 0.3  # least share of a subject's points inside the box of its object

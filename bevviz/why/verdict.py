@@ -17,7 +17,7 @@ from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.ideal import StageSet
 from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
 from bevviz.why.subject import Subject
-from bevviz.why.subject_matches import find_fused
+from bevviz.why.subject_matches import find_fused, first_name
 
 LikelyReasons = tuple[()] | tuple[ReasonKind, ReasonKind]
 
@@ -358,6 +358,8 @@ class _Decider:
         evidence, best = self.evidence, self.evidence.best
         if best is None:
             return ReasonKind.NOT_DETECTED
+        if best.kept and first_name(self.subject, evidence, self.traces) is not None:
+            return ReasonKind.SECOND_NAME
         most_points = max((part.points for part in evidence.parts if part.kept), default=0)
         lost = evidence.voxels >= FEW and most_points < max(FEW, PART * evidence.obstacles)
         if not best.kept:  # The fusion may give noise to a detection, but never ground.
