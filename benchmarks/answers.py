@@ -78,7 +78,7 @@ class Page:
                 raise SystemExit(message["text"])
             if message["type"] == "entries":
                 sights = [sight for entry in message["entries"] for sight in entry["sights"]]
-                self.sights += [(int(sight[1]), sight[3]) for sight in sights if sight[3]]
+                self.sights += [(int(sight["stamp"]), sight["pick"]) for sight in sights if sight["pick"]]
             if message["type"] == kind:
                 return message
 

@@ -514,7 +514,7 @@ def _clicks(drive: Sequence[str], folder: Path) -> Results:
                         known = entries.setdefault(entry["number"], {**entry, "sights": []})
                         known["sights"] += entry["sights"]
                 if message["type"] == "frames":
-                    stamps |= {int(at) for at, _ in message["frames"]}
+                    stamps |= {int(frame["stamp"]) for frame in message["frames"]}
                 over = message["type"] == "progress" and message["over"]
             rows = [
                 f"{entry['what']} {_brief(_stable({k: v for k, v in entry.items() if k != 'sights'}))}"
@@ -522,10 +522,10 @@ def _clicks(drive: Sequence[str], folder: Path) -> Results:
             ]
             results["list"] = sorted(rows)
             asked = [
-                (int(sight[1]), sight[3])
+                (int(sight["stamp"]), sight["pick"])
                 for entry in entries.values()
                 for sight in entry["sights"]
-                if sight[3]
+                if sight["pick"]
             ]
             picks = sorted(set(asked))[: CLICKS // 2]
             places = [f"pixel/zed/{60 + 53 * n % 540},{120 + 29 * n % 160}" for n in range(CLICKS)]

@@ -51,11 +51,11 @@ def main() -> None:
     worst = sorted(whole.values(), key=order)[:WORST]
     print(
         "the worst:",
-        ", ".join(f"{one['what']} {one['name']} at frame {one['sights'][0][0]}" for one in worst),
+        ", ".join(f"{one['what']} {one['name']} at frame {one['sights'][0]['frame']}" for one in worst),
     )
     for after, entries in early.items():
         listed = sum(any(same(one, other) for other in entries.values()) for one in worst)
-        frames = len({sight[0] for one in entries.values() for sight in one["sights"]})
+        frames = len({sight["frame"] for one in entries.values() for sight in one["sights"]})
         print(f"after {after:g} s: {listed} of {len(worst)}; {len(entries)} rows of {frames} frames")
     print(f"complete after {seconds:.0f} s with {len(whole)} rows; at most {memory:.0f} MB of memory")
 
@@ -84,8 +84,11 @@ def watch(address: str, start: float, times: list[float]) -> tuple[dict[float, E
 def order(entry: Mapping[str, Any]) -> tuple[float, ...]:
     """Return the sort key of the page's table."""
     sights = entry["sights"]
-    stamps, away = [int(sight[1]) for sight in sights], [99 if s[2] is None else s[2] for s in sights]
-    level = sum([any(s[7] for s in sights), min(away) <= NEAR, max(stamps) - min(stamps) >= LONG])
+    stamps, away = (
+        [int(s["stamp"]) for s in sights],
+        [99 if s["distance"] is None else s["distance"] for s in sights],
+    )
+    level = sum([any(s["in_way"] for s in sights), min(away) <= NEAR, max(stamps) - min(stamps) >= LONG])
     if entry["what"] == "anomaly":
         level = 3 if entry["name"] in SENSORS else 0
     rank = 0 if entry["what"] == "unmatched" else RANK.index(entry["what"])
@@ -96,8 +99,8 @@ def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two rows may be one finding."""
     if (one["what"], one["name"]) != (other["what"], other["name"]):
         return False
-    frames = [sight[0] for sight in other["sights"]]
-    return any(abs(sight[0] - frame) <= CELL for sight in one["sights"] for frame in frames)
+    frames = [sight["frame"] for sight in other["sights"]]
+    return any(abs(sight["frame"] - frame) <= CELL for sight in one["sights"] for frame in frames)
 
 
 if __name__ == "__main__":

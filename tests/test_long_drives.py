@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,8 +55,8 @@ def finding(frame: int, row: int, x: float) -> Finding:
 
 def groups(listed: FindingList) -> list[list[int]]:
     """Return the frames of each group."""
-    news: list[dict[str, Any]] = list(listed.news({}))
-    return [[sight[0] for sight in entry["sights"]] for entry in news[0]["entries"]] if news else []
+    entries, _ = listed.news({})
+    return [[sight["frame"] for sight in entry["sights"]] for entry in entries]
 
 
 @pytest.fixture
@@ -71,7 +70,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def whole_list(drive: RecordedDrive, passes: set[str]) -> list[list[int]]:
     """Run a drive and return the groups of its list. Collect the names of its passes."""
-    drive.news.listen(lambda: passes.add(str(drive.progress()["pass"])))
+    drive.news.listen(lambda: passes.add(str(drive.progress()["phase"])))
     drive.start()
     until(lambda: drive.over)
     assert drive.progress()["done"] == FRAMES and not drive.progress()["error"]

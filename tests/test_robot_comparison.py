@@ -610,9 +610,12 @@ def test_effects_of_other_limits_are_counted() -> None:
     _, found = held(ours(), result.objects.boxes, result.objects.names, config=config.opinions)
     lenient = replace(result, opinions=found, config=config)
     told = trial_effects(result, lenient, None)
-    assert told["opinions"] == {"contradicted": [1, 0], "unseen": [0, 1]}
+    assert told["opinions"] == {
+        "contradicted": {"before": 1, "after": 0},
+        "unseen": {"before": 0, "after": 1},
+    }
     assert told["changes"] == {"opinions.min_height": "25.0 -> 500.0"}
-    assert trial_effects(ours(), result, None)["opinions"]["contradicted"] == [None, 1]
+    assert trial_effects(ours(), result, None)["opinions"]["contradicted"] == {"before": None, "after": 1}
     outcome = SweepOutcome()
     for one in (result, lenient):
         outcome.add(Outcome("lenient", one))

@@ -55,9 +55,14 @@ def hinted(address: str) -> Hinted:
     with Talk(address) as talk:
         sights = [entry["sights"][0] for entry in talk.of("missed")]
         return [
-            (int(stamp), pick, talk.asked("hints", type="ask", time=int(stamp), set=[], pick=pick))
-            for _, stamp, _, pick, *_ in sights
+            (stamp, pick, talk.asked("hints", type="ask", time=stamp, set=[], pick=pick))
+            for stamp, pick in map(stamp_and_pick, sights)
         ]
+
+
+def stamp_and_pick(sight: dict[str, Any]) -> tuple[int, str]:
+    """Return the stamp of a frame of a finding, and the text that asks about its object."""
+    return int(sight["stamp"]), sight["pick"]
 
 
 def helped(hinted: Hinted) -> tuple[int, str, dict[str, Any]]:
@@ -70,32 +75,33 @@ def test_one_missed_object_is_one_entry(talk: Talk) -> None:
     """However many frames it lasts; no two entries have the same object of a frame."""
     missed = talk.of("missed")
     assert any(len(entry["sights"]) > 2 for entry in missed)
-    sights = [(frame, pick) for entry in missed for frame, _, _, pick, *_ in entry["sights"]]
+    sights = [(sight["frame"], sight["pick"]) for entry in missed for sight in entry["sights"]]
     assert len(sights) == len(set(sights))
     for entry in missed:
-        numbers = [frame for frame, *_ in entry["sights"]]
+        numbers = [sight["frame"] for sight in entry["sights"]]
         assert numbers == sorted(set(numbers))
-        assert all(sight[5] for sight in entry["sights"]), "its reason"
+        assert all(sight["text"] for sight in entry["sights"]), "its reason"
 
 
 @pytest.mark.long
 def test_rows_of_the_list_agree_with_their_answers(talk: Talk) -> None:
     """One kind, subject, distance and reason, whether it is read in the list or asked for."""
     for entry in talk.of("missed", "false"):
-        for _, stamp, distance, pick, tried, reason, *_ in entry["sights"]:
-            answer = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
+        for sight in entry["sights"]:
+            stamp, pick = stamp_and_pick(sight)
+            answer = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
             address = f"{answer['kind']}/{answer['camera']}/{answer['row']}"
             assert (address, answer["label"].lower(), answer["reason"]) == (
                 pick,
                 entry["name"],
-                reason,
+                sight["text"],
             )
-            assert answer["distance"] == distance and not tried
+            assert answer["distance"] == sight["distance"] and not sight["tried"]
             assert answer["reported"] == answer["false"] == (entry["what"] == "false")
 
 
 def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
-    stamp = next(iter(talk.of("missed")))["sights"][0][1]
+    stamp = next(iter(talk.of("missed")))["sights"][0]["stamp"]
     ground = talk.asked("answer", type="ask", time=int(stamp), set=[], pick="point//6,0,-1.6")
     assert re.search(r"only ground .*: \d+ points, all ground", ground["verdict"])
     answers = [
@@ -112,28 +118,28 @@ def test_empty_ground_and_several_things_are_told(talk: Talk) -> None:
 @pytest.mark.long
 def test_the_subject_is_followed_over_frames(talk: Talk) -> None:
     """An object is asked by its row in one frame, and found by its id in each other one."""
-    _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
-    first = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
+    stamp, pick = stamp_and_pick(talk.of("missed")[0]["sights"][0])
+    first = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
     identity = json.loads(first["pick"])
     for frame in range(FRAMES):
-        time_ = int(stamp) + (frame - first["frame"]) * 100_000_000
+        time_ = stamp + (frame - first["frame"]) * 100_000_000
         values = ["clustering.eps=0.9"] if frame % 2 else []
         message = talk.asked("answer", type="ask", time=time_, set=values, pick=first["pick"])
         assert (message["frame"], message["set"]) == (frame, values)
         assert json.loads(message["pick"])["id"] == identity["id"]
         assert message["label"].lower() == identity["label"]
     gone = json.dumps({**identity, "id": "nobody"})
-    absent = talk.asked("absent", type="ask", time=int(stamp), set=[], pick=gone)
+    absent = talk.asked("absent", type="ask", time=stamp, set=[], pick=gone)
     assert f"is not in frame {first['frame']}: the ground truth has no" in absent["text"]
 
 
 def test_rows_are_valid_in_their_own_frame_only(talk: Talk) -> None:
     """A row of the list that is asked with tried values is the object of the list."""
     for entry in talk.of("false"):
-        frame, stamp, _, pick, *_ = entry["sights"][0]
-        origin = {"time": int(stamp), "set": []}
-        opened = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)
-        wanted = {"type": "ask", "time": int(stamp), "pick": pick, "from": origin}
+        frame, (stamp, pick) = entry["sights"][0]["frame"], stamp_and_pick(entry["sights"][0])
+        origin = {"time": stamp, "set": []}
+        opened = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)
+        wanted = {"type": "ask", "time": stamp, "pick": pick, "origin": origin}
         tried = talk.asked("answer|absent", **wanted, set=["detector.conf_threshold=0.5"])
         assert tried["frame"] == frame
         if tried["type"] == "absent":
@@ -149,7 +155,7 @@ def test_a_hint_has_the_promised_effect(talk: Talk, hinted: Hinted) -> None:
     tried = talk.asked("tried", type="try", time=stamp, set=hint["settings"], pick=pick)
     assert tried["effects"] == {key: hint[key] for key in tried["effects"]}
     assert hint["fixed"]
-    assert tried["f1"][1] > tried["f1"][0]
+    assert tried["f1"]["after"] > tried["f1"]["before"]
 
 
 def test_without_a_hint_a_sentence_names_the_tried_changes(hinted: Hinted) -> None:
@@ -173,12 +179,12 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str, hinted: Hi
         assert trials[0] == trials[1]
     trial = trials[0]
     assert trial["done"] == trial["total"] == len(trial["strip"]) == FRAMES
-    assert trial["f1"][0] != trial["f1"][1]
-    fixed = [(int(s[1]), s[3]) for entry in talk.of("fixed") for s in entry["sights"]]
+    assert trial["f1"]["before"] != trial["f1"]["after"]
+    fixed = [stamp_and_pick(sight) for entry in talk.of("fixed") for sight in entry["sights"]]
     assert (stamp, pick) in fixed
     assert len(fixed) == trial["counts"]["fixed"]
     good = sum(len(e["sights"]) for e in talk.of("fixed", "false gone"))
-    assert sum(frame[1] for frame in trial["strip"]) == good
+    assert sum(frame["better"] for frame in trial["strip"]) == good
     talk.say(type="drive", set=["clustering.eps=0.7"])
     talk.say(type="cancel", what="drive")
     ended = talk.until("progress", lambda m: m["trials"][-1]["settings"] == ["clustering.eps=0.7"])["trials"][
@@ -193,20 +199,20 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str, hinted: Hi
 
 @pytest.mark.long
 def test_notes_are_kept_beside_the_bag(talk: Talk, bag: Path) -> None:
-    _, stamp, _, pick, *_ = talk.of("missed")[0]["sights"][0]
-    pick = talk.asked("answer", type="ask", time=int(stamp), set=[], pick=pick)["pick"]
-    talk.say(type="note", time=int(stamp), pick=pick, text=" look here ")
+    stamp, pick = stamp_and_pick(talk.of("missed")[0]["sights"][0])
+    pick = talk.asked("answer", type="ask", time=stamp, set=[], pick=pick)["pick"]
+    talk.say(type="note", time=stamp, pick=pick, text=" look here ")
     (note,) = talk.until("notes", lambda message: message["notes"])["notes"]
-    assert (note["stamp"], note["pick"], note["text"]) == (stamp, pick, "look here")
+    assert (note["stamp"], note["pick"], note["text"]) == (str(stamp), pick, "look here")
     assert [str(one) for one in Notes([bag])] == [f"{note['about']}: look here"]
-    assert "characters" in talk.asked("noted", type="note", time=int(stamp), pick="", text="  ")["text"]
-    talk.say(type="unnote", stamp=stamp, text="look here")
+    assert "characters" in talk.asked("noted", type="note", time=stamp, pick="", text="  ")["text"]
+    talk.say(type="unnote", stamp=str(stamp), text="look here")
     talk.until("notes", lambda message: not message["notes"])
     assert not Notes([bag]).path.exists()
 
 
 def test_a_note_about_a_place_names_it_as_the_answer_does(talk: Talk) -> None:
-    stamp = int(talk.of("missed")[0]["sights"][0][1])
+    stamp = int(talk.of("missed")[0]["sights"][0]["stamp"])
     answer = talk.asked("answer", type="ask", time=stamp, set=[], pick="pixel/zed/20,20")
     said = talk.asked("noted", type="note", time=stamp, pick=answer["pick"], text="empty road")
     assert said["text"].startswith("Noted about what is at pixel 20, 20 in frame ")
@@ -273,10 +279,17 @@ def test_a_report_is_about_the_object_of_its_own_tab(talk: Talk, address: str, h
     (page,) = [file["name"] for file in report["files"] if file["name"].endswith(".html")]
     text = (Path(report["folder"]) / page).read_text()
     assert f"Missed: {mine['name']}" in " ".join(re.sub(r"<[^>]*>", " ", unescape(text)).split())
-    far = max(talk.of("missed"), key=lambda entry: int(entry["sights"][-1][1]))["sights"][-1]
+    far = max(talk.of("missed"), key=lambda entry: int(entry["sights"][-1]["stamp"]))["sights"][-1]
     absent = {"kind": "truth", "label": "bus", "frame": 0, "id": "bus of another drive"}
     said = talk.asked(
-        "never", type="report", time=int(far[1]), set=[], pick=json.dumps(absent), before=0, after=0, text=""
+        "never",
+        type="report",
+        time=int(far["stamp"]),
+        set=[],
+        pick=json.dumps(absent),
+        before=0,
+        after=0,
+        text="",
     )
     assert "of the drive as opened" in said["text"]
 
@@ -300,7 +313,7 @@ def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None
 def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
     """A page that acknowledges no piece gets a few pieces, and the one that it asks for."""
     with Talk(address) as talk:
-        last = max(int(s[1]) for entry in talk.of("missed", "false") for s in entry["sights"])
+        last = max(int(s["stamp"]) for entry in talk.of("missed", "false") for s in entry["sights"])
     with channel(address, "/recording") as page:
         whole = list[str | bytes]()
         while len(whole) <= FRAMES:
@@ -467,14 +480,14 @@ def test_a_file_that_is_no_bag_is_one_line(tmp_path: Path, capsys: pytest.Captur
 def test_a_slow_try_keeps_no_question_waiting(talk: Talk) -> None:
     """It can be cancelled; its own answer comes never, that of the next try at once."""
     slow, entry = ["bev.resolution=0.02"], talk.of("missed")[0]
-    _, stamp, _, pick, *_ = entry["sights"][0]
-    talk.say(type="try", time=int(stamp), set=slow, pick=pick)
-    talk.say(type="ask", time=int(stamp), set=[], pick=pick)
+    stamp, pick = stamp_and_pick(entry["sights"][0])
+    talk.say(type="try", time=stamp, set=slow, pick=pick)
+    talk.say(type="ask", time=stamp, set=[], pick=pick)
     first = talk.until("tried|answer")
     assert first["type"] == "answer" and first["set"] == []
-    talk.say(type="try", time=int(stamp), set=["bev.resolution=0.025"], pick=pick)
+    talk.say(type="try", time=stamp, set=["bev.resolution=0.025"], pick=pick)
     talk.say(type="cancel", what="try")
-    talk.say(type="try", time=int(stamp), set=["clustering.eps=0.9"], pick=pick)
+    talk.say(type="try", time=stamp, set=["clustering.eps=0.9"], pick=pick)
     tried = talk.until("tried")
     while tried["type"] == "error":
         assert tried["text"] == "the try was cancelled"
@@ -484,9 +497,9 @@ def test_a_slow_try_keeps_no_question_waiting(talk: Talk) -> None:
 
 def test_a_question_about_a_cancelled_try_is_answered(talk: Talk) -> None:
     values, entry = ["bev.resolution=0.03"], talk.of("missed")[0]
-    _, stamp, _, pick, *_ = entry["sights"][0]
-    talk.say(type="try", time=int(stamp), set=values, pick=pick)
-    talk.say(type="ask", time=int(stamp), set=values, pick=pick)
+    stamp, pick = stamp_and_pick(entry["sights"][0])
+    talk.say(type="try", time=stamp, set=values, pick=pick)
+    talk.say(type="ask", time=stamp, set=values, pick=pick)
     talk.say(type="cancel", what="try")
     answer = talk.until("answer")
     while answer["type"] == "error":

@@ -158,10 +158,10 @@ def nearest_missed(talk: Channel, frame: int) -> str:
     """Return the pick of the nearest missed object in the next list, which is of one frame only."""
     entries: list[dict[str, Any]] = []
     # Lists of the frame that was held before may come first.
-    while {sight[0] for entry in entries for sight in entry["sights"]} != {frame}:
+    while {sight["frame"] for entry in entries for sight in entry["sights"]} != {frame}:
         entries = talk.entries.popleft() if talk.entries else talk.until("entries")["entries"]
     missed = [entry["sights"][0] for entry in entries if entry["what"] == "missed"]
-    return str(min(missed, key=lambda sight: sight[2])[3])
+    return str(min(missed, key=lambda sight: sight["distance"])["pick"])
 
 
 @pytest.mark.long
@@ -346,7 +346,9 @@ def test_the_objects_method_is_changed_there_and_back(
     theirs = ("objects.method=network:detect", "objects.params.ahead=14", "opinions.min_height=400")
     told = session.try_values(0, theirs)
     assert told["changes"]["objects.params.ahead"] == "absent -> 14.0"
-    assert told["opinions"]["unseen"] == [None, 1] and told["opinions"]["missed"][1] > 0
+    assert (
+        told["opinions"]["unseen"] == {"before": None, "after": 1} and told["opinions"]["missed"]["after"] > 0
+    )
     assert bench.live.session.stages.objects is not None
     said = [text for _, text in bench.live.notes.take()]
     assert not [text for text in said if "absent" in text], "what comes with a method is not told one by one"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.findings.frame_findings import Finding, Position
 from bevviz.model import geometry
@@ -40,6 +40,28 @@ _ANOMALIES = {  # kind -> remark
 REMARKS = DIFFERENCES | _ANOMALIES
 
 
+class Sight(TypedDict):
+    """A ``FindingFrame`` as the page gets it. The stamp is text: JavaScript numbers cannot hold it."""
+
+    frame: int
+    stamp: str
+    distance: float | None
+    pick: str
+    tried: bool
+    text: str
+    remark: str
+    in_way: bool
+
+
+class Entry(TypedDict):
+    """A group of findings as the page gets it, with the frames that the page does not have yet."""
+
+    number: int
+    what: str
+    name: str
+    sights: list[Sight]
+
+
 @dataclass(frozen=True, slots=True)
 class FindingFrame:
     """One frame of a finding.
@@ -64,11 +86,19 @@ class FindingFrame:
     remark: str = ""
     in_way: bool = False
 
-    def as_list(self) -> list[Any]:
-        """Return the values for the page. The stamp is text: JavaScript numbers cannot hold it."""
-        distance = None if math.isnan(self.distance) else round(self.distance, 1)
-        head = [self.frame, str(self.stamp), distance, self.pick, self.tried]
-        return [*head, self.text, self.remark, self.in_way]
+    @property
+    def sight(self) -> Sight:
+        """The frame as the page gets it."""
+        return {
+            "frame": self.frame,
+            "stamp": str(self.stamp),
+            "distance": None if math.isnan(self.distance) else round(self.distance, 1),
+            "pick": self.pick,
+            "tried": self.tried,
+            "text": self.text,
+            "remark": self.remark,
+            "in_way": self.in_way,
+        }
 
 
 @dataclass(slots=True)
@@ -200,8 +230,12 @@ class FindingList:
             frames = [one for group in self._groups.values() for one in group.frames]
         return {(one.frame, one.pick): one.text for one in frames if not one.tried}
 
-    def news(self, sent_counts: dict[int, int]) -> Iterator[dict[str, Any]]:
-        """Yield the news for a page. ``sent_counts`` counts the frames that it has of each group."""
+    def news(self, sent_counts: dict[int, int]) -> tuple[list[Entry], list[int]]:
+        """Return what is new for a page: groups, and numbers of those that are gone.
+
+        Args:
+            sent_counts: number of the frames that the page has of each group. It is updated.
+        """
         with self._lock:
             gone = [number for number in sent_counts if number not in self._groups]
             changed_groups = [
@@ -209,20 +243,19 @@ class FindingList:
                 for group in self._groups.values()
                 if len(group.frames) > sent_counts.get(group.number, 0)
             ]
-            new_items = [
+            entries: list[Entry] = [
                 {
                     "number": group.number,
                     "what": group.what,
                     "name": group.name,
-                    "sights": [frame.as_list() for frame in group.frames[sent_counts.get(group.number, 0) :]],
+                    "sights": [frame.sight for frame in group.frames[sent_counts.get(group.number, 0) :]],
                 }
                 for group in changed_groups
             ]
             sent_counts.update((group.number, len(group.frames)) for group in changed_groups)
         for number in gone:
             del sent_counts[number]
-        if gone or new_items:
-            yield {"type": "entries", "entries": new_items, "gone": gone}
+        return entries, gone
 
 
 def _nearest(groups: Iterable[FindingGroup], finding: Finding, taken_groups: set[int]) -> FindingGroup | None:

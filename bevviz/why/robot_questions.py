@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
+
 from bevviz.bags.source import BagSource
 from bevviz.model.frame import F64, Frame
 from bevviz.support.extensions import find
@@ -14,6 +16,10 @@ if TYPE_CHECKING:
     from bevviz.why.selection import Selection
 
 
+RobotStep = TypedDict("RobotStep", {"about": str, "text": str, "changed": bool})
+RobotSteps = TypedDict("RobotSteps", {"text": str, "steps": list[RobotStep], "notes": list[str]})
+
+
 class RobotObject(Protocol):
     """One object of the robot, and its way through the robot's nodes."""
 
@@ -21,7 +27,7 @@ class RobotObject(Protocol):
     def is_known(self) -> bool:
         """Whether a topic has the object."""
 
-    def page_form(self) -> dict[str, Any]:
+    def page_form(self) -> RobotSteps:
         """Return what the workbench shows: a text, the steps and notes."""
 
 

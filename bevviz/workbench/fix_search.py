@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bevviz.errors import UserError
 from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
     from bevviz.workbench.growing_drive import GrowingDrive
+    from bevviz.workbench.page_types import FixEntry
 
 
 @dataclass(slots=True)
@@ -24,9 +25,9 @@ class FixJob(Job):
 
     text: str = ""
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> FixEntry:
         """Return the search as JSON for the page."""
-        return Job.as_dict(self) | {"text": self.error or self.text}
+        return {**Job.as_dict(self), "text": self.error or self.text}
 
 
 class FixSearch(Jobs[FixJob]):
@@ -59,7 +60,7 @@ class FixSearch(Jobs[FixJob]):
             raise UserError("there is no ground truth, by which a fix is judged")
         self.start(FixJob(len(self.jobs), asked_by=asked_by), self._search)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> FixEntry:
         """Return the newest search as JSON for the page. Before the first one, the state is empty."""
         return (self.jobs[-1] if self.jobs else FixJob(0, state="")).as_dict()
 

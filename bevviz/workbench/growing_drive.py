@@ -10,7 +10,7 @@ from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,8 +32,10 @@ from bevviz.why.robot_questions import RobotObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import RobotReply, RunProgress
+
 Settings = tuple[str, ...]
-Message = Mapping[str, Any]  # message from the page
 
 RESULTS = 6  # results of frames that were asked about
 READ = 4  # frames that are kept as they were read
@@ -122,7 +124,7 @@ class GrowingDrive(Closable):
         self.following = threading.Lock()  # guards the bag that the robot's chain is read from
         self._aside: FrameExplainer | None = None
         self.first = 0
-        self.commands: Mapping[str, Callable[[Message], dict[str, Any]]] = {}
+        self.commands: Mapping[str, Callable[[Any], RobotReply]] = {}
         self._newest: deque[FrameResult] = deque(maxlen=newest)
         self._held: OrderedDict[int, FrameResult] = OrderedDict()  # results that stay, by number
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
@@ -377,7 +379,7 @@ class GrowingDrive(Closable):
         return None
 
     @abstractmethod
-    def progress(self) -> dict[str, Any]:
+    def progress(self) -> RunProgress:
         """Return the progress of the run for the page."""
 
     @abstractmethod

@@ -5,9 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from bevviz.errors import UserError, first_line
+
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import JobEntry
 
 
 @dataclass(slots=True)
@@ -50,7 +53,7 @@ class Job:
         if self.stop.is_set():
             raise CancelledError
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JobEntry:
         """Return the job as JSON for the page."""
         return {
             "number": self.number,

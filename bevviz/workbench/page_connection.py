@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer, Selection
     from bevviz.why.identity import Identity
+    from bevviz.why.robot_questions import RobotSteps
+    from bevviz.workbench import page_types as types
     from bevviz.workbench.buffers import News
-    from bevviz.workbench.growing_drive import Message, Settings
+    from bevviz.workbench.growing_drive import Settings
     from bevviz.workbench.session import WorkbenchSession
 
 LEGEND = ("person", "cyclist", "car", "truck", "bus")  # classes in the legend of the page
@@ -52,13 +54,13 @@ class PageConnection:
         self._tasks: set[asyncio.Task[None]] = set()
         self._newest = 0  # of all messages
         self._asked = 0  # of the questions
-        self._rows: list[tuple[int, str]] = []  # frame and selection of the rows that need a remark
+        self._rows: list[types.Row] = []  # those that need a remark
         self._remarking = False
         self._overlay = self._source.open_overlay()
         self._name = "" if self._overlay is None else self._overlay.lane
         self._tries = ThreadPoolExecutor(1, "tries")  # A slow try keeps no other question waiting.
         self._trying = 0  # number of the try in progress
-        self._handlers = {
+        self._handlers: Mapping[str, Callable[[Any], Coroutine[Any, Any, None]]] = {
             "ask": self._ask,
             "try": self._try,
             "settle": self._settle,
@@ -96,7 +98,7 @@ class PageConnection:
 
     # --- messages to the page ------------------------------------------------------------------
 
-    def _welcome(self) -> dict[str, Any]:
+    def _welcome(self) -> types.Welcome:
         from bevviz.workbench.page_messages import controls, opened_values
 
         source = self._source
@@ -107,7 +109,6 @@ class PageConnection:
             "run": self._run,
             "overlay": self._name,
             "bag": source.title,
-            "scans": source.scans,
             "truth": source.truth_of is not None,
             "single": source.single_frames,
             "detector": bool(self._opened.detector.model),
@@ -141,9 +142,11 @@ class PageConnection:
             now_times = set(source.frame_times())
             times, sent_times = sorted(now_times - sent_times), now_times
             if times:
-                await self._send({"type": "frames", "frames": [[str(at), number] for at, number in times]})
-            for message in source.findings.news(sent_counts):
-                await self._send(message)
+                frames: list[types.FrameTime] = [{"stamp": str(at), "frame": number} for at, number in times]
+                await self._send({"type": "frames", "frames": frames})
+            entries, gone = source.findings.news(sent_counts)
+            if entries or gone:
+                await self._send({"type": "entries", "entries": entries, "gone": gone})
             if notes_version != workbench.notes_version:
                 notes_version = workbench.notes_version
                 await self._send(await asyncio.to_thread(self._notes))
@@ -151,12 +154,12 @@ class PageConnection:
             await news.wait()
             await asyncio.sleep(TOGETHER)
 
-    async def _send(self, message: dict[str, Any]) -> None:
+    async def _send(self, message: types.ToPage | dict[str, Any]) -> None:
         async with self._sending:
             await self._socket.send_text(json.dumps(message))
 
-    def _notes(self) -> dict[str, Any]:
-        from bevviz.workbench.page_messages import handled_dict, note_dict
+    def _notes(self) -> types.Notes:
+        from bevviz.workbench.page_messages import handled_entry, note_entry
 
         try:
             file, error = self._workbench.tools.notes, ""
@@ -165,8 +168,8 @@ class PageConnection:
             notes, findings, error = [], [], str(problem)
         return {
             "type": "notes",
-            "notes": [note_dict(note) for note in notes],
-            "findings": [handled_dict(finding) for finding in findings],
+            "notes": [note_entry(note) for note in notes],
+            "findings": [handled_entry(finding) for finding in findings],
             "error": error,
         }
 
@@ -179,16 +182,19 @@ class PageConnection:
         task.add_done_callback(self._tasks.discard)
 
     async def _handle(self, text: str) -> None:
+        from bevviz.workbench.page_types import FROM_PAGE
+
         number: Any = None
         try:
-            message = json.loads(text)
-            number = message.get("id")
+            tree = json.loads(text)
+            number = tree.get("id")
+            message = FROM_PAGE.validate_python(tree)
             if message["type"] != "remarks":  # It makes no question idle.
-                self._newest = max(self._newest, int(number))
+                self._newest = max(self._newest, message["id"])
             if command := self._source.commands.get(message["type"]):
                 await self._send(await asyncio.to_thread(self._reply, command, message))
             else:
-                await self._handlers[message["type"]](int(number), message)
+                await self._handlers[message["type"]](message)
         except (WebSocketDisconnect, RuntimeError):
             return
         except UserError as error:
@@ -220,24 +226,24 @@ class PageConnection:
             self._tries if own_thread else self._questions, job
         )
 
-    async def _ask(self, number: int, message: Message) -> None:
+    async def _ask(self, message: types.Ask) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer question came."""
-        from bevviz.workbench.page_messages import answer_tree, hints_dict, other_answers
+        from bevviz.workbench.page_messages import answer_tree, other_answers, row_remark
 
-        self._asked = number
+        number = self._asked = message["id"]
         workbench, frame = self._workbench, await self._frame(message)
-        settings = self._source.asked_settings(_settings(message), again="pick" in message)
-        head = {"id": number, "frame": frame, "set": list(_settings(message))}
-        origin = message.get("from")
+        settings = self._source.asked_settings(message.get("set", ()), again="pick" in message)
+        head: types.Reply = {"id": number, "frame": frame, "set": message.get("set", ())}
+        origin = message.get("origin")
         asked_in = frame if origin is None else await self._frame(origin)
 
-        def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | dict[str, Any]:
+        def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | types.Nothing | types.Absent:
             identity, found = _identity(message), ""
             selection = None if identity else self._selected(message, frame, settings)
             if identity is None and selection is None:
-                return {"type": "nothing", "entity": str(message.get("entity", ""))}
+                return {"type": "nothing", **head, "entity": message.get("entity", "")}
             if selection is not None and origin is not None:
-                asked_settings = self._source.asked_settings(_settings(origin), again=True)
+                asked_settings = self._source.asked_settings(origin["set"], again=True)
                 if (asked_in, asked_settings) != (frame, settings):
                     answer = workbench.ask(asked_in, asked_settings, selection)[0]
                     identity = workbench.identity(asked_in, asked_settings, selection, answer, None)
@@ -248,19 +254,19 @@ class PageConnection:
                 values = " with these values" if settings and frame == identity.frame else ""
                 name = identity.name[:1].upper() + identity.name[1:]
                 text = f"{name} of frame {identity.frame} is not in frame {frame}{values}: {found}."
-                return {"type": "absent", "text": text, "pick": str(identity)}
+                return {"type": "absent", **head, "text": text, "pick": str(identity)}
             answer, *others = workbench.ask(frame, settings, selection)
             pick = str(workbench.identity(frame, settings, selection, answer, identity))
-            followed = {"pick": pick, "found": found}
-            tree = {**followed, **answer_tree(answer), "beside": list(other_answers(others))}
+            followed = {"pick": pick, "found": found, "beside": list(other_answers(others))}
+            tree = {"type": "answer", **head, **answer_tree(answer), **followed}
             return selection, self._source.look(frame, settings), answer, tree
 
         answered = await self._in_turn(number, work, settings)
         if isinstance(answered, dict):
-            await self._send({**answered, **head})
+            await self._send(answered)
             return
         selection, result, answer, tree = answered
-        await self._send({"type": "answer", **head, **tree})
+        await self._send(tree)
 
         async def follow_up() -> None:
             await self._in_turn(number, lambda: self._source.mark(result, answer, self._overlay))
@@ -268,8 +274,10 @@ class PageConnection:
                 number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
             )
             if hints is not None:
-                asked = str(message.get("pick", tree["pick"]))
-                await self._send({"type": "hints", **head, "row_pick": asked, **hints_dict(hints)})
+                asked, changes = message.get("pick", tree["pick"]), answer_tree(hints)["hints"]
+                await self._send(
+                    {"type": "hints", **head, "row_pick": asked, "hints": changes, **row_remark(hints)}
+                )
 
         async def follow_robot() -> None:
             robot = await asyncio.to_thread(self._followed, number, result, answer)
@@ -278,7 +286,7 @@ class PageConnection:
 
         await asyncio.gather(follow_up(), follow_robot())
 
-    def _followed(self, number: int, result: FrameResult, answer: Answer) -> dict[str, Any] | None:
+    def _followed(self, number: int, result: FrameResult, answer: Answer) -> RobotSteps | None:
         """Return what the robot's own nodes did with an object. None: nothing is to be shown."""
         from bevviz.why.log import focus_point
 
@@ -294,39 +302,36 @@ class PageConnection:
             return None
         return followed.page_form()
 
-    def _selected(self, message: Message, frame: int, settings: Settings) -> Selection | None:
+    def _selected(self, message: types.Ask, frame: int, settings: Settings) -> Selection | None:
         """Return the selection of a question: named by its text, or by a click in the viewer."""
         from bevviz.why.selection import Selection
 
         if "pick" in message:
-            return Selection.parse(str(message["pick"]))
-        instance = message.get("instance")
-        row = None if instance is None else int(instance)
-        position: Sequence[float]
-        position = [float(value) for value in message.get("position") or () if value is not None]
+            return Selection.parse(message["pick"])
+        position: Sequence[float] = [one for one in message.get("position") or () if one is not None]
         if self._overlay is not None and position:
-            stamp, view = round(float(message["time"])), str(message.get("view", ""))
+            stamp, view = round(message["time"]), message.get("view", "")
             position = self._source.position(self._overlay, stamp, view, position)
-        return self._source.select(frame, settings, str(message["entity"]), row, position)
+        return self._source.select(frame, settings, message["entity"], message.get("instance"), position)
 
-    async def _try(self, number: int, message: Message) -> None:
+    async def _try(self, message: types.Try) -> None:
         from bevviz.workbench.page_messages import controls
 
         self._stop_try()
-        overlay, workbench, settings = self._overlay, self._workbench, _settings(message)
+        overlay, workbench, settings = self._overlay, self._workbench, message.get("set", ())
         attempt = None if overlay is None else overlay.attempt()
-        self._trying = number
+        number = self._trying = message["id"]
         try:
             frame, identity = await self._frame(message), _identity(message)
-            effects = await self._in_turn(
+            effects: types.TriedEffects = await self._in_turn(
                 number, lambda: workbench.try_values(frame, settings, identity, attempt), settings
             )
         finally:
             if self._trying == number:
                 self._trying = 0
         pieces = 0 if overlay is None else len(overlay.buffer)
-        head = {"id": number, "frame": frame, "set": list(settings), "pieces": pieces}
-        await self._send({"type": "tried", **head, **effects})
+        head: types.Reply = {"id": number, "frame": frame, "set": settings}
+        await self._send({"type": "tried", **head, "pieces": pieces, **effects})
         new_controls = controls(self._source.configured(settings), self._opened)
         if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
             self._controls = new_controls
@@ -343,48 +348,49 @@ class PageConnection:
             self._tries.shutdown(wait=False)
             self._tries = ThreadPoolExecutor(1, "tries")
 
-    async def _settle(self, number: int, message: Message) -> None:
+    async def _settle(self, message: types.Settle) -> None:
         """Compute the result of the frame that the page has stopped at, before a question about it comes."""
-        frame, settings = await self._frame(message), _settings(message)
-        await self._in_turn(number, lambda: self._source.look(frame, settings), settings, idle=True)
+        frame, settings = await self._frame(message), message.get("set", ())
+        await self._in_turn(message["id"], lambda: self._source.look(frame, settings), settings, idle=True)
 
-    async def _remark_rows(self, number: int, message: Message) -> None:
+    async def _remark_rows(self, message: types.Remarks) -> None:
         """Send the remarks on the first rows of the page's list, one by one, behind all questions."""
-        self._rows = [(int(frame), str(pick)) for frame, pick in message["rows"]]
+        self._rows = message["rows"]
         if self._remarking:
             return
         self._remarking = True
         try:
             while self._rows:
-                frame, pick = self._rows.pop(0)
-                remark = await asyncio.to_thread(self._remark, frame, pick)
-                await self._send({"type": "remark", "frame": frame, "pick": pick, **remark})
+                row = self._rows.pop(0)
+                remark = await asyncio.to_thread(self._remark, row)
+                await self._send({"type": "remark", **row, **remark})
         finally:
             self._remarking = False
 
-    def _remark(self, frame: int, pick: str) -> dict[str, str]:
+    def _remark(self, row: types.Row) -> types.RowRemark:
         """Return the remark on a row. The next one waits as long as this one took."""
-        from bevviz.workbench.page_messages import remark_dict
+        from bevviz.workbench.page_messages import row_remark
 
         self._source.wait_for_quiet()
         start = time.monotonic()
         try:
-            remark = remark_dict(self._source.remark(frame, pick))
+            remark = row_remark(self._source.remark(row["frame"], row["pick"]))
         except UserError:  # The list has changed meanwhile.
             remark = {"remark": "", "chip": ""}
         time.sleep(min(time.monotonic() - start, 1.0))
         return remark
 
-    async def _drive(self, number: int, message: Message) -> None:
+    async def _drive(self, message: types.RunDrive) -> None:
         """Run the drive with other values."""
-        settings, span = _settings(message), _span(message)
-        await asyncio.to_thread(self._workbench.tools.trials.begin, settings, self._name, span)
+        await asyncio.to_thread(
+            self._workbench.tools.trials.begin, message["set"], self._name, _span(message.get("span"))
+        )
 
-    async def _fix(self, number: int, message: Message) -> None:
+    async def _fix(self, message: types.FindFix) -> None:
         """Search values that repair the drive."""
         self._workbench.tools.fix.begin(self._name)
 
-    async def _cancel(self, number: int, message: Message) -> None:
+    async def _cancel(self, message: types.Cancel) -> None:
         if message["what"] == "try":
             self._stop_try()
             return
@@ -395,64 +401,59 @@ class PageConnection:
             tools = workbench.tools
             (tools.fix if message["what"] == "fix" else tools.trials).cancel(self._name)
 
-    async def _report(self, number: int, message: Message) -> None:
-        reports = self._workbench.reports
-        frame, settings, text = await self._frame(message), _settings(message), str(message["text"])
-        before, after = float(message["before"]), float(message["after"])
-        asked = frame, settings, before, after, text, _identity(message), self._name
-        await self._in_turn(number, lambda: reports.begin(*asked), settings)
+    async def _report(self, message: types.MakeReport) -> None:
+        reports, settings = self._workbench.reports, message.get("set", ())
+        range_ = message["before"], message["after"]
+        asked = await self._frame(message), settings, *range_, message["text"], _identity(message), self._name
+        await self._in_turn(message["id"], lambda: reports.begin(*asked), settings)
 
-    async def _note(self, number: int, message: Message) -> None:
+    async def _note(self, message: types.AddNote) -> None:
         file = self._workbench.tools.notes.path.name
-        frame, text, identity = await self._frame(message), str(message["text"]), _identity(message)
+        number, text, span = message["id"], message["text"], _span(message.get("span"))
+        frame, identity = await self._frame(message), _identity(message)
         about = await self._in_turn(
-            number, lambda: self._workbench.note(frame, text, identity, self._overlay, _span(message))
+            number, lambda: self._workbench.note(frame, text, identity, self._overlay, span)
         )
-        said = f"Noted about {about}{'' if _span(message) else f' in frame {frame}'}."
+        said = f"Noted about {about}{'' if span else f' in frame {frame}'}."
         await self._send({"type": "noted", "id": number, "file": file, "text": said})
 
-    async def _unnote(self, number: int, message: Message) -> None:
-        stamp, text = int(message["stamp"]), str(message["text"])
-        await self._in_turn(number, lambda: self._workbench.remove_note(stamp, text))
+    async def _unnote(self, message: types.RemoveNote) -> None:
+        stamp, text = int(message["stamp"]), message["text"]
+        await self._in_turn(message["id"], lambda: self._workbench.remove_note(stamp, text))
 
-    async def _handle_finding(self, number: int, message: Message) -> None:
+    async def _handle_finding(self, message: types.Handle) -> None:
         """Keep that a finding is done or ignored."""
         from bevviz.workbench.page_messages import handled_finding
 
         finding = handled_finding(message)
-        await self._in_turn(number, lambda: self._workbench.handle(finding))
+        await self._in_turn(message["id"], lambda: self._workbench.handle(finding))
 
-    def _reply(self, command: Callable[[Message], dict[str, Any]], message: Message) -> dict[str, Any]:
+    def _reply(self, command: Callable[[Any], types.RobotReply], message: object) -> types.RobotReply:
         """Return the reply of the source to one of its commands."""
         try:
             return command(message)
         except UserError as error:
             return {"type": "said", "text": str(error), "wrong": True}
 
-    async def _shown(self, number: int, message: Message) -> None:
+    async def _shown(self, message: types.Shown) -> None:
         """Let the run continue: the page has drawn its first frame."""
         self._source.go_on()
 
-    async def _frame(self, message: Message) -> int:
+    async def _frame(self, message: types.AboutFrame | types.Origin) -> int:
         """Return the number of the frame that the page shows. The run may not have reached it yet."""
-        return await asyncio.to_thread(self._source.number_at, round(float(message["time"])))
+        return await asyncio.to_thread(self._source.number_at, round(message["time"]))
 
 
-def _settings(message: Message) -> Settings:
-    return tuple(str(setting) for setting in message.get("set") or ())
+def _span(span: types.Span | None) -> tuple[int, int] | None:
+    """Return the first and the last stamp of a span."""
+    return None if span is None else (int(span["first"]), int(span["last"]))
 
 
-def _span(message: Message) -> tuple[int, int] | None:
-    """Return the first and the last stamp of the span that a message names, if it names one."""
-    low_high = [int(stamp) for stamp in message.get("span") or ()]
-    return (low_high[0], low_high[1]) if low_high else None
-
-
-def _identity(message: Message) -> Identity | None:
+def _identity(message: types.AboutFrame) -> Identity | None:
     """Return the identity that a message names, if it names one."""
     from bevviz.why.identity import Identity
 
-    pick = str(message.get("pick", ""))
+    pick = message.get("pick", "")
     return Identity.parse(pick) if pick.startswith("{") else None
 
 

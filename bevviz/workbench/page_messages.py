@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer
 from bevviz.why.answer_results import AnswerResult
-from bevviz.workbench.growing_drive import Message
+from bevviz.workbench.page_types import Chip, Control, HandledEntry, NoteEntry, OtherObject, RowRemark
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 BESIDE = 6  # further answers that are listed
@@ -22,7 +21,7 @@ BESIDE = 6  # further answers that are listed
 # --- answers and notes -------------------------------------------------------------------------
 
 
-def other_answers(answers: Sequence[Answer]) -> Iterator[dict[str, Any]]:
+def other_answers(answers: Sequence[Answer]) -> Iterator[OtherObject]:
     """Yield the first other answers in brief, in the order of the explainer."""
     for answer in answers[:BESIDE]:
         if (selection := answer.selection) is not None:
@@ -39,32 +38,52 @@ def answer_tree(answer: Answer) -> dict[str, Any]:
     return json_tree(AnswerResult.of(answer))
 
 
-def hints_dict(answer: Answer) -> dict[str, Any]:
-    """Return the hints of an answer with hints, and the sentence about them."""
-    return {"hints": answer_tree(answer)["hints"], **remark_dict(answer)}
-
-
-def remark_dict(answer: Answer) -> dict[str, str]:
+def row_remark(answer: Answer) -> RowRemark:
     """Return the sentence about the hints of an answer with hints, and the same in two words for a row."""
-    chips = {"hint": answer.hints, "cannot tell": answer.likely, "tried in vain": answer.tried}
+    chips: dict[Chip, object] = {
+        "hint": answer.hints,
+        "cannot tell": answer.likely,
+        "tried in vain": answer.tried,
+    }
     return {"remark": answer.remark, "chip": next((chip for chip, known in chips.items() if known), "")}
 
 
-def note_dict(note: Note) -> dict[str, Any]:
-    """Return a note. Its times are text, as JavaScript numbers cannot hold them."""
-    return {**asdict(note), "stamp": str(note.stamp), "received": str(note.received), "end": str(note.end)}
+def note_entry(note: Note) -> NoteEntry:
+    """Return a note for the page."""
+    return {
+        "stamp": str(note.stamp),
+        "received": str(note.received),
+        "text": note.text,
+        "about": note.about,
+        "pick": note.pick,
+        "end": str(note.end),
+    }
 
 
-def handled_dict(finding: HandledFinding) -> dict[str, Any]:
-    """Return a finding that the user has dealt with. Its time is text."""
-    return {**asdict(finding), "stamp": str(finding.stamp)}
+def handled_entry(finding: HandledFinding) -> HandledEntry:
+    """Return a finding that the user has dealt with, for the page."""
+    return {
+        "stamp": str(finding.stamp),
+        "what": finding.what,
+        "name": finding.name,
+        "pick": finding.pick,
+        "distance": finding.distance,
+        "state": finding.state,
+        "text": finding.text,
+    }
 
 
-def handled_finding(message: Message) -> HandledFinding:
+def handled_finding(entry: HandledEntry) -> HandledFinding:
     """Return the finding that a message of the page says is done or ignored."""
-    what, name, pick, state, text = (str(message[key]) for key in ("what", "name", "pick", "state", "text"))
-    distance = None if message["distance"] is None else float(message["distance"])
-    return HandledFinding(int(message["stamp"]), what, name, pick, distance, state, text.strip())
+    return HandledFinding(
+        stamp=int(entry["stamp"]),
+        what=entry["what"],
+        name=entry["name"],
+        pick=entry["pick"],
+        distance=entry["distance"],
+        state=entry["state"],
+        text=entry["text"].strip(),
+    )
 
 
 def opened_values(config: Config) -> str:
@@ -77,7 +96,7 @@ def opened_values(config: Config) -> str:
 # --- parameter controls ------------------------------------------------------------------------
 
 
-def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any]]:
+def controls(config: Config, opened: Config | None = None) -> list[Control]:
     """Return one control, with unit, range, value and description, for each parameter of the stages.
 
     Args:
@@ -94,17 +113,19 @@ def controls(config: Config, opened: Config | None = None) -> list[dict[str, Any
     ]
 
 
-def _control(declared: Parameter, value: Any) -> dict[str, Any]:
+def _control(declared: Parameter, value: Any) -> Control:
     """Return the control of one parameter as JSON for the page."""
-    control: dict[str, Any] = {
+    control: Control = {
         "key": declared.key,
         "value": value,
         "unit": declared.unit,
         "about": declared.text,
         "kind": declared.kind,
     }
-    limits = {"low": declared.low, "high": declared.high}
-    control |= {name: limit for name, limit in limits.items() if limit is not None}
+    if declared.low is not None:
+        control["low"] = declared.low
+    if declared.high is not None:
+        control["high"] = declared.high
     if declared.choices and declared.kind in ("choice", "list"):
         control["choices"] = list(declared.choices)
     return control

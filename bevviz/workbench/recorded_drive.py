@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.thumbnails import Thumbnails
+
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import RunProgress
 
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
@@ -121,11 +124,11 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     # --- run -----------------------------------------------------------------------------------
 
-    def progress(self) -> dict[str, Any]:
+    def progress(self) -> RunProgress:
         """Return the progress of the run for the page."""
         overview = self._overview
         return {
-            "pass": "overview" if overview is not None else "again" if self._is_listed else "run",
+            "phase": "overview" if overview is not None else "again" if self._is_listed else "run",
             "done": self._done,
             "total": self.again.total if overview is None else overview.total,
             "over": self.over,

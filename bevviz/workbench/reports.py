@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from bevviz.bags.remote import beside
 from bevviz.bags.source import iso
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from bevviz.why import Answer
     from bevviz.why.identity import Identity
     from bevviz.workbench.growing_drive import GrowingDrive, Settings
+    from bevviz.workbench.page_types import ReportEntry
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
@@ -40,9 +41,10 @@ class ReportJob(Job):
     name: str = ""
     files: list[Path] = field(default_factory=list)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> ReportEntry:
         """Return the report as JSON for the page."""
-        return Job.as_dict(self) | {
+        return {
+            **Job.as_dict(self),
             "name": self.name,
             "files": [
                 {"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._existing_files()

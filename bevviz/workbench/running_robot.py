@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import rerun as rr
 
@@ -33,12 +33,15 @@ from bevviz.why import Answer, Selection
 from bevviz.why.log import mark_answers
 from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, Message, Settings
+from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, Settings
 from bevviz.workbench.held_seconds import HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportedBag, ReportMaker
 from bevviz.workbench.session import WorkbenchSession
+
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import Held, Hold, ListHeld, Mark, RunProgress, Said, Snap
 
 KEPT = 4  # held frames that are kept
 BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame needs
@@ -97,7 +100,7 @@ class RunningRobot(GrowingDrive):
             while self._bags:
                 self._bags.pop().close()
 
-    def progress(self) -> dict[str, Any]:
+    def progress(self) -> RunProgress:
         """Return the progress of the run for the page."""
         status = self.live.status
         drops = ", ".join(f"{count} {where}" for where, count in status.drops.items() if count)
@@ -331,12 +334,12 @@ class RunningRobot(GrowingDrive):
 
     # --- commands of the page ------------------------------------------------------------------
 
-    def _hold(self, message: Message) -> dict[str, Any]:
+    def _hold(self, message: Hold) -> Held:
         """Hold the shown frame."""
-        frame = self.hold(round(float(message["time"]))).frame
+        frame = self.hold(round(message["time"])).frame
         return {"type": "held", "frame": frame.index, "stamp": str(frame.stamp)}
 
-    def _list(self, message: Message) -> dict[str, Any]:
+    def _list(self, message: ListHeld) -> Said:
         """Begin to list the findings of the held seconds, frame by frame, at the lowest priority."""
         self._end_list()
         numbers = [number for _, number in self.frame_times()]
@@ -370,14 +373,14 @@ class RunningRobot(GrowingDrive):
             self._listing.join()
             self._listing = None
 
-    def _snap(self, message: Message) -> dict[str, Any]:
+    def _snap(self, message: Snap) -> Said:
         """Save the flight recorder."""
         return {"type": "said", "text": f"saved in {self.live.save()}"}
 
-    def _mark(self, message: Message) -> dict[str, Any]:
+    def _mark(self, message: Mark) -> Said:
         """Mark the shown frame, as a message on the robot's topic of marks does, and on the terminal."""
-        number = self.number_at(round(float(message["time"])))
-        text = str(message.get("text", "")).strip() or "look here"
+        number = self.number_at(round(message["time"]))
+        text = message["text"].strip() or "look here"
         self.live.mark(f"{text} (frame {number})")
         text = f"mark at frame {number}: {text}"
         self.live.notes.info(text)

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bevviz.drive import Drive
 from bevviz.errors import UserError
@@ -28,6 +28,9 @@ from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
 from bevviz.workbench.trials import TrialRunner, trial_effects
+
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import Progress, TriedEffects
 
 ASKED = 8  # answers that are kept for reports
 
@@ -113,9 +116,15 @@ class WorkbenchSession(Closable):
             self._reports.end()
         self.source.close()
 
-    def progress(self) -> dict[str, Any]:
+    def progress(self) -> Progress:
         """Return the progress message for the page."""
-        message = {"type": "progress", **self.source.progress(), "reports": [], "trials": []}
+        message: Progress = {
+            "type": "progress",
+            **self.source.progress(),
+            "reports": [],
+            "trials": [],
+            "fix": None,
+        }
         if self._reports is not None:
             message["reports"] = [report.as_dict() for report in self._reports.jobs]
         if self._tools is not None:
@@ -265,7 +274,7 @@ class WorkbenchSession(Closable):
         settings: Settings,
         identity: Identity | None = None,
         attempt: Attempt | None = None,
-    ) -> dict[str, Any]:
+    ) -> TriedEffects:
         """Show a frame with other values, and return their effects.
 
         Args:

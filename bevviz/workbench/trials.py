@@ -6,14 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError
-from bevviz.evaluate import ObjectScore, Truth
-from bevviz.evaluate.differences import BeforeAfter, before_after
+from bevviz.evaluate import ObjectScore, Truth, differences
 from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
@@ -32,6 +31,9 @@ from bevviz.workbench.growing_drive import Settings
 from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.overview import NumberedFrames
 from bevviz.workbench.recorded_drive import RecordedDrive
+
+if TYPE_CHECKING:
+    from bevviz.workbench.page_types import BeforeAfter, SideEffects, TrialEntry, TriedEffects
 
 RUNS = 6  # trials that are kept
 
@@ -70,16 +72,17 @@ class Trial(Job):
         """Name by which a page requests its recording."""
         return f"run-{self.number}"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> TrialEntry:
         """Return the trial as JSON for the page."""
-        return Job.as_dict(self) | {
+        before, after = (rounded(score.f1) for score in self.scores)
+        strip = [] if self.going else self.strip
+        return {
+            **Job.as_dict(self),
             "lane": self.lane,
-            "span": [str(stamp) for stamp in self.span or ()],
+            "span": None if self.span is None else {"first": str(self.span[0]), "last": str(self.span[1])},
             "counts": {key: number for key, number in self.counts.items() if number},
-            "better": sum(good > bad for _, good, bad in self.strip),
-            "worse": sum(bad > good for _, good, bad in self.strip),
-            "f1": [rounded(score.f1) for score in self.scores] if self.known else None,
-            "strip": [] if self.going else [[str(stamp), good, bad] for stamp, good, bad in self.strip],
+            "f1": {"before": before, "after": after} if self.known else None,
+            "strip": [{"stamp": str(stamp), "better": good, "worse": bad} for stamp, good, bad in strip],
         }
 
 
@@ -151,7 +154,7 @@ class _TrialObserver(Observer[FrameResult]):
         explainer = drive.explainer(result)
         if not drive.recording.on_demand:  # Else a page tries the values on the frames that it shows.
             drive.recording.draw_tried(self._logger, explainer, trial.settings)
-        change = before_after(before, after, drive.truth(frame))
+        change = differences.before_after(before, after, drive.truth(frame))
         findings = list(difference_findings(explainer, change, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
         trial.counts["changed"] += change.changed
@@ -179,7 +182,7 @@ class _TrialObserver(Observer[FrameResult]):
 
 def difference_findings(
     explainer: FrameExplainer,
-    change: BeforeAfter,
+    change: differences.BeforeAfter,
     before: Objects | None,
     reasons: Mapping[tuple[int, str], str],
 ) -> Iterator[tuple[Finding, bool]]:
@@ -208,7 +211,7 @@ def difference_findings(
 
 def trial_effects(
     before: FrameResult, after: FrameResult, truth: Truth | None, truth_row: int = -1
-) -> dict[str, Any]:
+) -> TriedEffects:
     """Return the effects of other values on one frame, for the page.
 
     Args:
@@ -219,29 +222,28 @@ def trial_effects(
     """
     subjects = FrameIndex(after, _names(before)).truth
     side_effects = effects(before.objects, after.objects, subjects, truth_row)
-    message: dict[str, Any] = {
+    message: TriedEffects = {
         "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},
         "effects": effects_dict(side_effects),
         "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }
     if truth is not None:
-        message["f1"] = [_f1(result, truth) for result in (before, after)]
+        message["f1"] = {"before": _f1(before, truth), "after": _f1(after, truth)}
     return message
 
 
-def _opinions(before: FrameResult, after: FrameResult) -> dict[str, list[int | None]]:
+def _opinions(before: FrameResult, after: FrameResult) -> dict[str, BeforeAfter]:
     """Return the counts of opinions that changed, before and after. None: the objects are our own."""
     counts_before, counts_after = count_opinions(before), count_opinions(after)
-    counts = {opinion: [counts_before.get(opinion), counts_after.get(opinion)] for opinion in OPINIONS}
     return {
-        opinion.replace("_", " "): [old, new]
-        for opinion, (old, new) in counts.items()
-        if (old or 0) != (new or 0)
+        opinion.replace("_", " "): {"before": counts_before.get(opinion), "after": counts_after.get(opinion)}
+        for opinion in OPINIONS
+        if counts_before.get(opinion, 0) != counts_after.get(opinion, 0)
     }
 
 
-def effects_dict(side_effects: Effects) -> dict[str, Any]:
+def effects_dict(side_effects: Effects) -> SideEffects:
     """Return effects as JSON for the page, in the same form as those of a hint."""
     return {
         "fixed": list(side_effects.fixed),

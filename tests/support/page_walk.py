@@ -159,7 +159,7 @@ class Oracle:
         made = trial_effects(before, after, truth_of(frame, frame.truth))
         changed = made["effects"].pop("changed")
         words = {name for names in made["effects"].values() for name in names}
-        words |= {" → ".join("–" if one is None else f"{one:g}" for one in made["f1"])}  # noqa: RUF001
+        words |= {" → ".join("–" if one is None else f"{one:g}" for one in made["f1"].values())}  # noqa: RUF001
         return sorted(words | ({f"changes {changed}"} if changed else set()), key=len, reverse=True)
 
     def owner(self, asked: Asked) -> str:

@@ -24,6 +24,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_source
+from bevviz.workbench.page_types import TO_PAGE
 from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE, until
 
@@ -259,6 +260,7 @@ class Talk:
         """Return the next message of a kind that meets the condition, or the next error."""
         while True:
             message: dict[str, Any] = json.loads(self._channel.recv(timeout=PATIENCE))
+            TO_PAGE.validate_python(message)
             if message["type"] == "entries":
                 for number in message["gone"]:
                     del self.entries[number]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F64, Frame, LabelledBoxes3D
 from bevviz.sync.transform_tree import TransformBuffer, TransformError
 from bevviz.why.answer_results import RobotObjectResult, RobotStepResult
-from bevviz.why.robot_questions import object_topics
+from bevviz.why.robot_questions import RobotSteps, object_topics
 
 AROUND = 10 * SECOND  # nanoseconds before and after the frame that the chain is inferred from
 LEAST = 4  # messages of a topic that the chain needs
@@ -95,7 +94,7 @@ class FollowedObject:
             steps=[RobotStepResult(one.topic, one.parent, one.state, one.text) for one in self.outcomes],
         )
 
-    def page_form(self) -> dict[str, Any]:
+    def page_form(self) -> RobotSteps:
         """Return each step of the chain, with what it did with the object."""
         outcomes = {outcome.topic: outcome for outcome in self.outcomes}
         change = self.change

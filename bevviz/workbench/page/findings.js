@@ -46,7 +46,7 @@ export function notes(message) {
   for (const key of [...entries.keys()]) if (typeof key === "string") entries.delete(key);
   for (const one of message.notes) {
     const key = `${one.stamp} ${one.text}`;
-    const sights = [[null, one.stamp, null, one.pick, false, one.text]];
+    const sights = [{ frame: null, stamp: one.stamp, distance: null, pick: one.pick, tried: false, text: one.text, remark: "", in_way: false }];
     entries.set(key, { key, what: "note", name: one.about || (one.end === "0" ? "frame" : "span"), sights, note: one });
   }
   handled = message.findings;
@@ -54,11 +54,11 @@ export function notes(message) {
   draw();
 }
 
-// Show in the row of an object whether a change helps. A sight keeps the sentence after its own text, and the chip last.
+// Show in the row of an object whether a change helps.
 export function explain({ frame, pick, remark, chip }, tried = false) {
   for (const { sights } of entries.values()) {
-    const one = sights.find((sight) => sight[0] === frame && sight[3] === pick && sight[4] === tried);
-    if (one) [one[6], one[8]] = [remark || " ", chip];
+    const one = sights.find((other) => other.frame === frame && other.pick === pick && other.tried === tried);
+    if (one) Object.assign(one, { remark: remark || " ", chip });
   }
   draw();
 }
@@ -73,12 +73,12 @@ export function leave() {
 // --- drawing ------------------------------------------------------------------------------------
 
 const nearest = (entry) => entry.sights.reduce((best, one, row) => (away(one) < away(entry.sights[best]) ? row : best), 0);
-const here = (entry) => entry.sights.findIndex((one) => Math.abs(Number(one[1]) - Number(state.time)) < 2000);
+const here = (entry) => entry.sights.findIndex((one) => Math.abs(Number(one.stamp) - Number(state.time)) < 2000);
 const kindOf = (entry) => (entry.handled ? "handled" : entry.what);
 
 // A mark belongs to the finding that has its object at its frame.
 const marks = (entry) => (mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
-  one[1] === mark.stamp && one[3] === mark.pick && (one[2] === mark.distance || Math.abs(one[2] - mark.distance) < 0.5)));
+  one.stamp === mark.stamp && one.pick === mark.pick && (one.distance === mark.distance || Math.abs(one.distance - mark.distance) < 0.5)));
 
 let waiting = 0;
 export function draw() {
@@ -129,7 +129,7 @@ function replaceRows(items) {
 let requested = "";
 function requestRemarks() {
   const lacking = rows.slice(0, REMARKED).map((entry) => entry.sights[entry.best])
-    .filter((one) => one[3] && !one[4] && !one[6] && one[0] !== null).map((one) => [one[0], one[3]]);
+    .filter((one) => one.pick && !one.tried && !one.remark && one.frame !== null).map(({ frame, pick }) => ({ frame, pick }));
   if (!lacking.length || JSON.stringify(lacking) === requested) return;
   requested = JSON.stringify(lacking);
   does.remarks?.(lacking);
@@ -157,7 +157,7 @@ function kinds(shown) {
 const isSpan = (entry) => Boolean(entry.note) && entry.note.end !== "0";
 
 function frames(entry) {
-  const numbers = entry.sights.map((one) => one[0]);
+  const numbers = entry.sights.map((one) => one.frame);
   if (numbers.length < 2) return "";
   const [low, high] = [Math.min(...numbers), Math.max(...numbers)];
   return high - low + 1 === numbers.length ? `frames ${low}–${high}` : `${numbers.length} frames, ${low}–${high}`;
@@ -170,13 +170,13 @@ function drawn(entry) {
   const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
   const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
   dots.title = reasons.join("; ") || "no reason to hurry";
-  const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one[2] === null ? "" : `${one[2]} m`),
-    element("span", "reason", one[5])];
-  const button = element("button", "", "", dots, element("span", "time", isSpan(entry) ? spanText([one[1], entry.note.end]) : at(one[1], one[0])),
+  const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one.distance === null ? "" : `${one.distance} m`),
+    element("span", "reason", one.text)];
+  const button = element("button", "", "", dots, element("span", "time", isSpan(entry) ? spanText({ first: one.stamp, last: entry.note.end }) : at(one.stamp, one.frame)),
     element("span", entry.what.replace(" ", "-"), entry.what), name, away, reason);
-  reason.title = state.meanings[one[5]] ?? one[5];
-  button.title = [frames(entry), one[6]].filter((more) => more?.trim()).join("\n");
-  if (one[8]) button.append(element("span", `chip ${one[8].replaceAll(" ", "-")}`, one[8]));
+  reason.title = state.meanings[one.text] ?? one.text;
+  button.title = [frames(entry), one.remark].filter((more) => more?.trim()).join("\n");
+  if (one.chip) button.append(element("span", `chip ${one.chip.replaceAll(" ", "-")}`, one.chip));
   button.setAttribute("aria-current", isChosen);
   button.onclick = () => choose(entry, isChosen ? sight + 1 : entry.best);
   const item = element("li", entry.handled ? "handled" : "", "", button);
@@ -185,7 +185,7 @@ function drawn(entry) {
   else if (entry.handled) {
     const { state: became, text: why } = entry.handled;
     item.append(element("span", "faint", `${became}${why ? `: ${why}` : ""}`), small("reopen", "list it again", () => mark(entry, "")));
-  } else if (isChosen && does.handle && (hasCause(entry) || entry.what === "anomaly") && !one[4]) {
+  } else if (isChosen && does.handle && (hasCause(entry) || entry.what === "anomaly") && !one.tried) {
     const why = element("input", "", "");
     why.placeholder = "why (optional)";
     why.setAttribute("aria-label", "why it is done or ignored");
@@ -205,7 +205,7 @@ function small(text, meaning, action) {
 
 function mark(entry, became, text = "") {
   const one = entry.sights[entry.best];
-  const known = entry.handled ?? { stamp: one[1], what: entry.what, name: entry.name, pick: one[3], distance: one[2] };
+  const known = entry.handled ?? { stamp: one.stamp, what: entry.what, name: entry.name, pick: one.pick, distance: one.distance };
   does.handle({ ...known, state: became, text });
 }
 
@@ -226,12 +226,12 @@ function begin() {
   if (hasBegun || !does.remarks || state.pick || state.time === null) return;
   for (const entry of rows.slice(0, REMARKED)) {
     const one = entry.sights[entry.best];
-    if (one[8] === "hint") {
+    if (one.chip === "hint") {
       hasBegun = true;
       choose(entry, entry.best, false);
       return;
     }
-    if (one[3] && !one[4] && !one[6]) return;
+    if (one.pick && !one.tried && !one.remark) return;
   }
 }
 
@@ -246,18 +246,18 @@ export function choose(entry, which, scrolls = true) {
   current = entry.key;
   isSubject = true;
   sight = which % entry.sights.length;
-  const [, stamp, , pick, tried] = entry.sights[sight];
+  const { stamp, pick, tried } = entry.sights[sight];
   redraw();
   showRow(scrolls);
   if (tried || entry.what.endsWith("gone")) does.tryOut(tried);
-  const from = { time: Number(stamp), set: tried ? does.tryOut.settings() : [] }; // The pick is valid there.
+  const origin = { time: Number(stamp), set: tried ? does.tryOut.settings() : [] }; // The pick is valid there.
   remember(Boolean(state.pick));
-  [state.pick, state.from] = [pick, from];
+  [state.pick, state.origin] = [pick, origin];
   seek(stamp);
   showSide();
   remember();
-  if (isSpan(entry)) does.markSpan([stamp, entry.note.end]);
-  if (pick) does.ask({ pick, from });
+  if (isSpan(entry)) does.markSpan({ first: stamp, last: entry.note.end });
+  if (pick) does.ask({ pick, origin });
   else does.forget();
 }
 

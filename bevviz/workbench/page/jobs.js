@@ -1,6 +1,6 @@
 // Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
-import { $, at, element, inSpan, spanText, state } from "./page_state.js";
+import { $, at, beforeAfter, element, inSpan, spanText, state } from "./page_state.js";
 import { isTried, seek } from "./viewer.js";
 import { follow, isOthers, send } from "./connection.js";
 
@@ -34,19 +34,19 @@ export function start(using) {
         return;
       }
       const from = (stamp) => Math.abs(Number(stamp) - Number(state.time)) / 1e9;
-      [range.before, range.after] = state.span.map(from);
+      [range.before, range.after] = [from(state.span.first), from(state.span.last)];
     }
     const set = isTried() ? state.set : []; // settings of the shown side
     const about = { time: Number(state.time), set, pick: state.pick };
     send({ type: "report", ...about, text: $("words").value, ...range }, say("noted"));
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value,
-    span: state.span ?? [] }, say("noted"));
+    span: state.span }, say("noted"));
   $("strip").onclick = (event) => {
     const trial = shownRun();
     if (!trial?.strip.length) return;
     const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
-    seek(trial.strip[Math.min(row, trial.strip.length - 1)][0]);
+    seek(trial.strip[Math.min(row, trial.strip.length - 1)].stamp);
   };
 }
 
@@ -63,7 +63,7 @@ export function progress(message) {
   state.over = message.over;
   const part = `${message.done} of ${message.total} frames`;
   const run = { overview: `Overview: ${part}, all over the drive; then every frame in order`,
-    again: `The list is complete, from an earlier run; ${part} run again for tracks and plots` }[message.pass] ?? `${part} run in order`;
+    again: `The list is complete, from an earlier run; ${part} run again for tracks and plots` }[message.phase] ?? `${part} run in order`;
   const text = message.over ? `${message.done} frames` : run;
   $("run").textContent = [text, message.error, ...message.warnings].filter(Boolean).join(" · ");
   $("run").className = message.error ? "alarm" : "faint";
@@ -105,12 +105,12 @@ function row(values, kind = "td") {
 }
 
 // The values of a run, and the span that it was run over.
-const named = (run) => [run.settings.join(", "), ...(run.span.length ? [`of ${spanText(run.span)}`] : [])].join("; ");
+const named = (run) => [run.settings.join(", "), ...(run.span ? [`of ${spanText(run.span)}`] : [])].join("; ");
 
 function runRow(run) {
   const button = element("button", "", named(run));
   button.onclick = () => use(run.settings);
-  const f1 = run.f1 ? run.f1.map((one) => one ?? "–").join(" → ") : "–";
+  const f1 = run.f1 ? beforeAfter(run.f1) : "–";
   const ended = { over: "", cancelled: " (cancelled)", failed: " (failed)" }[run.state] ?? " ...";
   const made = row([isShown(run) ? "▸" : "", button, f1 + ended, ...kindsOf(trials).map((kind) => String(run.counts[kind] ?? 0))]);
   made.setAttribute("aria-current", isShown(run));
@@ -122,7 +122,7 @@ const kindsOf = (runs) => KINDS.filter((kind) => runs.some((run) => run.counts[k
 
 function summary(message) {
   const parts = [];
-  if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
+  if (message.f1) parts.push(`F1 ${beforeAfter(message.f1)}`);
   const frames = message.state === "running" ? `${message.done} of ${message.total} frames` : `${message.done} frames`;
   parts.push(frames);
   for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
@@ -140,20 +140,20 @@ function strip(frames) {
   canvas.width = width;
   canvas.height = height;
   const draw = canvas.getContext("2d");
-  const most = Math.max(1, ...frames.map(([, good, bad]) => Math.max(good, bad)));
+  const most = Math.max(1, ...frames.map(({ better, worse }) => Math.max(better, worse)));
   const each = width / frames.length;
   const style = getComputedStyle(document.documentElement);
-  for (const [row, [, good, bad]] of frames.entries()) {
+  for (const [row, { better, worse }] of frames.entries()) {
     const side = (number) => (number / most) * (height / 2 - 1);
     draw.fillStyle = style.getPropertyValue("--good");
-    draw.fillRect(row * each, height / 2 - side(good), Math.max(1, each - 1), side(good));
+    draw.fillRect(row * each, height / 2 - side(better), Math.max(1, each - 1), side(better));
     draw.fillStyle = style.getPropertyValue("--mark");
-    draw.fillRect(row * each, height / 2, Math.max(1, each - 1), side(bad));
+    draw.fillRect(row * each, height / 2, Math.max(1, each - 1), side(worse));
   }
   draw.fillStyle = style.getPropertyValue("--line");
   draw.fillRect(0, height / 2, width, 1);
-  const worst = frames.reduce((a, b) => (b[2] - b[1] > a[2] - a[1] ? b : a));
-  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst[0])}`;
+  const worst = frames.reduce((a, b) => (b.worse - b.better > a.worse - a.better ? b : a));
+  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst.stamp)}`;
 }
 
 // --- search of a fix ----------------------------------------------------------------------------

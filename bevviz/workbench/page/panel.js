@@ -3,7 +3,7 @@
 import { connect, isConnected, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
-import { $, addFrames, asked, element, frameTimes, neighbour, remember, seconds, shownFrame, spanText, state, stated } from "./page_state.js";
+import { $, addFrames, asked, beforeAfter, element, frameTimes, neighbour, remember, seconds, shownFrame, spanText, state, stated } from "./page_state.js";
 import * as parameters from "./parameters.js";
 import * as playback from "./playback.js";
 import * as share from "./share.js";
@@ -56,14 +56,14 @@ function ask(what) {
 function askOther(what) {
   list.leave();
   remember(Boolean(state.pick));
-  if ("pick" in what) [state.pick, state.from] = [what.pick, what.from];
+  if ("pick" in what) [state.pick, state.origin] = [what.pick, what.origin];
   ask(what);
 }
 
 // Row numbers differ between frames and values. The address of an answer's object is valid in all of them.
 // Until it has come, the row number goes with its frame and values.
 const askAgain = () => {
-  if (state.pick) ask({ pick: state.pick, ...(state.pick.startsWith("{") || !state.from ? {} : { from: state.from }) });
+  if (state.pick) ask({ pick: state.pick, ...(state.pick.startsWith("{") || !state.origin ? {} : { origin: state.origin }) });
 };
 
 // Show a sentence in place of an answer. Nothing of the former answer stays.
@@ -132,11 +132,11 @@ function answer(message) {
   $("robot-chain").replaceChildren();
   $("robot-title").hidden = true;
   $("further").replaceChildren(...further(message).map((text) => element("p", "", text)));
-  const from = { time: Number(state.time), set: message.set };
+  const origin = { time: Number(state.time), set: message.set };
   $("beside").replaceChildren(...message.beside.map((other) => {
     const button = element("button", other.reported ? "" : "missed", `${other.name}: ${other.reason}`);
     button.title = state.meanings[other.reason] ?? "";
-    button.onclick = () => askOther({ pick: other.pick, from });
+    button.onclick = () => askOther({ pick: other.pick, origin });
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
@@ -314,9 +314,9 @@ function tried(message) {
   $("effect").dataset.took = took();
   $("effect").dataset.frame = message.frame;
   withPieces(message.pieces, () => drawnThen(() => { $("effect").dataset.drawn = took(); }));
-  const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${both.map((one) => one ?? "–").join(" → ")}`);
+  const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${beforeAfter(both)}`);
   const parts = [[effects(message.effects), ...opinions].filter(Boolean).join("; ") || "changes nothing that is reported"];
-  if (message.f1) parts.push(`F1 ${message.f1.map((one) => one ?? "–").join(" → ")}`);
+  if (message.f1) parts.push(`F1 ${beforeAfter(message.f1)}`);
   parts.push(...message.failures);
   $("effect").textContent = `Frame ${message.frame}: ${parts.join("; ")}.`;
   freshness();
@@ -359,9 +359,12 @@ function open({ stamp, first, demand }) {
   list.draw(); // An earlier run's list may be there already, without the time that seconds count from.
   if (!same) return;
   state.set = stated.getAll("set");
-  if (stated.get("span")) markSpan(stated.get("span").split("-"));
+  if (stated.get("span")) {
+    const [first, last] = stated.get("span").split("-");
+    markSpan({ first, last });
+  }
   state.pick = stated.get("pick") ?? "";
-  state.from = { time: Number(state.opening), set: state.set };
+  state.origin = { time: Number(state.opening), set: state.set };
   if (state.set.length) {
     state.undo.push([]);
     changed();
@@ -438,7 +441,7 @@ window.addEventListener("popstate", (event) => {
   const parts = new URLSearchParams(location.hash.slice(1));
   list.leave();
   const set = parts.getAll("set");
-  [state.pick, state.from] = [parts.get("pick") ?? "", { time: Number(parts.get("at")), set }];
+  [state.pick, state.origin] = [parts.get("pick") ?? "", { time: Number(parts.get("at")), set }];
   state.flipped = parts.get("side") === "before";
   seek(parts.get("at"));
   if (set.join() !== state.set.join()) {
@@ -482,10 +485,10 @@ function markSpan(span) {
 function markHere(isEnd) {
   const times = frameTimes();
   if (kind === "live" || times.length < 2) return;
-  const [low, high] = state.span ?? [frameTimes.stamp(0), frameTimes.stamp(times.length - 1)];
+  const { first, last } = state.span ?? { first: frameTimes.stamp(0), last: frameTimes.stamp(times.length - 1) };
   const here = frameTimes.stamp(Math.max(0, times.findLastIndex((one) => one <= Number(state.time) + 1000)));
-  if (isEnd) markSpan([Number(low) <= Number(here) ? low : here, here]);
-  else markSpan([here, Number(high) >= Number(here) ? high : here]);
+  if (isEnd) markSpan({ first: Number(first) <= Number(here) ? first : here, last: here });
+  else markSpan({ first: here, last: Number(last) >= Number(here) ? last : here });
 }
 
 const actions = {

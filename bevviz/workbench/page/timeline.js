@@ -37,14 +37,14 @@ export function start(choosing, marking) {
   };
   $("events").onclick = (event) => { if (!dragged?.marks) clicked(event); };
   $("events").onkeydown = (event) => {
-    const here = marks.filter((mark) => Math.abs(Number(mark.entry.sights[mark.row][1]) - Number(state.time)) < 2000);
+    const here = marks.filter((mark) => Math.abs(Number(mark.entry.sights[mark.row].stamp) - Number(state.time)) < 2000);
     if (event.key === "Enter" && here.length) choose(here[0].entry, here[0].row);
   };
   $("events").onpointermove = (event) => {
     if (event.buttons && dragged && (dragged.marks || Math.abs(event.offsetX - dragged.x) > DRAG)) {
       dragged.marks = true;
       const [low, high] = [dragged.row, rowAt(event)].sort((a, b) => a - b);
-      markSpan([frameTimes.stamp(low), frameTimes.stamp(high)]);
+      markSpan({ first: frameTimes.stamp(low), last: frameTimes.stamp(high) });
       return;
     }
     const mark = markAt(event);
@@ -99,7 +99,7 @@ export function draw() {
   pen.drawImage(picture, 0, 0);
   pen.scale(scale, scale);
   if (state.span) {
-    const [low, high] = state.span.map(x);
+    const [low, high] = [state.span.first, state.span.last].map(x);
     pen.fillStyle = "rgb(255 255 255 / 18%)";
     pen.fillRect(low - each / 2, 0, high - low + each, height);
   }
@@ -138,10 +138,10 @@ function bars(lane, x) {
   const all = new Map();
   for (const entry of lane.entries) {
     for (const [row, one] of entry.sights.entries()) {
-      const at = x(one[1]);
+      const at = x(one.stamp);
       const bar = all.get(Math.round(at)) ?? { x: at, count: 0, distance: null };
       bar.count += 1;
-      if (bar.count === 1 || (one[2] ?? Infinity) < (bar.distance ?? Infinity)) Object.assign(bar, { entry, row, distance: one[2] });
+      if (bar.count === 1 || (one.distance ?? Infinity) < (bar.distance ?? Infinity)) Object.assign(bar, { entry, row, distance: one.distance });
       all.set(Math.round(at), bar);
     }
   }
@@ -155,7 +155,7 @@ function shade(distance) {
 }
 
 function told({ entry, row, count }) {
-  const when = at(entry.sights[row][1]);
+  const when = at(entry.sights[row].stamp);
   return count === 1 ? `${entry.what} ${entry.name} at ${when}` : `${count} at ${when}; the nearest: ${entry.what} ${entry.name}`;
 }
 

@@ -10,18 +10,18 @@ const NEAR = 10; // metres
 const LONG = 0.5e9; // nanoseconds until it is seen again
 const SENSORS = ["sensor", "sync", "tf", "stage"]; // anomalies that concern everything
 
-export const away = (sight) => sight[2] ?? 99;
+export const away = (sight) => sight.distance ?? 99;
 export const hasCause = (entry) => entry.what !== "anomaly" && entry.what !== "note";
-export const cause = (entry) => (hasCause(entry) ? entry.sights[entry.best][5] || "unknown" : entry.what);
+export const cause = (entry) => (hasCause(entry) ? entry.sights[entry.best].text || "unknown" : entry.what);
 
 // Reasons that make a finding severe. Each counts once.
 export function severity(entry) {
   if (entry.what === "anomaly" && SENSORS.includes(entry.name)) return ["concerns everything that the sensors see"];
   if (!hasCause(entry)) return [];
-  const stamps = entry.sights.map((one) => Number(one[1]));
+  const stamps = entry.sights.map((one) => Number(one.stamp));
   const lasts = Math.max(...stamps) - Math.min(...stamps);
   const reasons = [];
-  if (entry.sights.some((one) => one[7])) reasons.push("in the way of the robot");
+  if (entry.sights.some((one) => one.in_way)) reasons.push("in the way of the robot");
   if (Math.min(...entry.sights.map(away)) <= NEAR) reasons.push(`nearer than ${NEAR} m`);
   if (lasts >= LONG) reasons.push(`lasts ${(lasts / 1e9).toFixed(1)} s`);
   return reasons;
@@ -30,7 +30,7 @@ export function severity(entry) {
 const level = (entry) => (entry.what === "anomaly" && severity(entry).length ? 3 : severity(entry).length);
 const order = (a, b) => Number(Boolean(a.handled)) - Number(Boolean(b.handled)) || level(b) - level(a)
   || RANK.get(a.what) - RANK.get(b.what) || away(a.sights[a.best]) - away(b.sights[b.best])
-  || Number(a.sights[0][1]) - Number(b.sights[0][1]);
+  || Number(a.sights[0].stamp) - Number(b.sights[0].stamp);
 
 // Sort by severity. With groups, the group of the severest finding comes first.
 export function sorted(entries) {
@@ -44,7 +44,7 @@ export function sorted(entries) {
 // The filters, without the kinds. They see what the rows show: not the sentences of the answers.
 export function matches(entry) {
   const words = $("find").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const text = [entry.what, entry.name, entry.handled?.text ?? "", ...entry.sights.map((one) => one[5])]
+  const text = [entry.what, entry.name, entry.handled?.text ?? "", ...entry.sights.map((one) => one.text)]
     .join(" ").toLowerCase();
   return words.every((word) => text.includes(word))
     && (!$("class").value || entry.name === $("class").value)
@@ -72,8 +72,8 @@ export function csv(rows) {
   const quoted = (value) => (/[",\n]/.test(String(value)) ? `"${String(value).replaceAll('"', '""')}"` : String(value));
   const line = (entry) => {
     const one = entry.sights[entry.best];
-    return [level(entry), severity(entry).join("; "), entry.what, entry.name, one[0] ?? "", seconds(one[1]).replace(" s", ""),
-      one[2] ?? "", entry.sights.length, one[5], one[6] ?? "", entry.handled?.state ?? "", entry.handled?.text ?? ""];
+    return [level(entry), severity(entry).join("; "), entry.what, entry.name, one.frame ?? "", seconds(one.stamp).replace(" s", ""),
+      one.distance ?? "", entry.sights.length, one.text, one.remark, entry.handled?.state ?? "", entry.handled?.text ?? ""];
   };
   return [COLUMNS, ...rows.map(line)].map((values) => values.map(quoted).join(",")).join("\n") + "\n";
 }

@@ -1,0 +1,352 @@
+"""Messages between the server and the page, of which ``python -m tools.make_page_types`` makes types.
+
+A stamp is text: JavaScript numbers cannot hold it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NotRequired, TypeAlias
+
+from pydantic import Field, TypeAdapter
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
+
+from bevviz.config.parameters import Kind
+from bevviz.findings.finding_list import Entry
+from bevviz.support.json_form import json_form
+from bevviz.why.answer_results import AnswerResult, HintResult
+from bevviz.why.robot_questions import RobotSteps
+
+# --- parts of messages -------------------------------------------------------------------------
+
+
+Span = TypedDict("Span", {"first": str, "last": str})  # stamps
+BeforeAfter = TypedDict("BeforeAfter", {"before": float | None, "after": float | None})  # null: unknown
+FrameTime = TypedDict("FrameTime", {"stamp": str, "frame": int})
+Row = TypedDict("Row", {"frame": int, "pick": str})  # an object in a frame
+Origin = TypedDict("Origin", {"time": float, "set": tuple[str, ...]})  # where a pick is valid
+Chip = Literal["", "hint", "cannot tell", "tried in vain"]
+RowRemark = TypedDict("RowRemark", {"remark": str, "chip": Chip})
+OtherObject = TypedDict("OtherObject", {"pick": str, "name": str, "reported": bool, "reason": str})
+Problem = TypedDict("Problem", {"text": str, "seconds": int})  # of the robot's data, and for how long
+StripFrame = TypedDict("StripFrame", {"stamp": str, "better": int, "worse": int})  # numbers of objects
+ReportFile = TypedDict("ReportFile", {"name": str, "megabytes": float})
+
+
+class Control(TypedDict):
+    """Control of a parameter."""
+
+    key: str
+    value: Any
+    unit: str
+    about: str
+    kind: Kind
+    low: NotRequired[float]
+    high: NotRequired[float]
+    choices: NotRequired[list[str]]
+
+
+class SideEffects(TypedDict):
+    """Effects of other values on a frame, as those of a hint."""
+
+    fixed: list[str]
+    added: list[str]
+    false: list[str]
+    lost: list[str]
+    right: list[str]
+    false_gone: list[str]
+    changed: int
+
+
+class HandledEntry(TypedDict):
+    """A finding that the user has dealt with."""
+
+    stamp: str
+    what: str
+    name: str
+    pick: str
+    distance: float | None
+    state: str
+    text: str
+
+
+class NoteEntry(TypedDict):
+    """A note of the user."""
+
+    stamp: str
+    received: str
+    text: str
+    about: str
+    pick: str
+    end: str
+
+
+class JobEntry(TypedDict):
+    """A job in the background."""
+
+    number: int
+    settings: list[str]
+    asked_by: str
+    cancelled_by: str
+    state: str
+    error: str
+    done: int
+    total: int
+
+
+class TrialEntry(JobEntry):
+    """A run with other values. ``span`` is null for the whole drive."""
+
+    lane: str
+    span: Span | None
+    counts: dict[str, int]
+    f1: BeforeAfter | None
+    strip: list[StripFrame]
+
+
+class FixEntry(JobEntry):
+    """A search of a fix, and its result in words."""
+
+    text: str
+
+
+class ReportEntry(JobEntry):
+    """A report."""
+
+    name: str
+    files: list[ReportFile]
+    folder: str
+
+
+# --- messages to the page ----------------------------------------------------------------------
+
+
+class Welcome(TypedDict):
+    """The first message: what is opened."""
+
+    type: Literal["welcome"]
+    run: str
+    overlay: str
+    bag: str
+    truth: bool
+    single: bool
+    detector: bool
+    opened: str
+    classes: dict[str, str]
+    controls: list[Control]
+    meanings: dict[str, str]
+
+
+Failed = TypedDict("Failed", {"type": Literal["failed"], "text": str})  # The drive cannot be opened.
+Error = TypedDict("Error", {"type": Literal["error"], "id": int | None, "text": str})
+Opening = TypedDict("Opening", {"type": Literal["opening"], "stamp": str, "first": str, "demand": bool})
+Frames = TypedDict("Frames", {"type": Literal["frames"], "frames": list[FrameTime]})  # new ones
+# Groups with their new frames, and numbers of the groups that are gone.
+Entries = TypedDict("Entries", {"type": Literal["entries"], "entries": list[Entry], "gone": list[int]})
+Controls = TypedDict("Controls", {"type": Literal["controls"], "controls": list[Control]})
+Noted = TypedDict("Noted", {"type": Literal["noted"], "id": int, "file": str, "text": str})
+Held = TypedDict("Held", {"type": Literal["held"], "frame": int, "stamp": str})
+Said = TypedDict("Said", {"type": Literal["said"], "text": str, "wrong": NotRequired[bool]})
+RobotReply: TypeAlias = Held | Said
+
+
+class Notes(TypedDict):
+    """All notes, and all findings that the user has dealt with."""
+
+    type: Literal["notes"]
+    notes: list[NoteEntry]
+    findings: list[HandledEntry]
+    error: str
+
+
+class RunProgress(TypedDict):
+    """Progress of the source: ``phase`` of a drive, ``problems`` and ``held`` of a robot."""
+
+    done: int
+    total: int | None
+    over: bool
+    error: str
+    warnings: list[str]
+    phase: NotRequired[Literal["overview", "again", "run"]]
+    problems: NotRequired[list[Problem]]
+    held: NotRequired[list[str]]
+
+
+class Progress(RunProgress):
+    """Progress of the run and of all jobs."""
+
+    type: Literal["progress"]
+    reports: list[ReportEntry]
+    trials: list[TrialEntry]
+    fix: FixEntry | None
+
+
+class Reply(TypedDict):
+    """Head of a reply to a question about a frame with other values."""
+
+    id: int
+    frame: int
+    set: Sequence[str]
+
+
+@json_form
+@dataclass(frozen=True)
+class AnswerMessage(AnswerResult):
+    """An answer."""
+
+    type: Literal["answer"]
+    id: int
+    frame: int
+    set: Sequence[str]
+    pick: str
+    found: str
+    beside: Sequence[OtherObject]
+
+
+class Nothing(Reply):
+    """What was clicked cannot be asked about."""
+
+    type: Literal["nothing"]
+    entity: str
+
+
+class Absent(Reply):
+    """The object is not in the frame."""
+
+    type: Literal["absent"]
+    text: str
+    pick: str
+
+
+class Hints(Reply, RowRemark):
+    """Hints of an answer."""
+
+    type: Literal["hints"]
+    row_pick: str
+    hints: list[HintResult]
+
+
+class Remark(Row, RowRemark):
+    """Remark on a row of the list."""
+
+    type: Literal["remark"]
+
+
+class Robot(Reply, RobotSteps):
+    """What the robot's nodes did with the object."""
+
+    type: Literal["robot"]
+
+
+class TriedEffects(TypedDict):
+    """Effects of other values on a frame."""
+
+    changes: dict[str, str]
+    effects: SideEffects
+    opinions: dict[str, BeforeAfter]
+    failures: list[str]
+    f1: NotRequired[BeforeAfter]
+
+
+class Tried(Reply, TriedEffects):
+    """A frame was tried with other values."""
+
+    type: Literal["tried"]
+    pieces: int
+
+
+ToPage: TypeAlias = (
+    Welcome | Failed | Error | Opening | Frames | Entries | Notes | Progress | Nothing | Absent | Hints
+) | (Robot | Remark | Tried | Controls | Noted | RobotReply)  # fmt: skip
+
+# --- messages from the page --------------------------------------------------------------------
+
+
+class AboutFrame(TypedDict):
+    """A message about the frame at a time, with other values, and about an object."""
+
+    id: int
+    time: float
+    set: NotRequired[tuple[str, ...]]
+    pick: NotRequired[str]
+
+
+class Ask(AboutFrame):
+    """A question about a pick, or about a click in the viewer."""
+
+    type: Literal["ask"]
+    origin: NotRequired[Origin | None]
+    entity: NotRequired[str]
+    instance: NotRequired[int | None]
+    position: NotRequired[list[float | None] | None]
+    view: NotRequired[str]
+
+
+class Try(AboutFrame):
+    """Show the frame with the values."""
+
+    type: Literal["try"]
+
+
+class Settle(AboutFrame):
+    """The page has stopped at a frame."""
+
+    type: Literal["settle"]
+
+
+class MakeReport(AboutFrame):
+    """Make a report of the seconds before and after the frame."""
+
+    type: Literal["report"]
+    text: str
+    before: float
+    after: float
+
+
+class AddNote(AboutFrame):
+    """Save a note."""
+
+    type: Literal["note"]
+    text: str
+    span: NotRequired[Span | None]
+
+
+class RunDrive(TypedDict):
+    """Run the drive, or a span of it, with the values."""
+
+    type: Literal["drive"]
+    id: int
+    set: tuple[str, ...]
+    span: NotRequired[Span | None]
+
+
+class Cancel(TypedDict):
+    """Cancel a job."""
+
+    type: Literal["cancel"]
+    id: int
+    what: Literal["try", "drive", "fix", "report"]
+
+
+class Handle(HandledEntry):
+    """A finding is done or ignored. With an empty state it is open again."""
+
+    type: Literal["handle"]
+    id: int
+
+
+Remarks = TypedDict("Remarks", {"type": Literal["remarks"], "id": int, "rows": list[Row]})
+Shown = TypedDict("Shown", {"type": Literal["shown"], "id": int})  # The page has drawn its first frame.
+FindFix = TypedDict("FindFix", {"type": Literal["fix"], "id": int})
+RemoveNote = TypedDict("RemoveNote", {"type": Literal["unnote"], "id": int, "stamp": str, "text": str})
+Hold = TypedDict("Hold", {"type": Literal["hold"], "id": int, "time": float})  # of a robot, as those below
+ListHeld = TypedDict("ListHeld", {"type": Literal["list"], "id": int})
+Snap = TypedDict("Snap", {"type": Literal["snap"], "id": int})
+Mark = TypedDict("Mark", {"type": Literal["mark"], "id": int, "time": float, "text": str})
+FromPage: TypeAlias = (
+    Ask | Try | Settle | MakeReport | AddNote | RunDrive | Cancel | Handle | Remarks | Shown | FindFix
+) | (RemoveNote | Hold | ListHeld | Snap | Mark)  # fmt: skip
+
+TO_PAGE: TypeAdapter[Any] = TypeAdapter(Annotated[ToPage | AnswerMessage, Field(discriminator="type")])
+FROM_PAGE: TypeAdapter[Any] = TypeAdapter(Annotated[FromPage, Field(discriminator="type")])
