@@ -72,7 +72,7 @@ def main() -> int:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         outputs = Outputs(save=folder / "soak.rrd" if options.save else None, serve=options.serve)
-        loader = StageLoader()
+        loader = StageLoader(store=False)  # the drive is repeated, a robot is not
         warm_up(settings.config, loader)
         if options.dds:
             write_drive(folder, simulated, drive)

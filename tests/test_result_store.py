@@ -16,14 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bevviz.cli import main
+from bevviz.cli import live, main
 from bevviz.config import load
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.model.frame import Frame
 from bevviz.model.results import Detections
 from bevviz.pipeline import result_store
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.result_store import ResultStore, StoredDetector, open_store
 from bevviz.pipeline.stage_loader import StageLoader
+from bevviz.stages.detector import Detector
 from bevviz.stages.detector.session import NetworkSession
 from bevviz.support import progress
 from tests.support import kept_drives
@@ -69,6 +71,19 @@ def detections(frame: Frame, *settings: str, model: str = "demo", stored: bool =
     found = perceive(frame, config := load(settings=texts), StageLoader().load(config)).cameras[0].detections
     assert found is not None
     return found
+
+
+def test_a_robots_images_leave_nothing_in_the_store(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    networks: list[object] = []
+
+    def run(settings: ReloadableConfig, _: object, __: object, loader: StageLoader, ___: object) -> int:
+        networks.append(loader.load(settings.config).network)
+        return 0
+
+    monkeypatch.setattr(live, "_run", run)
+    assert main(["live", "--model", "demo"]) == 0
+    assert isinstance(networks[0], Detector)
+    assert not folder.exists()
 
 
 def expect_equal(one: Any, other: Any) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -67,22 +68,29 @@ class _Pair:
 
 
 class PlacementWatch:
-    """Detector of cameras that are not where their transform says."""
+    """Detector of cameras that are not where their transform says.
+
+    A check takes longer than all other rules together, so that a thread works on it until the next frame.
+    """
 
     def __init__(self) -> None:
         self._frames = 0
         self._pairs: dict[tuple[str, str], _Pair] = defaultdict(_Pair)
+        self._worker = ThreadPoolExecutor(1, "placement")
+        # Stamp of the frame, names of camera and LiDAR, and the scores.
+        self._check: tuple[int, str, str, Future[F64 | None]] | None = None
 
     def update(
         self, frame: Frame, clouds: Sequence[Cloud], distrusted: Collection[str]
     ) -> Iterator[SensorFault]:
-        """Yield the faults of the newest frame. One camera is checked in every ``EVERY``-th frame.
+        """Yield the faults up to the frame before. One camera is checked in every ``EVERY``-th frame.
 
         Args:
             frame: the frame.
             clouds: its clouds by sensor.
             distrusted: names of cameras whose image is known to be wrong.
         """
+        self._finish_check()
         turn, rest = divmod(self._frames, EVERY)
         self._frames += 1
         if rest == 0 and clouds and frame.cameras:
@@ -90,17 +98,21 @@ class PlacementWatch:
             camera, row = frame.cameras[of_camera], number % len(clouds)
             if camera.name not in distrusted:
                 points_from_cloud = frame.points_from_clouds[row] if frame.clouds else np.eye(4)
-                self._check(frame.stamp, camera, clouds[row], points_from_cloud)
+                scores = self._worker.submit(score_rotations, camera, clouds[row], points_from_cloud)
+                self._check = frame.stamp, camera.name, clouds[row].name, scores
         for pair in self._pairs.values():
             if pair.fault is not None:
                 yield pair.fault
 
-    def _check(self, stamp: int, camera: Camera, cloud: Cloud, points_from_cloud: F64) -> None:
-        """Check one camera with one cloud."""
-        scores = score_rotations(camera, cloud, points_from_cloud)
+    def _finish_check(self) -> None:
+        """Judge the pair whose check began in the frame before."""
+        if self._check is None:
+            return
+        stamp, camera, lidar, check = self._check
+        self._check, scores = None, check.result()
         if scores is None:
             return
-        pair = self._pairs[camera.name, cloud.name]
+        pair = self._pairs[camera, lidar]
         pair.scores.append(scores)
         pair.stamps.append(stamp)
         best = find_error(np.array(pair.scores))
@@ -108,8 +120,8 @@ class PlacementWatch:
             pair.fault = None
             return
         since = pair.stamps[0] if pair.fault is None else pair.fault.since
-        detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {cloud.name}"
-        pair.fault = SensorFault(f"camera {camera.name}", "not where its transform says", since, detail)
+        detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {lidar}"
+        pair.fault = SensorFault(f"camera {camera}", "not where its transform says", since, detail)
 
 
 def find_error(scores: F64) -> int | None:

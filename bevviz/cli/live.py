@@ -136,7 +136,7 @@ def _live(options: LiveOptions) -> int:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = ReloadableConfig(config.file, values, config.preset, config.project_layers)
     _check_outputs(output)
-    loader = StageLoader()
+    loader = StageLoader(store=False)  # no image of a robot comes twice
     if not chosen.observe:
         loader.load(settings.config)
     notes = Notes(say)
