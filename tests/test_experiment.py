@@ -121,6 +121,19 @@ def test_fixed_broken_new_false_and_false_gone_are_told_apart() -> None:
     assert unknown.fixed == unknown.broken == []
 
 
+def test_the_names_of_changed_objects() -> None:
+    labels = Truth(boxes(5, 20), ("car",) * 2, (frozenset({"car"}),) * 2, np.ones(2, bool))
+    change = before_after(cars(5, 9), None, labels)
+    assert change.names.lost == change.names.right == ("car at 5.0 m",)
+    assert (change.good, change.harm) == (1, 1)
+    assert change.text == "broken car at 5.0 m, false gone car at 9.0 m"
+    assert before_after(cars(5, 9), None, None).names.lost == ("car at 5.0 m", "car at 9.0 m")
+    found = before_after(cars(9), cars(20, 5, 40), labels, asked=1)
+    assert found.names.fixed == ("car at 20.0 m", "car at 5.0 m")
+    assert found.names.added == found.names.false == ("car at 40.0 m",)
+    assert before_after(None, cars(30, 40), None, own=1).names.fixed == ("car at 40.0 m",)
+
+
 def test_a_name_that_no_label_accepts_is_not_false() -> None:
     labels = Truth(boxes(10), ("car",), (frozenset({"car"}),), np.array([True]))
     benches = replace(cars(50), names=("bench",))

@@ -20,7 +20,6 @@ from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.false_objects import false_causes
-from bevviz.why.side_effects import Effect, Effects
 
 MISC = (804.79, 167.34, 995.43, 327.94)  # image box of the label of frame 2
 REGION = (5.0, 229.89, 214.12, 367.61)  # image box of a DontCare region of frame 3
@@ -110,15 +109,6 @@ def test_a_second_box_in_a_labelled_car_is_called_so(shared: Path) -> None:
     assert answer.verdict.kind is ReasonKind.DUPLICATE
     assert "it is inside the box of the car at 13." in answer.verdict.text
     assert "a second box of it, which car 0.90 is already" in answer.verdict.text
-
-
-def test_a_false_object_that_goes_is_no_loss() -> None:
-    right, false = Effect("car at 5.0 m", truth=3, before=0, missed=True), Effect("car at 9.0 m", before=1)
-    known = Effects(gone=(right, false), known=True)
-    assert known.lost == ("car at 5.0 m",) and (known.good, known.harm) == (1, 1)
-    assert known.text == "broken car at 5.0 m, false gone car at 9.0 m"
-    unknown = Effects(gone=(right, false))
-    assert unknown.lost == ("car at 5.0 m", "car at 9.0 m")
 
 
 @pytest.mark.parametrize(

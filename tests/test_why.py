@@ -413,12 +413,14 @@ def test_a_hint_names_its_side_effects() -> None:
     (row,) = planted("flat_car", "car", 10.0)
     answer = about("flat_car", "reference", row)
     effects = answer.hints[0].effects
-    assert any(name.startswith("car at 10.") for name in effects.fixed)
+    assert any(name.startswith("car at 10.") for name in effects.names.fixed)
     assert f"(in this frame: {effects.text})" in answer.verdict.text
     before = run("flat_car", "reference").objects
     after = Session(config_of("reference", *answer.hints[0].settings)).run(at("flat_car").frame).objects
     assert before is not None and after is not None
-    assert len(after) - len(before) == len(effects.fixed) + len(effects.added) - len(effects.gone)
+    names = effects.names
+    assert not names.false_gone
+    assert len(after) - len(before) == len(names.fixed) + len(names.added) - len(names.lost)
 
 
 @pytest.mark.parametrize(

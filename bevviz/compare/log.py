@@ -163,7 +163,9 @@ def differences_page(differences: FrameDifferences) -> str:
     lines = [f"### Frame {differences.index}", "", table.markdown([("", "A", "B"), *_totals(differences)])]
     if (judged := differences.judged) is not None:
         for title, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
-            lines += _section(f"{title}: {len(objects)}", [markdown(judged.text(row)) for row in objects])
+            lines += _section(
+                f"{title}: {len(objects)}", [markdown(judged.label_text(row)) for row in objects]
+            )
     for change in (*DIFFERENT, Change.SAME):
         selected = [d for d in differences.objects if d.change is change]
         title = f"{change[0].upper()}{change[1:]}: {len(selected)}"

@@ -185,8 +185,8 @@ class ComparisonSummary(Observer[FrameComparison]):
                 frame=differences.index,
                 stamp=differences.stamp,
                 number=differences.number,
-                fixed=[] if judged is None else [*map(judged.text, judged.fixed)],
-                broke=[] if judged is None else [*map(judged.text, judged.broken)],
+                fixed=[] if judged is None else [*map(judged.label_text, judged.fixed)],
+                broke=[] if judged is None else [*map(judged.label_text, judged.broken)],
                 objects=[_row(d, differences) for d in differing],
                 detections=[
                     ImageDifference(d.change.value, d.name_a, d.name_b, camera, d.text, f"in {camera}")

@@ -13,7 +13,7 @@ from bevviz.evaluate.ground_truth import Truth
 from bevviz.evaluate.matching import Matches, judge, position_text
 from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, F64, Boxes3D
-from bevviz.model.results import FrameResult, Objects
+from bevviz.model.results import CameraResult, FrameResult, Objects
 from bevviz.stages.fusion import assign
 
 MAX_PAIR_DISTANCE = 2.0  # metres between the centres of one object, in the bird's-eye view
@@ -210,20 +210,43 @@ def _make_pairs(
 
 
 @dataclass(frozen=True, slots=True)
+class ChangedObjects:
+    """Objects of a frame that a change affects, by class and distance."""
+
+    fixed: tuple[str, ...]  # labelled objects that were missed and are found; the object in question is first
+    added: tuple[str, ...]  # other new objects
+    false: tuple[str, ...]  # new false objects
+    lost: tuple[str, ...]  # objects that are gone, without the false ones
+    right: tuple[str, ...]  # objects that were right, of labels that are missed now
+    false_gone: tuple[str, ...]  # false objects that are gone
+    changed: int  # number of other objects that have moved or have another class
+
+
+@dataclass(frozen=True, slots=True)
 class BeforeAfter:
     """Effects of a change on the objects of one frame.
 
     Attributes:
+        a: objects before the change.
+        b: objects after the change.
         pairs: every object before and after the change, which are sides A and B.
         truth: ground truth of the frame; None: unknown.
         before: the objects before, matched with the ground truth.
         after: the objects after, matched with the ground truth.
+        asked: row of the labelled object in question; -1: none.
+        own: row after the change of the object in question; -1: none.
+        doubtful: number of doubtful objects that there are more after the change. Ground truth makes it 0.
     """
 
+    a: SideResult
+    b: SideResult
     pairs: tuple[Difference, ...]
     truth: Truth | None = None
     before: Matches | None = None
     after: Matches | None = None
+    asked: int = -1
+    own: int = -1
+    doubtful: int = 0
 
     @property
     def fixed(self) -> list[int]:
@@ -267,10 +290,76 @@ class BeforeAfter:
             return len(self.new_false), len(self.false_gone)
         return len(self.fixed) + len(self.false_gone), len(self.broken) + len(self.new_false)
 
-    def text(self, row: int) -> str:
+    @property
+    def names(self) -> ChangedObjects:
+        """Names of the objects that the change affects."""
+        before_of, after_of = _rows_by_label(self.before), _rows_by_label(self.after)
+        rows = set(self.fixed)
+        if self.asked in after_of and self.asked not in before_of:
+            rows.add(self.asked)  # It may be one that need not be found.
+        fixed = sorted((row != self.asked, self.label_text(row)) for row in rows)
+        right = [before_of[row] for row in self.broken]
+        false, false_gone = ([], []) if self.truth is None else (self.new_false, self.false_gone)
+        new, gone = self._only(Change.ONLY_B), self._only(Change.ONLY_A)
+        own = {after_of[row] for row in rows}
+        if self.own in new and self.own not in own:
+            fixed.insert(0, (False, _object_text(self.b, self.own)))
+            own.add(self.own)
+        named_a, named_b = {*right, *false_gone}, {*own, *false}
+        moved = (p for p in self.pairs if p.change in (Change.MOVED, Change.CLASS))
+        return ChangedObjects(
+            tuple(text for _, text in fixed),
+            tuple(_object_text(self.b, row) for row in new if row not in own),
+            tuple(_object_text(self.b, row) for row in false if row not in own),
+            tuple(_object_text(self.a, row) for row in gone if row not in false_gone),
+            tuple(_object_text(self.a, row) for row in right),
+            tuple(_object_text(self.a, row) for row in false_gone),
+            sum(pair.row_a not in named_a and pair.row_b not in named_b for pair in moved),
+        )
+
+    @property
+    def good(self) -> int:
+        """Number of objects that get better: new right ones, and false or doubtful ones that are gone."""
+        names = self.names
+        gone = len(names.false_gone) if self.truth is not None else max(-self.doubtful, 0)
+        return len(names.fixed) + gone
+
+    @property
+    def harm(self) -> int:
+        """Number of objects that get worse. Without ground truth: new doubtful ones, and those that are gone.
+
+        The objects that are gone then count without the doubtful ones among them.
+        """
+        if self.truth is not None:
+            return self.balance[1]
+        gone = len(self._only(Change.ONLY_A))
+        return max(self.doubtful, 0) + max(gone + min(self.doubtful, 0), 0)
+
+    @property
+    def text(self) -> str:
+        """All effects in brief, in the words of the page and of ``compare``."""
+        names = self.names
+        named = {
+            "fixed": names.fixed,
+            "broken": names.right,
+            "new false": names.false,
+            "false gone": names.false_gone,
+            "gone": [name for name in names.lost if name not in names.right],
+            "new": [name for name in names.added if name not in names.false],
+        }
+        texts = [f"{what} {' and '.join(objects)}" for what, objects in named.items() if objects]
+        texts += [f"{self.doubtful} more doubtful"] if self.doubtful > 0 else []
+        texts += [f"{names.changed} changed"] if names.changed else []
+        return ", ".join(texts)
+
+    def label_text(self, row: int) -> str:
         """Return class and distance of a labelled object, as ``person at 12.3 m``."""
         assert self.truth is not None
         return f"{self.truth.labels[row].lower()} at {self.truth.boxes.distance[row]:.1f} m"
+
+    def _only(self, change: Change) -> list[int]:
+        """Return the rows of the objects that only one side has."""
+        return [max(pair.row_a, pair.row_b) for pair in self.pairs if pair.change is change]
 
     def _false_only(
         self, pairs: Iterable[tuple[int, int]], matches: Matches | None, others: Matches | None
@@ -292,10 +381,43 @@ def _found_only(matches: Matches | None, others: Matches | None) -> list[int]:
     return np.flatnonzero(others.missed & ~matches.missed).tolist()
 
 
-def before_after(before: Objects | None, after: Objects | None, truth: Truth | None) -> BeforeAfter:
-    """Compare two results of one frame with each other and, if it is known, with the ground truth."""
+def _rows_by_label(matches: Matches | None) -> dict[int, int]:
+    """Return the row of the object of each labelled object that has one."""
+    if matches is None:
+        return {}
+    return {label: row for row, label in enumerate(matches.partner.tolist()) if label >= 0}
+
+
+def _object_text(side: SideResult, row: int) -> str:
+    """Return class and distance of an object."""
+    return f"{side.names[row]} at {side.boxes.distance[row]:.1f} m"
+
+
+def before_after(
+    before: Objects | None,
+    after: Objects | None,
+    truth: Truth | None,
+    *,
+    cameras: tuple[Sequence[CameraResult], Sequence[CameraResult]] = ((), ()),
+    asked: int = -1,
+    own: int = -1,
+    doubtful: int = 0,
+) -> BeforeAfter:
+    """Compare two results of one frame with each other and, if it is known, with the ground truth.
+
+    Args:
+        before: objects of the first result.
+        after: objects of the second result.
+        truth: ground truth of the frame. None: it is unknown.
+        cameras: cameras of both results, see ``judge``.
+        asked: see ``BeforeAfter``.
+        own: see ``BeforeAfter``.
+        doubtful: see ``BeforeAfter``.
+    """
     before, after = before or Objects.empty(), after or Objects.empty()
-    pairs = compare_objects(side_of(before), side_of(after))
+    a, b = side_of(before), side_of(after)
+    pairs = compare_objects(a, b)
     if truth is None:
-        return BeforeAfter(pairs)
-    return BeforeAfter(pairs, truth, judge(before, truth), judge(after, truth))
+        return BeforeAfter(a, b, pairs, own=own, doubtful=doubtful)
+    judged = judge(before, truth, cameras[0]), judge(after, truth, cameras[1])
+    return BeforeAfter(a, b, pairs, truth, *judged, asked, own)

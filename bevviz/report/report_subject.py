@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from bevviz.evaluate.differences import BeforeAfter
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.report.facts import AnswerText, Cause, TriedText
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.hints import Hint
 from bevviz.why.log import focus_point
-from bevviz.why.side_effects import Effects
 
 LISTED = 5  # further objects of the frame that are listed
 
@@ -29,7 +29,7 @@ class TriedValues:
 
     settings: Sequence[str]
     answer: Answer | None
-    effects: Effects
+    effects: BeforeAfter
     drive: str = ""
 
 
@@ -110,10 +110,11 @@ def _hint_text(hint: Hint) -> TriedText:
     return TriedText(", ".join(hint.settings), hint.text, *_good_and_bad(hint.effects))
 
 
-def _good_and_bad(effects: Effects) -> tuple[str, str]:
+def _good_and_bad(effects: BeforeAfter) -> tuple[str, str]:
     """Return the objects of a frame that get better, and those that get worse."""
-    worse = [f"new false {name}" for name in effects.false]
-    worse += [f"broken {name}" for name in (effects.right if effects.known else effects.lost)]
+    names = effects.names
+    worse = [f"new false {name}" for name in names.false]
+    worse += [f"broken {name}" for name in (names.lost if effects.truth is None else names.right)]
     worse += [f"{effects.doubtful} doubtful"] if effects.doubtful > 0 else []
-    gone = [f"false gone {name}" for name in effects.false_gone]
-    return ", ".join([*effects.fixed, *gone]) or "nothing", ", ".join(worse) or "nothing"
+    gone = [f"false gone {name}" for name in names.false_gone]
+    return ", ".join([*names.fixed, *gone]) or "nothing", ", ".join(worse) or "nothing"

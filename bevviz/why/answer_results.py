@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -50,19 +50,7 @@ class HintResult:
     @classmethod
     def of(cls, hint: Hint) -> HintResult:
         """Return a hint in plain values."""
-        effects = hint.effects
-        return cls(
-            settings=hint.settings,
-            text=hint.text,
-            fixed=effects.fixed,
-            added=effects.added,
-            false=effects.false,
-            lost=effects.lost,
-            right=effects.right,
-            false_gone=effects.false_gone,
-            changed=effects.changed,
-            beside=hint.beside,
-        )
+        return cls(hint.settings, hint.text, **asdict(hint.effects.names), beside=hint.beside)
 
 
 @json_form

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
+from bevviz.evaluate.differences import BeforeAfter, before_after
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.why.changes import (
     FAR_STEPS,
@@ -28,7 +29,6 @@ from bevviz.why.ideal import STAGES, StageSet
 from bevviz.why.neighbours import NeighbourRuns
 from bevviz.why.reason_values import ReasonValues
 from bevviz.why.reruns import FrameRuns
-from bevviz.why.side_effects import Effects, effects
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import FALSE, FLAWED, HOPELESS, find_reason, stage_of
 
@@ -61,14 +61,14 @@ class Hint:
     Attributes:
         settings: settings as ``--set`` takes them.
         text: the result for the subject.
-        effects: other objects of the frame that change.
+        effects: objects of the frame that change.
         balance: number of objects that it fixes, the subject included, minus those that it breaks.
         beside: the same for the frames before and after, None: they are not known.
     """
 
     settings: tuple[str, ...]
     text: str
-    effects: Effects
+    effects: BeforeAfter
     balance: int = 1
     beside: int | None = None
 
@@ -278,8 +278,15 @@ class HintFinder:
         before = self._traces
         self._change_of[_settings(change)] = change
         more = 0 if before.truth else len(false_reasons(after)) - len(false_reasons(before))
-        objects, then_objects = before.result.objects, after.result.objects
-        changed = effects(objects, then_objects, before.truth, asked, own, more)
+        changed = before_after(
+            before.result.objects,
+            after.result.objects,
+            before.labels_in_evaluate,
+            cameras=(before.result.cameras, after.result.cameras),
+            asked=asked,
+            own=own,
+            doubtful=more,
+        )
         if before.matches is None or after.matches is None:
             return Hint(_settings(change), text, changed, max(changed.good, 1) - changed.harm)
         right = int((after.matches.partner >= 0).sum()) - int((before.matches.partner >= 0).sum())

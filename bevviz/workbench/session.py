@@ -21,13 +21,12 @@ from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.identity import Identity, find, identify
 from bevviz.why.resolve import select_subjects
-from bevviz.why.side_effects import effects
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
-from bevviz.workbench.trials import TrialRunner, trial_effects
+from bevviz.workbench.trials import TrialRunner, frame_effects, trial_effects
 
 if TYPE_CHECKING:
     from bevviz.workbench.page_types import Progress, TriedEffects
@@ -255,7 +254,7 @@ class WorkbenchSession(Closable):
     def tried_on(self, number: int, settings: Settings, answer: Answer | None) -> TriedValues:
         """Return what other values do to the object of an answer, to its frame, and to the drive."""
         before, after = self.source.look(number), self.source.look(number, settings)
-        subjects, row = FrameIndex(after).truth, -1
+        row = -1
         answer_then = None
         if answer is not None and answer.selection is not None:
             identity = self.identity(number, (), answer.selection, answer, None)
@@ -264,9 +263,8 @@ class WorkbenchSession(Closable):
             answer_then = None if selection is None else self.ask(number, settings, selection)[0]
         texts = [trial.text for trial in self.tools.trials.jobs if trial.settings == settings]
         drive = texts[-1] if texts else ""
-        return TriedValues(
-            settings, answer_then, effects(before.objects, after.objects, subjects, row), drive
-        )
+        effects = frame_effects(before, after, self.source.truth(after.frame), row)
+        return TriedValues(settings, answer_then, effects, drive)
 
     def try_values(
         self,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
 from bevviz.why import FrameExplainer, Selection
-from bevviz.why.frame_index import FrameIndex
-from bevviz.why.side_effects import Effects, effects
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.growing_drive import Settings
 from bevviz.workbench.jobs import Job, Jobs
@@ -209,6 +207,14 @@ def difference_findings(
         yield Finding(frame.index, frame.stamp, kind, name, distance, selection, reason, (x, y, z)), False
 
 
+def frame_effects(
+    before: FrameResult, after: FrameResult, truth: Truth | None, truth_row: int
+) -> differences.BeforeAfter:
+    """Return the effects of other values on one frame; for the arguments see ``trial_effects``."""
+    cameras = before.cameras, after.cameras
+    return differences.before_after(before.objects, after.objects, truth, cameras=cameras, asked=truth_row)
+
+
 def trial_effects(
     before: FrameResult, after: FrameResult, truth: Truth | None, truth_row: int = -1
 ) -> TriedEffects:
@@ -220,11 +226,9 @@ def trial_effects(
         truth: ground truth of the frame.
         truth_row: row of the ground truth object that was asked about. Its effect comes first. -1: none.
     """
-    subjects = FrameIndex(after, _names(before)).truth
-    side_effects = effects(before.objects, after.objects, subjects, truth_row)
     message: TriedEffects = {
         "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},
-        "effects": effects_dict(side_effects),
+        "effects": cast("SideEffects", asdict(frame_effects(before, after, truth, truth_row).names)),
         "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }
@@ -241,25 +245,6 @@ def _opinions(before: FrameResult, after: FrameResult) -> dict[str, BeforeAfter]
         for opinion in OPINIONS
         if counts_before.get(opinion, 0) != counts_after.get(opinion, 0)
     }
-
-
-def effects_dict(side_effects: Effects) -> SideEffects:
-    """Return effects as JSON for the page, in the same form as those of a hint."""
-    return {
-        "fixed": list(side_effects.fixed),
-        "added": list(side_effects.added),
-        "false": list(side_effects.false),
-        "lost": list(side_effects.lost),
-        "right": list(side_effects.right),
-        "false_gone": list(side_effects.false_gone),
-        "changed": side_effects.changed,
-    }
-
-
-def _names(result: FrameResult) -> list[str]:
-    return [
-        name for camera in result.cameras if camera.detections is not None for name in camera.detections.names
-    ]
 
 
 def _f1(result: FrameResult, truth: Truth) -> float | None:
