@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bevviz.config import Config, load
-from bevviz.model.reasons import PARAMETERS, Limit, Reason, ReasonKind, Scored, limit_of
+from bevviz.model.reasons import Limit, Reason, ReasonKind, Scored, limit_of
 from bevviz.model.results import Decision, Pair
 from bevviz.why.sentences import FALSE_SENTENCES, SENTENCES, make_verdict
 from bevviz.why.subject import Subject
@@ -206,7 +206,7 @@ def sentence(
     kind: ReasonKind, reported: bool, values: dict[str, Any], subject: Subject, config: Config
 ) -> str:
     ours = not str(values.get("by", "")).startswith(NOT_OURS)
-    limit = limit_of(kind, config) if ours and kind in PARAMETERS else None
+    limit = limit_of(kind, config) if ours else None
     if kind is K.SHARED_BOX:
         limit = Limit("fusion.method", "centroid")
     if kind is K.REPORTED and subject is DETECTION:

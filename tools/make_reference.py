@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bevviz.config import Config, load, parameters, values
 from bevviz.evaluate.metrics import METRICS
-from bevviz.model.reasons import MEANINGS, PARAMETERS
+from bevviz.model.reasons import FACTS
 from bevviz.recording import entities
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
@@ -21,9 +21,9 @@ its value is stated; [the project file](project.md#which-value-wins) states valu
 def text() -> str:
     """Return the page."""
     lines = [HEAD, "## Reasons", "", "| reason | meaning | parameter that decides |", "| --- | --- | --- |"]
-    for kind, meaning in MEANINGS.items():
-        key = PARAMETERS.get(kind, "")
-        lines.append(f"| {kind.value} | {meaning} | {f'`{key}`' if key else ''} |")
+    for kind, facts in FACTS.items():
+        decides = f"`{facts.decides}`" if facts.decides else ""
+        lines.append(f"| {kind} | {facts.meaning} | {decides} |")
     lines += ["", "## Parameters", "", "`reference` stands where that preset has another value.", ""]
     default, reference = values(load()), values(load(preset="reference"))
     for section in Config.model_fields:

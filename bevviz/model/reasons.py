@@ -67,78 +67,190 @@ class ReasonKind(StrEnum):
     PROBLEM = "problem"
 
 
-_OF_STAGE = {  # stage -> reasons for which it lost an object, or made a false one
-    "sensors": (ReasonKind.OUT_OF_VIEW, ReasonKind.HIDDEN, ReasonKind.NO_POINTS),
-    "ground": (ReasonKind.GROUND,),
-    "clustering": (
-        *(ReasonKind.NOISE, ReasonKind.NO_CLUSTER, ReasonKind.TOO_SMALL, ReasonKind.TOO_LARGE),
-        *(ReasonKind.SPLIT, ReasonKind.MERGED),
-    ),
-    "detector": (
-        *(ReasonKind.NOT_RUN, ReasonKind.NOT_DETECTED, ReasonKind.BELOW_THRESHOLD),
-        *(ReasonKind.SUPPRESSED, ReasonKind.SECOND_NAME, ReasonKind.DETECTOR_ERROR),
-    ),
-    "fusion": (
-        *(ReasonKind.NOT_FUSED, ReasonKind.LOW_OVERLAP, ReasonKind.TOO_FEW_POINTS, ReasonKind.TOO_FAR),
-        *(ReasonKind.TAKEN, ReasonKind.MISFIT, ReasonKind.OTHER_CLUSTER, ReasonKind.LOST_IN_FUSION),
-        *(ReasonKind.SHARED_BOX, ReasonKind.BORROWED, ReasonKind.MISNAMED, ReasonKind.MISPLACED),
-        *(ReasonKind.DUPLICATE, ReasonKind.WRONG_DEPTH, ReasonKind.WALL),
-    ),
-    "objects": (ReasonKind.NOT_AMONG, ReasonKind.CONTRADICTED),
-}
-STAGES: Mapping[str, str] = {kind: stage for stage, kinds in _OF_STAGE.items() for kind in kinds}
+class ReasonFacts(NamedTuple):
+    """What is known of a kind of reason that an answer can have.
 
-PARAMETERS: Mapping[str, str] = {  # the parameter that decides
-    ReasonKind.GROUND: "ground.distance_threshold",
-    ReasonKind.NOISE: "clustering.min_points",
-    ReasonKind.MERGED: "clustering.eps",
-    ReasonKind.TOO_SMALL: "clustering.min_cluster_points",
-    ReasonKind.TOO_LARGE: "clustering.max_cluster_points",
-    ReasonKind.NOT_DETECTED: "detector.explain_threshold",
-    ReasonKind.BELOW_THRESHOLD: "detector.conf_threshold",
-    ReasonKind.SUPPRESSED: "detector.iou_threshold",
-    ReasonKind.LOW_OVERLAP: "fusion.min_iou",
-    ReasonKind.TOO_FEW_POINTS: "fusion.min_points",
-    ReasonKind.TOO_FAR: "fusion.max_depth",
-    ReasonKind.MISFIT: "fusion.min_rating",
+    Attributes:
+        meaning: its meaning, for the docs and the page.
+        stage: stage that lost the object, or made the false one; empty: none.
+        decides: parameter that decides; empty: none.
+        searched: parameters that ``fix`` searches, because they change how often it comes to this reason.
+    """
+
+    meaning: str
+    stage: str = ""
+    decides: str = ""
+    searched: tuple[str, ...] = ()
+
+
+_GROUND = ("ground.distance_threshold", "ground.method", "clustering.min_points", "voxel.size")
+_GROUPS = ("clustering.eps", "clustering.min_points", "clustering.min_cluster_points", "voxel.size")
+_MATCH = ("fusion.min_rating", "fusion.min_iou", "fusion.min_points", "fusion.split", "fusion.method")
+FACTS: Mapping[str, ReasonFacts] = {
+    ReasonKind.SHARED_BOX: ReasonFacts(
+        "the image box that names it names other clusters, too",
+        "fusion",
+        searched=("fusion.method", "fusion.split"),
+    ),
+    ReasonKind.BORROWED: ReasonFacts(
+        "the image box of another object names it",
+        "fusion",
+        searched=("fusion.method", "clustering.eps", "fusion.split"),
+    ),
+    ReasonKind.SPLIT: ReasonFacts(
+        "it is spread over several clusters; of a false object: it is a part of a labelled one",
+        "clustering",
+        searched=("clustering.eps", "clustering.min_points", "fusion.split", "voxel.size"),
+    ),
+    ReasonKind.MERGED: ReasonFacts(
+        "its cluster holds another object; the answer names the gap and the eps for it",
+        "clustering",
+        decides="clustering.eps",
+        searched=("clustering.eps", "fusion.split", "fusion.min_rating", "fusion.method", "voxel.size"),
+    ),
+    ReasonKind.MISNAMED: ReasonFacts(
+        "a detection of another class names it",
+        "fusion",
+        searched=("fusion.method", "detector.iou_threshold", "detector.conf_threshold"),
+    ),
+    ReasonKind.MISPLACED: ReasonFacts(
+        "its object is farther off than evaluate allows",
+        "fusion",
+        searched=("clustering.eps", "fusion.split", "fusion.method", "voxel.size"),
+    ),
+    ReasonKind.DUPLICATE: ReasonFacts(
+        "false: another object is the same thing already",
+        "fusion",
+        searched=(
+            "detector.iou_threshold",
+            "clustering.eps",
+            "fusion.split",
+            "fusion.min_rating",
+            "fusion.min_iou",
+        ),
+    ),
+    ReasonKind.WRONG_DEPTH: ReasonFacts(
+        "false: its image box is right, and its points are before or behind the thing",
+        "fusion",
+        searched=(*_MATCH, "clustering.eps"),
+    ),
+    ReasonKind.WALL: ReasonFacts(
+        "false: its points are a part of something larger", "fusion", searched=(*_MATCH, "clustering.eps")
+    ),
+    ReasonKind.DETECTOR_ERROR: ReasonFacts(
+        "false: no label is in reach; it is unlabelled, or the detector's own error",
+        "detector",
+        searched=("detector.conf_threshold", "fusion.min_rating", "fusion.min_iou"),
+    ),
+    ReasonKind.FAILED: ReasonFacts("a stage failed"),
+    ReasonKind.OUT_OF_VIEW: ReasonFacts("no camera sees it", "sensors"),
+    ReasonKind.HIDDEN: ReasonFacts(
+        "fewer than three points; most returns in its direction end before it", "sensors"
+    ),
+    ReasonKind.NO_POINTS: ReasonFacts(
+        "the LiDAR has fewer than three points there", "sensors", searched=("voxel.size",)
+    ),
+    ReasonKind.GROUND: ReasonFacts(
+        "most of it was removed as ground",
+        "ground",
+        decides="ground.distance_threshold",
+        searched=(*_GROUND, "clustering.min_cluster_points"),
+    ),
+    ReasonKind.NOISE: ReasonFacts(
+        "no point has clustering.min_points neighbours within clustering.eps",
+        "clustering",
+        decides="clustering.min_points",
+        searched=(*_GROUPS, "ground.distance_threshold"),
+    ),
+    ReasonKind.NO_CLUSTER: ReasonFacts(
+        "your function or the robot lost it",
+        "clustering",
+        searched=(*_GROUPS, "ground.distance_threshold", "fusion.max_depth"),
+    ),
+    ReasonKind.TOO_SMALL: ReasonFacts(
+        "its cluster has too few points",
+        "clustering",
+        decides="clustering.min_cluster_points",
+        searched=("clustering.min_cluster_points", "clustering.eps", "clustering.min_points", "voxel.size"),
+    ),
+    ReasonKind.TOO_LARGE: ReasonFacts(
+        "its cluster has too many points",
+        "clustering",
+        decides="clustering.max_cluster_points",
+        searched=("clustering.max_cluster_points", "clustering.eps"),
+    ),
+    ReasonKind.NOT_RUN: ReasonFacts("no model, no image or no camera", "detector"),
+    ReasonKind.NOT_DETECTED: ReasonFacts(
+        "the detector has no candidate there",
+        "detector",
+        decides="detector.explain_threshold",
+        searched=("detector.conf_threshold",),
+    ),
+    ReasonKind.BELOW_THRESHOLD: ReasonFacts(
+        "the detector's score is too low",
+        "detector",
+        decides="detector.conf_threshold",
+        searched=("detector.conf_threshold", "fusion.min_rating"),
+    ),
+    ReasonKind.SUPPRESSED: ReasonFacts(
+        "a better detection overlaps it; the answer names it and the IoU",
+        "detector",
+        decides="detector.iou_threshold",
+        searched=("detector.iou_threshold",),
+    ),
+    ReasonKind.SECOND_NAME: ReasonFacts(
+        "probably a second box of a reported thing: nothing was missed", "detector"
+    ),
+    ReasonKind.NOT_FUSED: ReasonFacts("its camera lacks a calibration or a pose", "fusion"),
+    ReasonKind.LOW_OVERLAP: ReasonFacts(
+        "its points cover too little of the image box",
+        "fusion",
+        decides="fusion.min_iou",
+        searched=("fusion.min_iou", "clustering.eps", "fusion.method", "fusion.split"),
+    ),
+    ReasonKind.TOO_FEW_POINTS: ReasonFacts(
+        "too few of its points are in the image box",
+        "fusion",
+        decides="fusion.min_points",
+        searched=("fusion.min_points", "clustering.min_points", "voxel.size", "ground.distance_threshold"),
+    ),
+    ReasonKind.TOO_FAR: ReasonFacts(
+        "it is too far away, for `reference` too many pixels from the image box",
+        "fusion",
+        decides="fusion.max_depth",
+        searched=("fusion.max_depth", "fusion.method", "ground.distance_threshold"),
+    ),
+    ReasonKind.TAKEN: ReasonFacts(
+        "a better detection has its cluster",
+        "fusion",
+        searched=("fusion.method", "clustering.eps", "detector.iou_threshold", "fusion.min_iou"),
+    ),
+    ReasonKind.MISFIT: ReasonFacts(
+        "no candidate in the frustum is rated high enough",
+        "fusion",
+        decides="fusion.min_rating",
+        searched=("fusion.min_rating", "fusion.split", "clustering.eps"),
+    ),
+    ReasonKind.OTHER_CLUSTER: ReasonFacts(
+        "its detection has another cluster",
+        "fusion",
+        searched=("fusion.method", "clustering.eps", "fusion.split"),
+    ),
+    ReasonKind.CONTRADICTED: ReasonFacts(
+        "your function or the robot has it, and a camera that sees the place does not", "objects"
+    ),
+    ReasonKind.NOT_AMONG: ReasonFacts(
+        "it is not among the objects of your function or of the robot", "objects"
+    ),
+    ReasonKind.LOST_IN_FUSION: ReasonFacts(
+        "the robot has its cluster and its detection, and no object of them", "fusion"
+    ),
 }
 
-MEANINGS = {  # of each reason that an answer can have, for the docs and the page
-    ReasonKind.SHARED_BOX: "the image box that names it names other clusters, too",
-    ReasonKind.BORROWED: "the image box of another object names it",
-    ReasonKind.SPLIT: "it is spread over several clusters; of a false object: it is a part of a labelled one",
-    ReasonKind.MERGED: "its cluster holds another object; the answer names the gap and the eps for it",
-    ReasonKind.MISNAMED: "a detection of another class names it",
-    ReasonKind.MISPLACED: "its object is farther off than evaluate allows",
-    ReasonKind.DUPLICATE: "false: another object is the same thing already",
-    ReasonKind.WRONG_DEPTH: "false: its image box is right, and its points are before or behind the thing",
-    ReasonKind.WALL: "false: its points are a part of something larger",
-    ReasonKind.DETECTOR_ERROR: "false: no label is in reach; it is unlabelled, or the detector's own error",
-    ReasonKind.FAILED: "a stage failed",
-    ReasonKind.OUT_OF_VIEW: "no camera sees it",
-    ReasonKind.HIDDEN: "fewer than three points; most returns in its direction end before it",
-    ReasonKind.NO_POINTS: "the LiDAR has fewer than three points there",
-    ReasonKind.GROUND: "most of it was removed as ground",
-    ReasonKind.NOISE: "no point has clustering.min_points neighbours within clustering.eps",
-    ReasonKind.NO_CLUSTER: "your function or the robot lost it",
-    ReasonKind.TOO_SMALL: "its cluster has too few points",
-    ReasonKind.TOO_LARGE: "its cluster has too many points",
-    ReasonKind.NOT_RUN: "no model, no image or no camera",
-    ReasonKind.NOT_DETECTED: "the detector has no candidate there",
-    ReasonKind.BELOW_THRESHOLD: "the detector's score is too low",
-    ReasonKind.SUPPRESSED: "a better detection overlaps it; the answer names it and the IoU",
-    ReasonKind.SECOND_NAME: "probably a second box of a reported thing: nothing was missed",
-    ReasonKind.NOT_FUSED: "its camera lacks a calibration or a pose",
-    ReasonKind.LOW_OVERLAP: "its points cover too little of the image box",
-    ReasonKind.TOO_FEW_POINTS: "too few of its points are in the image box",
-    ReasonKind.TOO_FAR: "it is too far away, for `reference` too many pixels from the image box",
-    ReasonKind.TAKEN: "a better detection has its cluster",
-    ReasonKind.MISFIT: "no candidate in the frustum is rated high enough",
-    ReasonKind.OTHER_CLUSTER: "its detection has another cluster",
-    ReasonKind.CONTRADICTED: "your function or the robot has it, and a camera that sees the place does not",
-    ReasonKind.NOT_AMONG: "it is not among the objects of your function or of the robot",
-    ReasonKind.LOST_IN_FUSION: "the robot has its cluster and its detection, and no object of them",
-}
+
+def facts_of(kind: str) -> ReasonFacts:
+    """Return the facts of a kind of reason. Kinds that no answer has have no facts."""
+    return FACTS.get(kind, ReasonFacts(""))
 
 
 @lru_cache(typed=True)  # members of two enumerations are equal numbers
@@ -185,7 +297,7 @@ def _unit(key: str) -> str:
 
 def limit_of(kind: ReasonKind, config: Config) -> Limit | None:
     """Return the parameter that decides about a kind of reason, None if there is none."""
-    key = PARAMETERS.get(kind)
+    key = facts_of(kind).decides
     if kind is ReasonKind.TOO_FAR and config.fusion.method == "centroid":
         key = "fusion.match_radius"
     return limit(config, key) if key else None

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from bevviz.config import Config, parameters, plugin_of, preset_differences, values
 from bevviz.errors import UserError
-from bevviz.model.reasons import STAGES, Reason, ReasonKind
+from bevviz.model.reasons import Reason, ReasonKind, facts_of
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
@@ -134,7 +134,7 @@ def changes_for(
         is_false: whether it is a false object.
     """
     result = traces.result
-    stage = STAGES.get(reason.kind, "")
+    stage = facts_of(reason.kind).stage
     section = "objects" if stage == "fusion" else stage
     if stage in _NEAR and not traces.origin(section).ours:
         yield from _function_changes(result, section)
@@ -237,7 +237,7 @@ def _stated_height(reason: Reason, result: FrameResult) -> Iterator[Change]:
 def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
     """Yield the preset's value of each number that was changed in a stage that may have lost the subject."""
     differing = preset_differences(config)
-    for section in _NEAR.get(STAGES.get(kind, ""), ()):
+    for section in _NEAR.get(facts_of(kind).stage, ()):
         for key, value in differing.items():
             if key.startswith(f"{section}.") and isinstance(value, int | float):
                 yield {key: value}

@@ -18,7 +18,7 @@ from bevviz.config import Config
 from bevviz.evaluate import Matches, Truth, judge
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.model.frame import Boxes3D, Frame
-from bevviz.model.reasons import STAGES, Reason
+from bevviz.model.reasons import Reason, facts_of
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.session import Variants
 from bevviz.why.answer import FrameExplainer
@@ -141,7 +141,7 @@ class Outcome:
             label=label.lower(),
             configuration=self.configuration,
             state=state,
-            stage="" if reason is None else STAGES.get(reason.kind, ""),
+            stage="" if reason is None else facts_of(reason.kind).stage,
             reason="" if reason is None else reason.kind.value,
             x=x,
             y=y,

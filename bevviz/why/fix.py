@@ -19,6 +19,7 @@ from bevviz.evaluate.differences import before_after
 from bevviz.evaluate.f1_change import f1, f1_change
 from bevviz.evaluate.ground_truth import Truth, truth_source
 from bevviz.model.frame import F64, Frame
+from bevviz.model.reasons import FACTS, facts_of
 from bevviz.pipeline.session import Variants
 from bevviz.support.json_form import json_form, rounded
 from bevviz.why.experiment import Experiment, Outcome
@@ -30,43 +31,6 @@ OF_CAUSE = 0.5  # share of these frames that have findings of the cause
 FEW = 6  # drives below which parts of drives are left out instead of whole drives
 PARTS = 10  # of a drive
 COMMON = 0.05  # least share of a reason among the findings whose parameters are searched
-
-_GROUND = ("ground.distance_threshold", "ground.method", "clustering.min_points", "voxel.size")
-_GROUPS = ("clustering.eps", "clustering.min_points", "clustering.min_cluster_points", "voxel.size")
-_MATCH = ("fusion.min_rating", "fusion.min_iou", "fusion.min_points", "fusion.split", "fusion.method")
-# Parameters that a reason depends on. The first one decides; the others change how often it comes to that.
-PARAMETERS: Mapping[str, tuple[str, ...]] = {
-    "ground": (*_GROUND, "clustering.min_cluster_points"),
-    "noise": (*_GROUPS, "ground.distance_threshold"),
-    "no cluster": (*_GROUPS, "ground.distance_threshold", "fusion.max_depth"),
-    "no points": ("voxel.size",),
-    "too small": ("clustering.min_cluster_points", "clustering.eps", "clustering.min_points", "voxel.size"),
-    "too large": ("clustering.max_cluster_points", "clustering.eps"),
-    "merged": ("clustering.eps", "fusion.split", "fusion.min_rating", "fusion.method", "voxel.size"),
-    "split": ("clustering.eps", "clustering.min_points", "fusion.split", "voxel.size"),
-    "misplaced": ("clustering.eps", "fusion.split", "fusion.method", "voxel.size"),
-    "not detected": ("detector.conf_threshold",),
-    "below threshold": ("detector.conf_threshold", "fusion.min_rating"),
-    "suppressed": ("detector.iou_threshold",),
-    "low overlap": ("fusion.min_iou", "clustering.eps", "fusion.method", "fusion.split"),
-    "misfit": ("fusion.min_rating", "fusion.split", "clustering.eps"),
-    "too few points": (
-        "fusion.min_points",
-        "clustering.min_points",
-        "voxel.size",
-        "ground.distance_threshold",
-    ),
-    "too far": ("fusion.max_depth", "fusion.method", "ground.distance_threshold"),
-    "taken": ("fusion.method", "clustering.eps", "detector.iou_threshold", "fusion.min_iou"),
-    "other cluster": ("fusion.method", "clustering.eps", "fusion.split"),
-    "borrowed name": ("fusion.method", "clustering.eps", "fusion.split"),
-    "shared box": ("fusion.method", "fusion.split"),
-    "misnamed": ("fusion.method", "detector.iou_threshold", "detector.conf_threshold"),
-    "duplicate": ("detector.iou_threshold", "clustering.eps", "fusion.split", *_MATCH[:2]),
-    "wrong depth": (*_MATCH, "clustering.eps"),
-    "wall in the frustum": (*_MATCH, "clustering.eps"),
-    "detector's own error": ("detector.conf_threshold", "fusion.min_rating", "fusion.min_iou"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,9 +284,9 @@ def keys_for(reasons: Mapping[str, int], config: Config | None = None) -> list[s
     keys: dict[str, None] = {}
     for reason, number in sorted(reasons.items(), key=lambda item: -item[1]):
         if number >= COMMON * total:
-            keys |= dict.fromkeys(PARAMETERS.get(reason, ()))
+            keys |= dict.fromkeys(facts_of(reason).searched)
     if keys and config is not None:
-        known = {key for of_reason in PARAMETERS.values() for key in of_reason}
+        known = {key for facts in FACTS.values() for key in facts.searched}
         keys |= dict.fromkeys(key for key in preset_differences(config) if key in known)
     return list(keys)
 

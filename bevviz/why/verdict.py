@@ -9,7 +9,7 @@ import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_reason
-from bevviz.model.reasons import STAGES, Reason, ReasonKind
+from bevviz.model.reasons import Reason, ReasonKind, facts_of
 from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.false_objects import false_reasons
@@ -105,7 +105,7 @@ def stage_of(kind: ReasonKind, evidence: Evidence) -> str:
         return "detector" if evidence.named.own else "fusion"
     if kind is ReasonKind.MERGED and evidence.joined_by is not None:
         return "fusion"
-    return STAGES.get(kind, "")
+    return facts_of(kind).stage
 
 
 def ground_lost(subject: Subject, evidence: Evidence) -> int:

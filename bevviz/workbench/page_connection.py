@@ -15,7 +15,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from bevviz.errors import UserError, first_line
 from bevviz.evaluate.metrics import METRICS
 from bevviz.findings.finding_list import DIFFERENCES
-from bevviz.model.reasons import MEANINGS
+from bevviz.model.reasons import FACTS
 from bevviz.support.colors import class_color
 from bevviz.support.loggers import logger
 
@@ -116,7 +116,7 @@ class PageConnection:
             "classes": {name: f"rgb{class_color(name)}" for name in LEGEND},
             "controls": self._controls,
             "meanings": {
-                **{kind.value: text for kind, text in MEANINGS.items()},
+                **{str(kind): facts.meaning for kind, facts in FACTS.items()},
                 **DIFFERENCES,
                 "F1": METRICS["f1"],
             },

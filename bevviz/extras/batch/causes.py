@@ -21,7 +21,7 @@ from bevviz.errors import UserError
 from bevviz.extras.batch.condition_search import LEAST_UNITS, Attribute, Condition, Slice, find_slices
 from bevviz.extras.batch.findings import FINDINGS
 from bevviz.model.frame import F32, I64, Bool
-from bevviz.model.reasons import PARAMETERS, STAGES, ReasonKind
+from bevviz.model.reasons import ReasonKind, facts_of
 from bevviz.support import table as text_table
 from bevviz.support.json_form import LEFT_OUT, WhereKnown, json_form, rounded
 
@@ -350,8 +350,8 @@ class Cause:
     @property
     def decided_by(self) -> str:
         """The stage of its reason and the parameter that decides, in words; empty: an anomaly."""
-        stage = STAGES.get(self.reason, "")
-        parameter = "" if self.reason == ReasonKind.NOT_DETECTED else PARAMETERS.get(self.reason, "")
+        stage = facts_of(self.reason).stage
+        parameter = "" if self.reason == ReasonKind.NOT_DETECTED else facts_of(self.reason).decides
         return f"stage {stage}{f', {parameter} decides' if parameter else ''}" if stage else ""
 
 
@@ -530,7 +530,7 @@ def _causes_of(findings: Findings, kind: str, rows: I64) -> list[Cause]:
         [(reason, most)] = _reasons(findings, rows[found.positives]).most_common(1)
         named = {condition.attribute for condition in found.conditions} - {"class"}
         # A far object of few points is lost by any detector. That is a cause where another stage loses it.
-        is_hard = bool(named) and named <= HARD and STAGES.get(reason) in (None, "sensors", "detector")
+        is_hard = bool(named) and named <= HARD and facts_of(reason).stage in ("", "sensors", "detector")
         return is_plain and most >= ONE_REASON * len(found.positives) and not is_hard
 
     slices = find_slices([attribute for attribute, _ in scales], targets, units, MOST, accepts)

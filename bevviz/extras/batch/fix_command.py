@@ -98,8 +98,9 @@ def _is_batch(options: FixOptions) -> bool:
 def _of_batch(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]]:
     """Return the configuration and the drives of a batch, and the parameters to search."""
     from bevviz.extras.batch.causes import Findings, find_causes
+    from bevviz.model.reasons import FACTS
     from bevviz.recording.source_lookup import find_source
-    from bevviz.why.fix import PARAMETERS, keys_for
+    from bevviz.why.fix import keys_for
 
     folder, search = options.drive.paths[0], options.search
     findings = Findings.load(folder)
@@ -115,7 +116,7 @@ def _of_batch(options: FixOptions) -> tuple[Config, list[DriveFrames], list[str]
                 f"--cause {search.cause}: {cause.kind}: no ground truth tells what is right there"
             )
         if not keys_for(cause.reasons) and not search.parameter:
-            known = ", ".join(PARAMETERS)
+            known = ", ".join(kind for kind, facts in FACTS.items() if facts.searched)
             raise UserError(f"--cause {search.cause}: no parameter decides it; one does for: {known}")
     drives = _drives_of(findings, cause)
     if not drives:
