@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from bevviz.export.folder import rectify
+from bevviz.extras.datasets.folder_export import rectify
 from bevviz.live.live_message import LiveMessage
 from bevviz.messages import (
     camera_info,

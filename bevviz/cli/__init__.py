@@ -34,7 +34,6 @@ CORE = {
     "why": ("why", "why an object was reported, or was not"),
     "compare": ("compare", "what if? two configurations, or the robot"),
     "evaluate": ("evaluate", "how right it is, where the truth is known; a gate for CI"),
-    "export": ("export", "write frames as KITTI or nuScenes, with what was found as labels"),
     "report": ("report", "a bug report that stands on its own, and its check"),
     "recover": ("recover", "a sound copy of a damaged bag"),
     "cut": ("cut", "a window of a drive with chosen topics, as a bag"),

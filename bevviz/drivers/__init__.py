@@ -1,1 +1,1 @@
-"""Decoders of Livox scans, compressed clouds and video. Imports `messages` and layers below it."""
+"""Decoders of compressed clouds and video. Imports `messages` and layers below it."""

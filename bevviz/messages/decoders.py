@@ -133,7 +133,6 @@ def either(msg: Any, *names: str) -> Any:
 
 # Names, not imports: drivers import this package. Each names a Decoder or a sequence of them.
 BUILT_IN = (
-    "bevviz.drivers.livox:DECODER",
     "bevviz.drivers.compressed_clouds:DECODER",
     "bevviz.messages.foxglove:DECODERS",
     "bevviz.drivers.video:DECODERS",

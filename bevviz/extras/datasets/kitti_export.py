@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bevviz.export.folder import FolderExport, encode_image, rectify
+from bevviz.extras.datasets.folder_export import FolderExport, encode_image, rectify
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Camera, Intrinsics
 from bevviz.model.results import FrameResult, Objects

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevviz.export.folder import FolderExport, encode_image, rectify
+from bevviz.extras.datasets.folder_export import FolderExport, encode_image, rectify
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, F64, Camera, Frame

@@ -1,1 +1,1 @@
-"""Packets of Ouster, Hesai and Velodyne LiDARs, network captures of them, and clouds compressed by draco."""
+"""Scans of Livox LiDARs, packets of Ouster, Hesai and Velodyne, network captures, and clouds by draco."""

@@ -18,7 +18,7 @@ import bevviz
 from bevviz.cli import main
 from bevviz.datasets.kitti_labels import read_labels
 from bevviz.errors import UserError
-from bevviz.export.folder import FolderExport, rectify
+from bevviz.extras.datasets.folder_export import FolderExport, rectify
 from bevviz.extras.datasets.kitti_export import KittiExport, label_lines
 from bevviz.extras.datasets.nuscenes_export import TABLES, VERSION, NuScenesExport
 from bevviz.model import geometry

@@ -50,13 +50,14 @@ class ExportOptions:
 
 @command(
     "export",
+    help="write frames as KITTI or nuScenes, with what was found as labels",
     description=DESCRIPTION,
     epilog=EPILOG,
 )
 def _export(options: ExportOptions) -> int:
     from bevviz.anomalies import FailureSummary
     from bevviz.drive import Drive
-    from bevviz.export.folder import FolderExport
+    from bevviz.extras.datasets.folder_export import FolderExport
     from bevviz.support.extensions import load_class
 
     output = options.output

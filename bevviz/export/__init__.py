@@ -1,1 +1,0 @@
-"""Export of a drive as a data set. Imports `pipeline` and the layers below it."""
