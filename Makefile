@@ -11,7 +11,7 @@ PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --m
 # One part of N of the long tests, as K/N. All of them without it.
 SHARE ?= 0/1
 
-.PHONY: demo test test-long test-fast check docs bench accuracy constraints sbom wheel clean
+.PHONY: demo test test-long test-fast check page-check docs bench accuracy constraints sbom wheel clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bevviz demo
@@ -33,6 +33,16 @@ check: $(VENV)/.tested
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The page's scripts: types, rules and tests. It needs Node.js 18 or newer, with npm.
+page-check: tests/page/node_modules/.installed
+	tests/page/node_modules/.bin/tsc --project tests/page
+	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.js bevviz/workbench/page tests/page
+	node --test tests/page/*.test.js
+
+tests/page/node_modules/.installed: tests/page/package-lock.json
+	npm ci --prefix tests/page --no-audit --no-fund
+	touch $@
 
 docs: $(VENV)/.tested
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -86,4 +96,4 @@ $(VENV)/.tested: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf .venv* build dist
+	rm -rf .venv* build dist tests/page/node_modules

@@ -1,43 +1,62 @@
 // Connection to the server: send questions, receive answers and recordings, reconnect.
 
-import { nextPicture } from "./idle_drawing.js";
+import { nextPicture } from "./rerun_patches.js";
 import { $, state } from "./page_state.js";
 import { kind, toViewer, viewerReady } from "./viewer.js";
 
 const RETRY = 1500; // ms between attempts to reach the server
 const LIMIT = 300e6; // bytes of frames on demand that the viewer holds, which take nearly three times the memory
 
+/** @import { FromPage, ToPage, AnswerMessage, Error } from "./types" */
+/** @typedef {ToPage | AnswerMessage} Message */
+/** @typedef {{ [K in Message["type"]]: (message: Extract<Message, { type: K }>) => void }} Handlers */
+/** @typedef {FromPage extends infer M ? M extends FromPage ? Omit<M, "id"> : never : never} Sent a message without its number */
+/** @typedef {{ made: (frame: number) => void, full: () => void, gone: () => void }} Happenings a frame came; no more is held; no server */
+
+/** @type {WebSocket | null} */
 let questions = null; // socket of the questions and answers
 let number = 0; // of the newest question
+/** @type {Partial<Handlers & Happenings>} */
 const handlers = {};
+/** @type {Map<number, (message: Error) => void>} */
 const failures = new Map(); // what to do with the error of a message, by its number
-export const on = (more) => Object.assign(handlers, more);
+export const on = (/** @type {Partial<Handlers & Happenings>} */ more) => Object.assign(handlers, more);
 
-const socketAt = (path) => new WebSocket(`ws://${location.host}${path}`);
+const socketAt = (/** @type {string} */ path) => new WebSocket(`ws://${location.host}${path}`);
 const pieces = new Map(); // number of pieces that the viewer has received of each recording
-const counted = (lane) => pieces.get(lane) ?? 0;
+const counted = (/** @type {string} */ lane) => pieces.get(lane) ?? 0;
 let early = 0; // number of frames that were requested out of order
 let held = 0; // bytes of frames on demand that the viewer holds
+/** @type {WebSocket | null} */
 let recording = null; // socket of the run
 let overlay = ""; // name of this page's answers and tried results; a robot has none
+/** @type {Map<string, WebSocket>} */
 const others = new Map(); // sockets of the overlay, and of runs with other values
 
-// Request the frame of this stamp next, if the viewer does not have it yet.
+/**
+ * Request the frame of this stamp next, if the viewer does not have it yet.
+ * @param {string | null} stamp
+ */
 export function want(stamp) {
   if (recording?.readyState !== WebSocket.OPEN) return;
   if (!state.demand) early += 1;
   recording.send(String(stamp));
 }
 
-// Receive the recording of a run with other values, because its settings are shown.
+/**
+ * Receive the recording of a run with other values, because its settings are shown.
+ * @param {string} lane
+ */
 export function follow(lane) {
   if (counted("recording") && !others.has(lane)) others.set(lane, receive(lane)); // The layout has to arrive first.
 }
 
+/** @param {string} lane */
 function receive(lane) {
   const first = counted(lane) - Math.min(counted(lane), lane === "recording" ? early : 0);
   const socket = socketAt(`/recording?lane=${lane}&from=${first}`);
   socket.binaryType = "arraybuffer";
+  /** @type {number | null} */
   let announced = null; // number of the frame on demand that comes next
   socket.onmessage = ({ data }) => {
     if (typeof data === "string") { announced = Number(data); return; }
@@ -46,9 +65,9 @@ function receive(lane) {
     if (announced === null) pieces.set(lane, counted(lane) + 1);
     else {
       held += data.byteLength;
-      handlers.made(announced);
+      handlers.made?.(announced);
       announced = null;
-      if (held > LIMIT) handlers.full();
+      if (held > LIMIT) handlers.full?.();
     }
     for (const one of awaited.filter(([, count]) => counted(overlay) >= count)) one[0]();
     awaited = awaited.filter(([, count]) => counted(overlay) < count);
@@ -71,15 +90,16 @@ export function connect() {
   questions = socketAt("/talk");
   questions.onopen = () => { alarm(""); };
   questions.onmessage = ({ data }) => {
+    /** @type {Message} */
     const message = JSON.parse(data);
     if (message.type === "welcome") {
       if (state.run && state.run !== message.run) { location.reload(); return; }
-      handlers.welcome(message);
+      handlers.welcome?.(message);
       overlay = message.overlay;
       viewerReady.then(() => { recording = receive("recording"); });
     } else if (message.type === "failed") alarm(message.text);
-    else if (message.type === "error") (failures.get(message.id) ?? handlers.error)(message);
-    else handlers[message.type]?.(message);
+    else if (message.type === "error") (failures.get(message.id ?? 0) ?? handlers.error)?.(message);
+    else /** @type {(message: Message) => void} */ (handlers[message.type])?.(message);
   };
   questions.onclose = () => {
     for (const socket of [recording, ...others.values()]) socket?.close();
@@ -96,27 +116,37 @@ export function connect() {
   };
 }
 
+/** @param {string} text */
 function alarm(text) {
   $("gone").textContent = text;
   $("gone").hidden = !text;
 }
 
-// Send a message. An error in reply to it goes to `failed`, which names the thing that it is about.
+/**
+ * Send a message. An error in reply to it goes to `failed`, which names the thing that it is about.
+ * @param {Sent} message
+ * @param {(message: Error) => void} [failed]
+ */
 export function send(message, failed) {
   number += 1;
   if (failed) failures.set(number, failed);
   failures.delete(number - 100);
-  if (isConnected()) questions.send(JSON.stringify({ id: number, ...message }));
+  if (isConnected()) questions?.send(JSON.stringify({ id: number, ...message }));
   return number;
 }
 
 export const isConnected = () => questions?.readyState === WebSocket.OPEN;
 
 // Whether another page asked for a job.
-export const isOthers = (job) => Boolean(overlay) && job.asked_by !== overlay;
+export const isOthers = (/** @type {{ asked_by: string }} */ job) => Boolean(overlay) && job.asked_by !== overlay;
 
-// Call a function once the viewer has so many pieces of the overlay.
+/** @type {[() => void, number][]} */
 let awaited = [];
+/**
+ * Call a function once the viewer has so many pieces of the overlay.
+ * @param {number} count
+ * @param {() => void} then
+ */
 export function withPieces(count, then) {
   if (counted(overlay) >= count) then();
   else awaited.push([then, count]);

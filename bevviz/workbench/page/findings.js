@@ -1,7 +1,7 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
 import { $, at, element, remember, spanText, state, stated } from "./page_state.js";
-import { away, cause, csv, hasCause, KINDS, matches, offerFilters, severity, sorted } from "./triage.js";
+import { away, cause, csv, hasCause, KINDS, matches, severity, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
@@ -9,20 +9,43 @@ const REMARKED = 10; // rows whose hint is searched without a click
 const PAUSE = 200; // ms between two updates of the page
 const DOTS = 3; // most reasons of a severity
 
+/** @import { Entries, HandledEntry, NoteEntry, Notes, Origin, Remark, Row, Span } from "./types" */
+/** @import { Finding, RowSight } from "./triage.js" */
+
+/**
+ * What the panel does. A robot has neither hints behind the list nor a bag to keep notes beside.
+ * @typedef {object} Actions
+ * @property {(what: { pick: string, origin: Origin }) => void} ask
+ * @property {(withThem: boolean) => void} tryOut
+ * @property {() => string[]} triedSet values of the newest trial
+ * @property {() => void} forget
+ * @property {(span: Span) => void} markSpan
+ * @property {(rows: Finding[]) => void} drawn
+ * @property {(rows: Row[]) => void} [remarks]
+ * @property {(finding: HandledEntry) => void} [handle]
+ * @property {(note: NoteEntry) => void} unnote
+ */
+
+/** @type {Map<number | string, Finding>} */
 const entries = new Map(); // findings by number, notes by stamp and text
 const hidden = new Set(["handled"]); // kinds that the user has switched off
+/** @type {HandledEntry[]} */
 let handled = []; // findings that the user has marked as done or ignored
+/** @type {Finding[]} */
 let rows = []; // findings in the table, in order
+/** @type {number | string | null} */
 let current = null; // key of the newest finding that was chosen
 let isSubject = false; // what is asked about is the chosen finding
 let sight = 0; // index of the chosen frame of the finding
-const does = {}; // what the panel does: ask, tryOut, forget, remarks, unnote, handle, drawn
+/** @type {Actions} */
+let does;
 
+/** @param {Actions} actions */
 export function start(actions) {
-  Object.assign(does, actions);
+  does = actions;
   $("next").onclick = () => step(1);
   $("previous").onclick = () => step(-1);
-  for (const id of ["here", "grouped", "class", "reason", "within"]) $(id).onchange = draw;
+  for (const id of /** @type {const} */ (["here", "grouped", "class", "reason", "within"])) $(id).onchange = draw;
   $("find").oninput = draw;
   $("csv").onclick = save;
 }
@@ -32,29 +55,34 @@ export function restart() {
   current = null;
 }
 
+/** @param {Entries} message */
 export function update(message) {
   for (const number of message.gone) entries.delete(number);
   for (const one of message.entries) {
     const known = entries.get(one.number);
     if (known) known.sights.push(...one.sights);
-    else entries.set(one.number, { key: one.number, ...one });
+    else entries.set(one.number, { key: one.number, best: 0, handled: null, ...one });
   }
   draw();
 }
 
+/** @param {Notes} message */
 export function notes(message) {
   for (const key of [...entries.keys()]) if (typeof key === "string") entries.delete(key);
   for (const one of message.notes) {
     const key = `${one.stamp} ${one.text}`;
     const sights = [{ frame: null, stamp: one.stamp, distance: null, pick: one.pick, tried: false, text: one.text, remark: "", in_way: false }];
-    entries.set(key, { key, what: "note", name: one.about || (one.end === "0" ? "frame" : "span"), sights, note: one });
+    entries.set(key, { key, what: "note", name: one.about || (one.end === "0" ? "frame" : "span"), sights, best: 0, handled: null, note: one });
   }
   handled = message.findings;
   $("note-error").textContent = message.error;
   draw();
 }
 
-// Show in the row of an object whether a change helps.
+/**
+ * Show in the row of an object whether a change helps.
+ * @param {Omit<Remark, "type">} row
+ */
 export function explain({ frame, pick, remark, chip }, tried = false) {
   for (const { sights } of entries.values()) {
     const one = sights.find((other) => other.frame === frame && other.pick === pick && other.tried === tried);
@@ -72,13 +100,13 @@ export function leave() {
 
 // --- drawing ------------------------------------------------------------------------------------
 
-const nearest = (entry) => entry.sights.reduce((best, one, row) => (away(one) < away(entry.sights[best]) ? row : best), 0);
-const here = (entry) => entry.sights.findIndex((one) => Math.abs(Number(one.stamp) - Number(state.time)) < 2000);
-const kindOf = (entry) => (entry.handled ? "handled" : entry.what);
+const nearest = (/** @type {Finding} */ entry) => entry.sights.reduce((best, one, row) => (away(one) < away(entry.sights[best]) ? row : best), 0);
+const here = (/** @type {Finding} */ entry) => entry.sights.findIndex((one) => Math.abs(Number(one.stamp) - Number(state.time)) < 2000);
+const kindOf = (/** @type {Finding} */ entry) => (entry.handled ? "handled" : entry.what);
 
 // A mark belongs to the finding that has its object at its frame.
-const marks = (entry) => (mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
-  one.stamp === mark.stamp && one.pick === mark.pick && (one.distance === mark.distance || Math.abs(one.distance - mark.distance) < 0.5)));
+const marks = (/** @type {Finding} */ entry) => (/** @type {HandledEntry} */ mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
+  one.stamp === mark.stamp && one.pick === mark.pick && Math.abs((one.distance ?? 0) - (mark.distance ?? 0)) < 0.5));
 
 let waiting = 0;
 export function draw() {
@@ -96,13 +124,14 @@ function redraw() {
     entry.handled = handled.find(marks(entry)) ?? null;
   }
   offerFilters([...entries.values()]);
-  const shown = [...entries.values()].filter((entry) => (!only || here(entry) >= 0) && matches(entry));
-  rows = sorted(shown.filter((entry) => !hidden.has(kindOf(entry))));
+  const filters = { words: $("find").value, class: $("class").value, reason: $("reason").value, within: $("within").value };
+  const shown = [...entries.values()].filter((entry) => (!only || here(entry) >= 0) && matches(entry, filters));
+  rows = sorted(shown.filter((entry) => !hidden.has(kindOf(entry))), $("grouped").checked);
   $("found-none").hidden = rows.length > 0;
   $("found-none").textContent = entries.size ? "No finding matches." : "None so far.";
   $("found-title").textContent = `Worth a look: ${rows.length}`;
   kinds(shown);
-  let before = null;
+  let before = "";
   replaceRows(rows.slice(0, SHOWN).flatMap((entry) => {
     const head = $("grouped").checked && cause(entry) !== before;
     before = cause(entry);
@@ -110,103 +139,141 @@ function redraw() {
     return head ? [element("li", "group", `${before}: ${number}`), drawn(entry)] : [drawn(entry)];
   }));
   requestRemarks();
-  does.drawn?.(rows);
+  does.drawn(rows);
   begin();
 }
 
-// Replace the rows that differ. A row that is replaced while a mouse button is down on it misses the click.
+/**
+ * Offer the classes and reasons that the drive has. The chosen one stays.
+ * @param {Finding[]} entries
+ */
+function offerFilters(entries) {
+  const objects = entries.filter(hasCause);
+  const offer = (/** @type {HTMLSelectElement} */ select, /** @type {string} */ first, /** @type {string[]} */ names) => {
+    const options = [...new Set(names)].filter(Boolean).sort();
+    if (select.value && !options.includes(select.value)) options.push(select.value);
+    if ([...select.options].slice(1).map((one) => one.value).join() === options.join()) return;
+    const chosen = select.value;
+    select.replaceChildren(new Option(first, ""), ...options.map((name) => new Option(name, name)));
+    select.value = chosen;
+  };
+  offer($("class"), "any class", objects.map((entry) => entry.name));
+  offer($("reason"), "any reason", objects.map(cause));
+}
+
+/**
+ * Replace the rows that differ. A row that is replaced while a mouse button is down on it misses the click.
+ * @param {HTMLLIElement[]} items
+ */
 function replaceRows(items) {
   const list = $("found");
   for (const [row, item] of items.entries()) {
-    const known = list.children[row];
+    const known = /** @type {HTMLElement | undefined} */ (list.children[row]);
     if (!known) list.append(item);
     else if (known.dataset.key !== item.dataset.key || known.outerHTML !== item.outerHTML) known.replaceWith(item);
   }
-  while (list.children.length > items.length) list.lastChild.remove();
+  while (list.children.length > items.length) list.lastChild?.remove();
 }
 
 // Ask for the sentences that the first rows lack. The server answers when it has nothing else to do.
 let requested = "";
 function requestRemarks() {
   const lacking = rows.slice(0, REMARKED).map((entry) => entry.sights[entry.best])
-    .filter((one) => one.pick && !one.tried && !one.remark && one.frame !== null).map(({ frame, pick }) => ({ frame, pick }));
+    .flatMap(({ frame, pick, tried, remark }) => (pick && !tried && !remark && frame !== null ? [{ frame, pick }] : []));
   if (!lacking.length || JSON.stringify(lacking) === requested) return;
   requested = JSON.stringify(lacking);
   does.remarks?.(lacking);
 }
 
+/** @param {Finding[]} shown */
 function kinds(shown) {
   const counts = new Map();
   for (const entry of shown) counts.set(kindOf(entry), (counts.get(kindOf(entry)) ?? 0) + 1);
   const offered = [...KINDS, "handled"].filter((kind) => counts.has(kind) || (hidden.has(kind) && kind !== "handled"));
-  const text = (kind) => `${kind} ${counts.get(kind) ?? 0}`;
+  const text = (/** @type {string} */ kind) => `${kind} ${counts.get(kind) ?? 0}`;
   const same = [...$("kinds").children].map((one) => one.textContent).join() === offered.map(text).join();
   if (same) return;
   $("kinds").replaceChildren(...offered.map((kind) => {
     const button = element("button", kind.replace(" ", "-"), text(kind));
-    button.setAttribute("aria-pressed", !hidden.has(kind));
+    button.ariaPressed = String(!hidden.has(kind));
     button.onclick = () => {
       if (!hidden.delete(kind)) hidden.add(kind);
-      button.setAttribute("aria-pressed", !hidden.has(kind));
+      button.ariaPressed = String(!hidden.has(kind));
       redraw();
     };
     return button;
   }));
 }
 
-const isSpan = (entry) => Boolean(entry.note) && entry.note.end !== "0";
+/**
+ * The span that a note is about.
+ * @param {Finding} entry
+ */
+const spanOf = ({ note }) => (note && note.end !== "0" ? { first: note.stamp, last: note.end } : null);
 
+/** @param {Finding} entry */
 function frames(entry) {
-  const numbers = entry.sights.map((one) => one.frame);
+  const numbers = entry.sights.map((one) => Number(one.frame));
   if (numbers.length < 2) return "";
   const [low, high] = [Math.min(...numbers), Math.max(...numbers)];
   return high - low + 1 === numbers.length ? `frames ${low}–${high}` : `${numbers.length} frames, ${low}–${high}`;
 }
 
+/** @param {Finding} entry */
 function drawn(entry) {
   const isChosen = isSubject && entry.key === current;
   const one = entry.sights[isChosen ? Math.min(sight, entry.sights.length - 1) : entry.best];
-  const reasons = severity(entry);
+  const [reasons, span, { note }] = [severity(entry), spanOf(entry), entry];
   const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
   const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
   dots.title = reasons.join("; ") || "no reason to hurry";
   const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one.distance === null ? "" : `${one.distance} m`),
     element("span", "reason", one.text)];
-  const button = element("button", "", "", dots, element("span", "time", isSpan(entry) ? spanText({ first: one.stamp, last: entry.note.end }) : at(one.stamp, one.frame)),
+  const button = element("button", "", "", dots, element("span", "time", span ? spanText(span) : at(one.stamp, one.frame)),
     element("span", entry.what.replace(" ", "-"), entry.what), name, away, reason);
   reason.title = state.meanings[one.text] ?? one.text;
   button.title = [frames(entry), one.remark].filter((more) => more?.trim()).join("\n");
   if (one.chip) button.append(element("span", `chip ${one.chip.replaceAll(" ", "-")}`, one.chip));
-  button.setAttribute("aria-current", isChosen);
+  button.ariaCurrent = String(isChosen);
   button.onclick = () => choose(entry, isChosen ? sight + 1 : entry.best);
   const item = element("li", entry.handled ? "handled" : "", "", button);
-  item.dataset.key = entry.key;
-  if (entry.note) item.append(small("×", "remove this note", () => does.unnote(entry.note)));
+  item.dataset.key = String(entry.key);
+  if (note) item.append(small("×", "remove this note", () => does.unnote(note)));
   else if (entry.handled) {
     const { state: became, text: why } = entry.handled;
     item.append(element("span", "faint", `${became}${why ? `: ${why}` : ""}`), small("reopen", "list it again", () => mark(entry, "")));
   } else if (isChosen && does.handle && (hasCause(entry) || entry.what === "anomaly") && !one.tried) {
     const why = element("input", "", "");
     why.placeholder = "why (optional)";
-    why.setAttribute("aria-label", "why it is done or ignored");
+    why.ariaLabel = "why it is done or ignored";
     item.append(why, small("done", "it is dealt with", () => mark(entry, "done", why.value)),
       small("ignore", "it is of no concern", () => mark(entry, "ignored", why.value)));
   }
   return item;
 }
 
+/**
+ * @param {string} text
+ * @param {string} meaning
+ * @param {() => void} action
+ */
 function small(text, meaning, action) {
   const button = element("button", "small", text);
   button.title = meaning;
-  button.setAttribute("aria-label", meaning);
+  button.ariaLabel = meaning;
   button.onclick = action;
   return button;
 }
 
+/**
+ * @param {Finding} entry
+ * @param {string} became
+ * @param {string} text
+ */
 function mark(entry, became, text = "") {
   const one = entry.sights[entry.best];
   const known = entry.handled ?? { stamp: one.stamp, what: entry.what, name: entry.name, pick: one.pick, distance: one.distance };
-  does.handle({ ...known, state: became, text });
+  does.handle?.({ ...known, state: became, text });
 }
 
 function save() {
@@ -235,6 +302,7 @@ function begin() {
   }
 }
 
+/** @param {number} by */
 export function step(by) {
   if (!rows.length) return;
   const at = rows.findIndex((entry) => entry.key === current);
@@ -242,6 +310,11 @@ export function step(by) {
   choose(entry, entry.best);
 }
 
+/**
+ * @param {Finding} entry
+ * @param {number} which index of the sight
+ * @param {boolean} scrolls
+ */
 export function choose(entry, which, scrolls = true) {
   current = entry.key;
   isSubject = true;
@@ -250,13 +323,14 @@ export function choose(entry, which, scrolls = true) {
   redraw();
   showRow(scrolls);
   if (tried || entry.what.endsWith("gone")) does.tryOut(tried);
-  const origin = { time: Number(stamp), set: tried ? does.tryOut.settings() : [] }; // The pick is valid there.
+  const origin = { time: Number(stamp), set: tried ? does.triedSet() : [] }; // The pick is valid there.
   remember(Boolean(state.pick));
   [state.pick, state.origin] = [pick, origin];
   seek(stamp);
   showSide();
   remember();
-  if (isSpan(entry)) does.markSpan({ first: stamp, last: entry.note.end });
+  const span = spanOf(entry);
+  if (span) does.markSpan(span);
   if (pick) does.ask({ pick, origin });
   else does.forget();
 }
@@ -270,9 +344,13 @@ export function showAnswer() {
   scrollsToAnswer = false;
 }
 
-// Scroll the list to the chosen row, and a wide panel to the list.
+/**
+ * Scroll the list to the chosen row, and a wide panel to the list.
+ * @param {boolean} scrolls
+ */
 function showRow(scrolls) {
-  const [list, item] = [$("found"), [...$("found").children].find((one) => one.dataset.key === String(current))];
+  const list = $("found");
+  const item = /** @type {HTMLElement[]} */ ([...list.children]).find((one) => one.dataset.key === String(current));
   if (!item) return;
   const top = item.offsetTop - list.offsetTop;
   if (top < list.scrollTop) list.scrollTop = top;
@@ -280,5 +358,7 @@ function showRow(scrolls) {
   document.documentElement.style.setProperty("--list-height", `${$("findings").offsetHeight}px`);
   if (!scrolls) return;
   scrollsToAnswer = isNarrow();
-  if (!isNarrow()) $("findings").parentElement.scrollTop = Math.min($("findings").parentElement.scrollTop, $("findings").previousElementSibling.offsetTop);
+  const panel = /** @type {HTMLElement} */ ($("findings").parentElement);
+  const above = /** @type {HTMLElement} */ ($("findings").previousElementSibling);
+  if (!isNarrow()) panel.scrollTop = Math.min(panel.scrollTop, above.offsetTop);
 }

@@ -6,19 +6,25 @@ import { follow, isOthers, send } from "./connection.js";
 
 const OTHERS = "asked for on another page";
 
+/** @import { FixEntry, Progress, ReportEntry, StripFrame, TrialEntry } from "./types" */
+
+/** @type {TrialEntry[]} */
 let trials = []; // runs with other values, from the server, the newest last
+/** @type {(settings: string[]) => void} */
 let use = () => {}; // shows the settings of a run
 
 export const settings = () => trials.at(-1)?.settings ?? null; // of the newest run, whose differences are listed
-const isShown = (run) => run.settings.join() === state.set.join();
+const isShown = (/** @type {TrialEntry} */ run) => run.settings.join() === state.set.join();
 const shownRun = () => trials.find(isShown) ?? trials.at(-1);
 
+/** @param {typeof use} using */
 export function start(using) {
   use = using;
-  const say = (id) => ({ text }) => {
+  const say = (/** @type {"effect" | "fix-text" | "noted"} */ id) => (/** @type {{ text: string }} */ { text }) => {
     $(id).textContent = text;
     $(id).className = "alarm";
-    $(id).closest("section").hidden = false;
+    const section = $(id).closest("section");
+    if (section) section.hidden = false;
   };
   $("drive").onclick = () => send({ type: "drive", set: state.set }, say("effect"));
   $("drive-span").onclick = () => send({ type: "drive", set: state.set, span: state.span }, say("effect"));
@@ -26,14 +32,14 @@ export function start(using) {
   $("fix").onclick = () => send({ type: "fix" }, say("fix-text"));
   $("fix-cancel").onclick = () => send({ type: "cancel", what: "fix" });
   $("report").onclick = () => {
-    const number = (id) => Number($(id).value) || 0;
+    const number = (/** @type {"before" | "after"} */ id) => Number($(id).value) || 0;
     const range = { before: number("before"), after: number("after") };
     if (state.span) {
       if (!inSpan(state.time)) {
         say("noted")({ text: `The shown frame is not in the marked ${spanText(state.span)}: go into it, or clear the span.` });
         return;
       }
-      const from = (stamp) => Math.abs(Number(stamp) - Number(state.time)) / 1e9;
+      const from = (/** @type {string} */ stamp) => Math.abs(Number(stamp) - Number(state.time)) / 1e9;
       [range.before, range.after] = [from(state.span.first), from(state.span.last)];
     }
     const set = isTried() ? state.set : []; // settings of the shown side
@@ -50,20 +56,22 @@ export function start(using) {
   };
 }
 
+/** @param {{ text: string }} message */
 export function noted({ text }) {
   $("words").value = "";
   $("noted").textContent = text;
   $("noted").className = "faint";
 }
 
+/** @param {Progress} message */
 export function progress(message) {
   $("bar").max = message.total || 1;
   $("bar").value = message.done;
   $("bar").hidden = message.over;
   state.over = message.over;
   const part = `${message.done} of ${message.total} frames`;
-  const run = { overview: `Overview: ${part}, all over the drive; then every frame in order`,
-    again: `The list is complete, from an earlier run; ${part} run again for tracks and plots` }[message.phase] ?? `${part} run in order`;
+  const run = { run: "", overview: `Overview: ${part}, all over the drive; then every frame in order`,
+    again: `The list is complete, from an earlier run; ${part} run again for tracks and plots` }[message.phase ?? "run"] || `${part} run in order`;
   const text = message.over ? `${message.done} frames` : run;
   $("run").textContent = [text, message.error, ...message.warnings].filter(Boolean).join(" · ");
   $("run").className = message.error ? "alarm" : "faint";
@@ -91,35 +99,41 @@ export function showRuns() {
   $("trial-text").textContent = { waiting: "Waiting for the first run ...", failed: message.error }[message.state] ?? summary(message);
   $("trial-text").className = message.state === "failed" ? "alarm" : "";
   $("trial-set").textContent = named(message);
-  const newest = trials.at(-1);
+  const newest = trials[trials.length - 1];
   $("trial-listed").hidden = message === newest;
   $("trial-listed").textContent = `The table of findings has the differences of ${named(newest)}.`;
   $("strip").hidden = going || !message.strip.length;
   if (!$("strip").hidden) strip(message.strip);
 }
 
+/**
+ * @param {(string | Node)[]} values
+ * @param {"td" | "th"} kind
+ */
 function row(values, kind = "td") {
   const cells = values.map((value) => element(kind, "", "", value));
-  for (const [column, cell] of cells.entries()) if (kind === "th") cell.title = state.meanings[values[column]] ?? "";
+  for (const [column, cell] of cells.entries()) if (kind === "th") cell.title = state.meanings[String(values[column])] ?? "";
   return element("tr", "", "", ...cells);
 }
 
 // The values of a run, and the span that it was run over.
-const named = (run) => [run.settings.join(", "), ...(run.span ? [`of ${spanText(run.span)}`] : [])].join("; ");
+const named = (/** @type {TrialEntry} */ run) => [run.settings.join(", "), ...(run.span ? [`of ${spanText(run.span)}`] : [])].join("; ");
 
+/** @param {TrialEntry} run */
 function runRow(run) {
   const button = element("button", "", named(run));
   button.onclick = () => use(run.settings);
   const f1 = run.f1 ? beforeAfter(run.f1) : "–";
   const ended = { over: "", cancelled: " (cancelled)", failed: " (failed)" }[run.state] ?? " ...";
   const made = row([isShown(run) ? "▸" : "", button, f1 + ended, ...kindsOf(trials).map((kind) => String(run.counts[kind] ?? 0))]);
-  made.setAttribute("aria-current", isShown(run));
+  made.ariaCurrent = String(isShown(run));
   return made;
 }
 
 const KINDS = ["fixed", "broken", "new false", "false gone", "new", "gone"];
-const kindsOf = (runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
+const kindsOf = (/** @type {TrialEntry[]} */ runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
 
+/** @param {TrialEntry} message */
 function summary(message) {
   const parts = [];
   if (message.f1) parts.push(`F1 ${beforeAfter(message.f1)}`);
@@ -131,20 +145,23 @@ function summary(message) {
   return parts.join("; ");
 }
 
-const cancelled = (job) => (job.cancelled_by && isOthers({ asked_by: job.cancelled_by }) ? "cancelled on another page" : "cancelled");
+const cancelled = (/** @type {{ asked_by: string, cancelled_by: string }} */ job) => (job.cancelled_by && isOthers({ asked_by: job.cancelled_by }) ? "cancelled on another page" : "cancelled");
 
-// Draw one bar per frame: fixed and false gone upwards, broken and new false downwards.
+/**
+ * Draw one bar per frame: fixed and false gone upwards, broken and new false downwards.
+ * @param {StripFrame[]} frames
+ */
 function strip(frames) {
   const canvas = $("strip");
   const [width, height] = [canvas.clientWidth || 360, 36];
   canvas.width = width;
   canvas.height = height;
-  const draw = canvas.getContext("2d");
+  const draw = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
   const most = Math.max(1, ...frames.map(({ better, worse }) => Math.max(better, worse)));
   const each = width / frames.length;
   const style = getComputedStyle(document.documentElement);
   for (const [row, { better, worse }] of frames.entries()) {
-    const side = (number) => (number / most) * (height / 2 - 1);
+    const side = (/** @type {number} */ number) => (number / most) * (height / 2 - 1);
     draw.fillStyle = style.getPropertyValue("--good");
     draw.fillRect(row * each, height / 2 - side(better), Math.max(1, each - 1), side(better));
     draw.fillStyle = style.getPropertyValue("--mark");
@@ -158,13 +175,14 @@ function strip(frames) {
 
 // --- search of a fix ----------------------------------------------------------------------------
 
+/** @param {FixEntry} fix */
 function showFix(fix) {
   const going = fix.state === "running";
   const by = isOthers(fix) ? ` (${OTHERS})` : "";
   const steps = (fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...") + by;
   $("fix").disabled = going;
   $("fix-section").hidden = !fix.state;
-  for (const id of ["fix-bar", "fix-cancel"]) $(id).hidden = !going;
+  for (const id of /** @type {const} */ (["fix-bar", "fix-cancel"])) $(id).hidden = !going;
   $("fix-bar").max = fix.total || 1;
   $("fix-bar").value = fix.done;
   $("fix-text").textContent = { "": "", running: steps, cancelled: `${cancelled(fix).replace("c", "C")}.` }[fix.state] ?? fix.text;
@@ -176,6 +194,7 @@ function showFix(fix) {
 
 // --- reports ------------------------------------------------------------------------------------
 
+/** @param {ReportEntry} one */
 function report(one) {
   const item = element("li", one.state === "failed" ? "alarm" : "", "");
   if (one.state === "failed") item.textContent = `${one.name}: ${one.error}`;

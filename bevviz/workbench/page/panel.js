@@ -12,6 +12,11 @@ import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from 
 
 const REQUESTS = 300; // ms between two requests of frames while the time goes on
 
+/** @import { AnswerMessage, Absent, Control, Error, Hints, Nothing, Opening, Origin, Robot, SideEffects, Span, Tried, Welcome } from "./types" */
+/** @typedef {{ pick: string, origin?: Origin }} Known */
+/** @typedef {Known | import("./viewer.js").Click} Subject what is asked about */
+
+/** @type {Control[]} */
 let opened = []; // controls of the configuration that the drive was opened with
 
 // --- questions and answers ----------------------------------------------------------------------
@@ -22,8 +27,8 @@ let askedTried = false; // the newest question is about the tried side
 
 const shownSet = () => (isTried() ? state.set : []);
 const shownKey = () => [shownFrame() ?? state.time, ...shownSet()].join();
-const frameName = (frame) => (frame === null ? `the frame at ${seconds(state.time)}` : `frame ${frame}`);
-const withValues = (set) => (set.length ? ` with ${set.join(", ")}` : "");
+const frameName = (/** @type {number | null} */ frame) => (frame === null ? `the frame at ${seconds(state.time)}` : `frame ${frame}`);
+const withValues = (/** @type {string[]} */ set) => (set.length ? ` with ${set.join(", ")}` : "");
 
 // A question that was asked while the server was away is asked when it is back, by this page or the reloaded one.
 function askUnsent() {
@@ -34,6 +39,7 @@ function askUnsent() {
   return true;
 }
 
+/** @param {Subject} what */
 function ask(what) {
   if (state.time === null) return;
   if (!isConnected()) {
@@ -53,10 +59,11 @@ function ask(what) {
   });
 }
 
+/** @param {Subject} what */
 function askOther(what) {
   list.leave();
   remember(Boolean(state.pick));
-  if ("pick" in what) [state.pick, state.origin] = [what.pick, what.origin];
+  if ("pick" in what) [state.pick, state.origin] = [what.pick, what.origin ?? null];
   ask(what);
 }
 
@@ -66,14 +73,19 @@ const askAgain = () => {
   if (state.pick) ask({ pick: state.pick, ...(state.pick.startsWith("{") || !state.origin ? {} : { origin: state.origin }) });
 };
 
-// Show a sentence in place of an answer. Nothing of the former answer stays.
+/**
+ * Show a sentence in place of an answer. Nothing of the former answer stays.
+ * @param {string} className
+ * @param {string} text
+ * @param {string} where
+ */
 function clear(className, text, where = "") {
   state.answer = null;
   $("answer").className = className;
   $("verdict").textContent = text;
   $("where").textContent = where;
-  for (const id of ["chain", "beside", "hints", "robot-chain", "further"]) $(id).replaceChildren();
-  for (const id of ["beside-title", "robot-title"]) $(id).hidden = true;
+  for (const id of /** @type {const} */ (["chain", "beside", "hints", "robot-chain", "further"])) $(id).replaceChildren();
+  for (const id of /** @type {const} */ (["beside-title", "robot-title"])) $(id).hidden = true;
   freshness();
 }
 
@@ -111,6 +123,7 @@ function freshness() {
   timeline.draw();
 }
 
+/** @param {AnswerMessage} message */
 function answer(message) {
   if (message.id !== asking) return;
   const took = performance.now() - asked.at;
@@ -146,6 +159,7 @@ function answer(message) {
 }
 
 // Say what the verdict leaves open: two reasons of which nothing tells which one mattered, and stages that bring it back.
+/** @param {AnswerMessage} message */
 function further({ likely, restored_by: restored }) {
   const texts = [];
   if (likely.length) texts.push(`Either of two reasons may have lost it: ${likely.join(" or ")}.`);
@@ -153,6 +167,7 @@ function further({ likely, restored_by: restored }) {
   return texts;
 }
 
+/** @param {Nothing} message */
 function nothing(message) {
   if (message.id !== asking) return;
   state.pick = "";
@@ -160,7 +175,10 @@ function nothing(message) {
   clear("", `Nothing can be asked about ${message.entity}.`);
 }
 
-// The object is in another frame only. It stays the subject, and is found again where it is.
+/**
+ * The object is in another frame only. It stays the subject, and is found again where it is.
+ * @param {Absent} message
+ */
 function absent(message) {
   if (message.id !== asking) return;
   state.pick = message.pick;
@@ -170,7 +188,10 @@ function absent(message) {
   freshness();
 }
 
-// The robot's own chain: what each of its nodes did with the object, with the usual delay and loss of the node.
+/**
+ * The robot's own chain: what each of its nodes did with the object, with the usual delay and loss of the node.
+ * @param {Robot} message
+ */
 function robotChain(message) {
   if (message.id !== asking) return;
   $("robot-title").hidden = false;
@@ -179,15 +200,18 @@ function robotChain(message) {
     ...message.steps.map((step) => element("li", step.changed ? "missed" : "", step.text || "not reached", element("small", "", step.about))),
     ...message.notes.map((note) => element("li", "", "", element("small", "", note))),
   );
-  const [list, changed] = [$("robot-chain"), $("robot-chain").querySelector(".missed")];
+  const list = $("robot-chain");
+  const changed = /** @type {HTMLElement | null} */ (list.querySelector(".missed"));
   if (changed) list.scrollTop = changed.offsetTop - list.offsetTop - list.clientHeight / 2;
 }
 
+/** @param {Error} message */
 function failed(message) {
   $("noted").textContent = message.text;
   $("noted").className = "alarm";
 }
 
+/** @param {Hints} message */
 function hints(message) {
   if (message.id !== asking) return;
   $("hints").replaceChildren(...message.hints.map((hint) => {
@@ -202,9 +226,12 @@ function hints(message) {
   list.explain({ ...message, pick: message.row_pick }, askedTried);
 }
 
-// Describe the effects of other values on a frame. Hints and tried values use the same words.
+/**
+ * Describe the effects of other values on a frame. Hints and tried values use the same words.
+ * @param {SideEffects} effect
+ */
 function effects(effect) {
-  const rest = (all, some) => all.filter((name) => !some.includes(name));
+  const rest = (/** @type {string[]} */ all, /** @type {string[]} */ some) => all.filter((name) => !some.includes(name));
   const parts = Object.entries({
     fixed: effect.fixed, broken: effect.right, "new false": effect.false,
     "false gone": effect.false_gone, gone: rest(effect.lost, effect.right), new: rest(effect.added, effect.false),
@@ -215,6 +242,7 @@ function effects(effect) {
 
 // --- other values -------------------------------------------------------------------------------
 
+/** @param {string[]} settings */
 function use(settings) {
   state.undo.push(state.set);
   state.redo = [];
@@ -223,11 +251,12 @@ function use(settings) {
   changed();
 }
 
+/** @param {string[]} settings */
 function change(settings) {
   const keys = new Set(settings.map((one) => one.split("=")[0]));
   // The parameters of a method are removed with it.
   const gone = [...keys].filter((key) => key.endsWith(".method")).map((key) => key.replace(/method$/, "params."));
-  const stays = (key) => !keys.has(key) && !gone.some((start) => key.startsWith(start));
+  const stays = (/** @type {string} */ key) => !keys.has(key) && !gone.some((start) => key.startsWith(start));
   use([...state.set.filter((one) => stays(one.split("=")[0])), ...settings]);
 }
 
@@ -246,6 +275,7 @@ function changed() {
 let trying = 0; // number of the newest trial
 let tryingSince = 0;
 let triedFor = ""; // frame and settings of the newest trial
+/** @type {string[]} */
 let valid = []; // the last settings that the server has accepted
 function attempt() {
   if (state.time === null) return;
@@ -259,7 +289,7 @@ function attempt() {
     triedFor = "";
     valid = [];
     $("effect").textContent = "As it was opened.";
-    $("effect").dataset.frame = shownFrame();
+    $("effect").dataset.frame = String(shownFrame());
     parameters.offer(opened);
   }
   askAgain();
@@ -269,7 +299,7 @@ function tryHere() {
   const frame = shownFrame();
   triedFor = shownKey();
   $("effect").textContent = `Running the stages on ${frameName(frame)} ...`;
-  $("effect").dataset.frame = frame;
+  $("effect").dataset.frame = String(frame);
   $("try-cancel").hidden = kind === "live";
   const set = state.set;
   trying = send({ type: "try", time: Number(state.time), set, pick: state.pick }, ({ id, text }) => {
@@ -305,6 +335,7 @@ function cancelTry() {
   }
 }
 
+/** @param {Tried} message */
 function tried(message) {
   if (message.id !== trying) return;
   tryOver();
@@ -312,7 +343,7 @@ function tried(message) {
   const since = tryingSince;
   const took = () => (performance.now() - since).toFixed(0);
   $("effect").dataset.took = took();
-  $("effect").dataset.frame = message.frame;
+  $("effect").dataset.frame = String(message.frame);
   withPieces(message.pieces, () => drawnThen(() => { $("effect").dataset.drawn = took(); }));
   const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${beforeAfter(both)}`);
   const parts = [[effects(message.effects), ...opinions].filter(Boolean).join("; ") || "changes nothing that is reported"];
@@ -336,11 +367,14 @@ function flip() {
 // Tell which side is shown. Other values show their own side again.
 function tellSide() {
   const isBefore = state.set.length > 0 && state.flipped;
-  $("flip").setAttribute("aria-pressed", isBefore);
+  $("flip").ariaPressed = String(isBefore);
   $("side").textContent = isBefore ? "shown: before" : isTried() ? "shown: after" : "";
 }
 
-// Show the side of a listed finding: with the settings of the newest trial, or as opened.
+/**
+ * Show the side of a listed finding: with the settings of the newest trial, or as opened.
+ * @param {boolean} withThem
+ */
 function tryOut(withThem) {
   const wanted = jobs.settings();
   if (wanted && wanted.join() !== state.set.join()) use(wanted);
@@ -349,6 +383,7 @@ function tryOut(withThem) {
 
 // --- session state from the server --------------------------------------------------------------
 
+/** @param {Opening} message */
 function open({ stamp, first, demand }) {
   if (state.opening !== null) return;
   state.first = first;
@@ -359,10 +394,8 @@ function open({ stamp, first, demand }) {
   list.draw(); // An earlier run's list may be there already, without the time that seconds count from.
   if (!same) return;
   state.set = stated.getAll("set");
-  if (stated.get("span")) {
-    const [first, last] = stated.get("span").split("-");
-    markSpan({ first, last });
-  }
+  const [low, high] = (stated.get("span") ?? "").split("-");
+  if (high) markSpan({ first: low, last: high });
   state.pick = stated.get("pick") ?? "";
   state.origin = { time: Number(state.opening), set: state.set };
   if (state.set.length) {
@@ -372,9 +405,10 @@ function open({ stamp, first, demand }) {
   } else if (!askUnsent()) askAgain();
 }
 
+/** @param {Welcome} message */
 function welcome(message) {
-  state.bag = message.bag;
-  for (const key of ["run", "meanings", "truth", "single"]) state[key] = message[key];
+  const { bag, run, meanings, truth, single } = message;
+  Object.assign(state, { bag, run, meanings, truth, single });
   document.title = `${message.bag} · bevviz`;
   $("bag").textContent = message.bag;
   opened = message.controls;
@@ -388,6 +422,7 @@ function welcome(message) {
   if (state.opening !== null) askUnsent();
 }
 
+/** @param {Record<string, string>} classes */
 function legend(classes) {
   $("classes").replaceChildren(...Object.entries(classes).map(([name, color]) => {
     const swatch = element("span", "swatch", "");
@@ -422,28 +457,31 @@ onViewer({
 // --- keys and buttons ---------------------------------------------------------------------------
 
 function undo() {
-  if (!state.undo.length) return;
+  const before = state.undo.pop();
+  if (!before) return;
   state.redo.push(state.set);
-  state.set = state.undo.pop();
+  state.set = before;
   changed();
 }
 
 function redo() {
-  if (!state.redo.length) return;
+  const next = state.redo.pop();
+  if (!next) return;
   state.undo.push(state.set);
-  state.set = state.redo.pop();
+  state.set = next;
   changed();
 }
 
 // Back and Forward of the browser walk through the subjects.
 window.addEventListener("popstate", (event) => {
-  if (!event.state || !new URLSearchParams(location.hash.slice(1)).get("at")) return;
   const parts = new URLSearchParams(location.hash.slice(1));
+  const at = parts.get("at");
+  if (!event.state || !at) return;
   list.leave();
   const set = parts.getAll("set");
-  [state.pick, state.origin] = [parts.get("pick") ?? "", { time: Number(parts.get("at")), set }];
+  [state.pick, state.origin] = [parts.get("pick") ?? "", { time: Number(at), set }];
   state.flipped = parts.get("side") === "before";
-  seek(parts.get("at"));
+  seek(at);
   if (set.join() !== state.set.join()) {
     state.undo.push(state.set);
     state.set = set;
@@ -452,26 +490,30 @@ window.addEventListener("popstate", (event) => {
   else forget();
 });
 
+/** @param {number} by */
 function stepFrame(by) {
-  const stamp = neighbour(by);
+  const [stamp, next] = [neighbour(by), (shownFrame() ?? -Infinity) + by];
   if (stamp !== null) seek(stamp);
-  else if (!state.over && shownFrame() !== null && shownFrame() + by >= 0) {
+  else if (!state.over && next >= 0) {
     freshness();
-    $("shown").textContent += `. Frame ${shownFrame() + by} has not been run yet.`;
+    $("shown").textContent += `. Frame ${next} has not been run yet.`;
   }
 }
 
-const toEnd = (isLast) => {
+const toEnd = (/** @type {boolean} */ isLast) => {
   const times = frameTimes();
   if (times.length) seek(frameTimes.stamp(isLast ? times.length - 1 : 0));
 };
 
-// Mark the frames from one stamp to another; null: none. It is played, noted, reported and run alone.
+/**
+ * Mark the frames from one stamp to another; null: none. It is played, noted, reported and run alone.
+ * @param {Span | null} span
+ */
 function markSpan(span) {
   state.span = span;
   $("span").hidden = !span;
   $("of-span").hidden = !span;
-  for (const label of document.querySelectorAll(".around")) label.hidden = Boolean(span);
+  for (const label of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll(".around"))) label.hidden = Boolean(span);
   if (span) {
     $("span-text").textContent = `${spanText(span)} marked`;
     $("of-span").textContent = `of ${spanText(span)}`;
@@ -481,7 +523,11 @@ function markSpan(span) {
   timeline.draw();
   remember();
 }
-// Begin or end the span at the shown frame. The other end stays where it was, if it can.
+
+/**
+ * Begin or end the span at the shown frame. The other end stays where it was, if it can.
+ * @param {boolean} isEnd
+ */
 function markHere(isEnd) {
   const times = frameTimes();
   if (kind === "live" || times.length < 2) return;
@@ -491,6 +537,7 @@ function markHere(isEnd) {
   else markSpan({ first: here, last: Number(last) >= Number(here) ? last : here });
 }
 
+/** @type {Record<string, () => void>} */
 const actions = {
   " ": kind === "live" ? playOrPause : playback.toggle,
   "<": () => playback.faster(-1),
@@ -524,10 +571,11 @@ let hasTabbed = false; // the focus came by Tab
 window.addEventListener("pointerdown", () => { hasTabbed = false; }, true);
 window.addEventListener("keydown", (event) => {
   if (event.key === "Tab") hasTabbed = true;
-  const inPanel = event.target.closest?.("aside"); // The viewer has hidden inputs, too.
-  const typing = inPanel && event.target.matches("input:not([type=range], [type=checkbox])");
-  if (typing && event.key === "Escape") event.target.blur();
-  const hasText = typing && event.target.value !== event.target.defaultValue; // Its own undo takes back what was typed.
+  const target = event.target instanceof Element ? event.target : document.body;
+  const inPanel = target.closest("aside"); // The viewer has hidden inputs, too.
+  const typing = inPanel && target instanceof HTMLInputElement && target.matches(":not([type=range], [type=checkbox])");
+  if (typing && event.key === "Escape") target.blur();
+  const hasText = typing && target.value !== target.defaultValue; // Its own undo takes back what was typed.
   if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !hasText) {
     event.preventDefault();
     event.stopPropagation();
@@ -536,7 +584,7 @@ window.addEventListener("keydown", (event) => {
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !(event.key in actions)) return;
   // A control that was reached by Tab keeps its own keys. One that was clicked does not.
   const own = event.key === " " ? "[type=checkbox], [type=range], summary, button, select, a" : event.key.length > 1 ? "[type=range], select" : "";
-  if (own && hasTabbed && event.target.matches?.(own)) return;
+  if (own && hasTabbed && target.matches(own)) return;
   event.preventDefault();
   event.stopPropagation();
   actions[event.key]();
@@ -547,13 +595,13 @@ if (kind === "live") {
   Object.assign(actions, robot.actions);
   on({ progress: (message) => { jobs.progress(message); robot.progress(message); } });
 }
-tryOut.settings = () => jobs.settings() ?? [];
-const ofDrive = { // A robot has neither hints behind the list nor a bag to keep notes beside.
+/** @type {Pick<import("./findings.js").Actions, "remarks" | "handle">} */
+const ofDrive = kind === "live" ? {} : {
   remarks: (rows) => send({ type: "remarks", rows }),
   handle: (finding) => send({ type: "handle", ...finding }),
 };
 list.start({
-  ask, tryOut, forget, markSpan, drawn: timeline.show, ...(kind === "live" ? {} : ofDrive),
+  ask, tryOut, forget, markSpan, drawn: timeline.show, triedSet: () => jobs.settings() ?? [], ...ofDrive,
   unnote: (note) => send({ type: "unnote", stamp: note.stamp, text: note.text }),
 });
 parameters.start(change);

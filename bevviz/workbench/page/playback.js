@@ -6,15 +6,17 @@ import { isThere, seek } from "./viewer.js";
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 const AGAIN = 30; // ms until it is asked again whether the viewer shows the frame
 
+/** @type {ReturnType<typeof setTimeout> | 0} */
 let timer = 0; // 0: paused
 let begun = { wall: 0, stamp: 0 }; // when and where the playback began
+/** @type {string | null} */
 let shown = null; // stamp that it has sought last
 let loops = Boolean(kept("loop", false));
 
 export function start() {
-  $("speed").replaceChildren(...SPEEDS.map((speed) => new Option(`${speed} ×`, speed)));
-  $("speed").value = kept("speed", 1);
-  $("speed").onchange = () => { keep("speed", Number($("speed").value)); rebase(); };
+  $("speed").replaceChildren(...SPEEDS.map((speed) => new Option(`${speed} ×`, String(speed))));
+  $("speed").value = String(kept("speed", 1));
+  $("speed").onchange = changeSpeed;
   $("play").onclick = toggle;
   $("loop").onclick = toggleLoop;
   tell();
@@ -22,8 +24,8 @@ export function start() {
 
 function tell() {
   $("play").textContent = timer ? "❚❚" : "▶";
-  $("play").setAttribute("aria-label", timer ? "pause" : "play");
-  $("loop").setAttribute("aria-pressed", loops);
+  $("play").ariaLabel = timer ? "pause" : "play";
+  $("loop").ariaPressed = String(loops);
 }
 
 // Tell time and frame of the shown frame beside the buttons.
@@ -42,7 +44,7 @@ function range() {
   return [rows[0] ?? 0, rows.at(-1) ?? 0];
 }
 
-const rowAt = (stamp) => frameTimes().findLastIndex((one) => one <= Number(stamp) + 1000);
+const rowAt = (/** @type {string | number | null} */ stamp) => frameTimes().findLastIndex((one) => one <= Number(stamp) + 1000);
 
 export function toggle() {
   if (timer) { pause(); return; }
@@ -66,11 +68,18 @@ export function toggleLoop() {
   tell();
 }
 
-export function faster(by) {
-  $("speed").selectedIndex = Math.min(SPEEDS.length - 1, Math.max(0, $("speed").selectedIndex + by));
-  $("speed").onchange();
+function changeSpeed() {
+  keep("speed", Number($("speed").value));
+  rebase();
 }
 
+/** @param {number} by */
+export function faster(by) {
+  $("speed").selectedIndex = Math.min(SPEEDS.length - 1, Math.max(0, $("speed").selectedIndex + by));
+  changeSpeed();
+}
+
+/** @param {number} row */
 function go(row) {
   shown = frameTimes.stamp(row);
   seek(shown);

@@ -5,34 +5,46 @@ import { $, dropFrames, frameTimes, state } from "./page_state.js";
 import { goTo, seek } from "./viewer.js";
 
 $("robot").hidden = false;
-for (const id of ["drive", "flip", "note"]) $(id).hidden = true; // These need a recorded drive.
+for (const id of /** @type {const} */ (["drive", "flip", "note"])) $(id).hidden = true; // These need a recorded drive.
 
+/** @import { Problem, Progress } from "./types" */
+
+/** @type {number | null} */
 let time = null; // of the viewer, nanoseconds
+/** @type {number | null} */
 let newest = null;
-window.addEventListener("viewer-event", ({ detail }) => {
+window.addEventListener("viewer-event", (event) => {
+  const { detail } = /** @type {CustomEvent} */ (event);
   if (detail.type === "time_update") time = detail.time;
   if (time !== null && (newest === null || time > newest)) newest = time;
 });
 
+/**
+ * @param {string} text
+ * @param {boolean} [wrong]
+ */
 function say(text, wrong) {
   $("said").textContent = text;
   $("said").className = wrong ? "alarm" : "faint";
 }
 
 // The slider has one step for each frame of the held seconds, which go on. While it is held, they stay.
+/** @type {number[] | null} */
 let sliding = null; // times of the frames when the slider was taken
-const ago = (times, row) => `${((times.at(-1) - times[row]) / 1e9).toFixed(1)} s ago`;
-export function progress({ held, problems }) {
+const ago = (/** @type {number[]} */ times, /** @type {number} */ row) => `${((times[times.length - 1] - times[row]) / 1e9).toFixed(1)} s ago`;
+
+/** @param {Progress} message */
+export function progress({ held = [], problems = [] }) {
   showProblems(problems);
   if (held.length) dropFrames(held);
   const times = frameTimes();
   $("past").disabled = times.length < 2;
   if (sliding || times.length < 2) return;
-  const at = time ?? newest;
+  const at = time ?? newest ?? 0;
   const row = times.findLastIndex((one) => one <= at + 1000);
   const shown = times[row] < state.start && at > times[row] + 1000 ? -1 : row;
-  $("past").max = times.length - 1;
-  $("past").value = Math.max(shown, 0);
+  $("past").max = String(times.length - 1);
+  $("past").value = String(Math.max(shown, 0));
   const gone = time === null ? "" : "longer ago than is held"; // The viewer has drawn nothing yet.
   $("past-at").textContent = shown < 0 ? gone : ago(times, shown);
 }
@@ -51,6 +63,7 @@ $("past").onchange = () => {
 };
 
 // What is wrong with the robot's data now, and for how long.
+/** @param {Problem[]} problems */
 function showProblems(problems) {
   $("problems").hidden = !problems.length;
   $("problems").replaceChildren(...problems.map(({ text, seconds }) => {
@@ -82,5 +95,5 @@ export const actions = {
   s: () => { say("Saving ..."); send({ type: "snap" }); },
   m: mark,
 };
-for (const [id, key] of [["hold", "h"], ["follow", "f"], ["list", "l"], ["snap", "s"], ["mark", "m"]]) $(id).onclick = actions[key];
+for (const [id, key] of /** @type {const} */ ([["hold", "h"], ["follow", "f"], ["list", "l"], ["snap", "s"], ["mark", "m"]])) $(id).onclick = actions[key];
 $("mark-text").onkeydown = (event) => { if (event.key === "Enter") mark(); };

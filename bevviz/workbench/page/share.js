@@ -3,12 +3,14 @@
 
 import { $, state, stated } from "./page_state.js";
 
+/** @import { Welcome } from "./types" */
+
 let opened = ""; // digest of the values that the drive was opened with
 
 export function start() {
   $("share").onclick = async () => {
     const parts = new URLSearchParams(location.hash.slice(1));
-    parts.set("first", state.first);
+    parts.set("first", String(state.first));
     parts.set("opened", opened);
     await navigator.clipboard.writeText(`${location.origin}/shared#${parts}`);
     $("shared").textContent = `Copied. It opens wherever 'bevviz open' shows ${state.bag}.`;
@@ -17,6 +19,7 @@ export function start() {
   window.addEventListener("hashchange", (event) => event.isTrusted && !history.state && location.reload());
 }
 
+/** @param {Welcome} message */
 export const welcomed = (message) => { opened = message.opened; };
 
 // Whether the address is about this drive. What differs is told.

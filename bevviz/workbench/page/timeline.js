@@ -1,34 +1,39 @@
 // Timeline under the viewer: one lane for each sort of finding, the shown time, and a click that goes there.
 // The height of a bar is the number of findings at its time, its shade the distance of the nearest one.
 
+import { bars, lanes, nearest, shade } from "./lanes.js";
 import { $, at, frameTimes, shownFrame, spanText, state } from "./page_state.js";
 import { kind, seek } from "./viewer.js";
 
-const LANES = [
-  ["missed", "--bad", ["missed", "lost", "unmatched", "broken"]],
-  ["false", "--doubtful", ["false", "doubtful", "contradicted", "new false"]],
-  ["unnamed", "--unknown", ["unnamed", "new", "gone"]],
-  ["fixed", "--good", ["fixed", "false gone"]],
-  ["anomaly", "--other", ["anomaly"]],
-  ["note", "--subject", ["note"]],
-];
+/** @import { Span } from "./types" */
+/** @import { Bar, Lane } from "./lanes.js" */
+/** @import { Finding } from "./triage.js" */
+/** @typedef {Bar & { y: number, half: number }} Mark a bar, and half of its width */
+
 const NAMES = 64; // pixels for the names of the lanes
 const HIT = 6; // pixels from the middle of a narrow mark that a click may be off
 const ROW = 16; // pixels
 const DRAG = 5; // pixels that the pointer moves until it marks a span
 const LOWEST = 4; // pixels, of the bar of one finding
-const [NEAR, FAR] = [5, 40]; // metres: a nearer one has the full colour, a farther one the faintest
-const [FAINTEST, UNKNOWN] = [0.35, 0.7]; // opacities: of the farthest, and where the distance is unknown
-
+/** @type {Finding[]} */
 let rows = [];
+/** @type {(entry: Finding, row: number) => void} */
 let choose = () => {};
+/** @type {(span: Span) => void} */
 let markSpan = () => {};
+/** @type {{ x: number, row: number, marks: boolean } | null} */
 let dragged = null; // where the pointer went down, and whether it marks a span
-let marks = []; // x, y, half of the width, number of findings, and entry and row of the nearest, of each bar
+/** @type {Mark[]} */
+let marks = [];
+const [image, caption] = /** @type {[HTMLImageElement, HTMLElement]} */ (/** @type {unknown} */ ([...$("thumbnail").children]));
 const picture = document.createElement("canvas"); // the marks, which are drawn again only when they change
 let pictured = ""; // findings, frames and size that the picture has
 let changes = 0; // number of changes of the findings
 
+/**
+ * @param {typeof choose} choosing
+ * @param {typeof markSpan} marking
+ */
 export function start(choosing, marking) {
   [choose, markSpan] = [choosing, marking];
   $("events").onpointerdown = (event) => {
@@ -52,50 +57,46 @@ export function start(choosing, marking) {
     showThumbnail(event, rowAt(event));
   };
   $("events").onpointerleave = () => { $("thumbnail").hidden = true; };
-  $("thumbnail").firstChild.onload = () => {
-    $("thumbnail").lastChild.textContent = $("thumbnail").dataset.at;
+  image.onload = () => {
+    caption.textContent = $("thumbnail").dataset.at ?? "";
     $("thumbnail").hidden = !$("events").matches(":hover");
   };
-  $("thumbnail").firstChild.onerror = () => { $("thumbnail").hidden = true; };
+  image.onerror = () => { $("thumbnail").hidden = true; };
   new ResizeObserver(draw).observe($("events"));
 }
 
+/** @param {Finding[]} findings */
 export function show(findings) {
   rows = findings;
   changes += 1;
   draw();
 }
 
-function lanes() {
-  return LANES.map(([name, color, kinds]) => ({ name, color, entries: rows.filter((entry) => kinds.includes(entry.what)) }))
-    .filter((lane) => lane.entries.length);
-}
-
 export function draw() {
   const canvas = $("events");
   const times = frameTimes();
-  const shown = lanes();
+  const shown = lanes(rows);
   canvas.hidden = times.length < 2 || (kind === "live" && !shown.length);
   if (canvas.hidden) return;
-  canvas.setAttribute("aria-valuetext", [at(state.time), state.span ? `${spanText(state.span)} marked` : ""].filter(Boolean).join(", "));
-  canvas.setAttribute("aria-valuenow", shownFrame() ?? 0);
-  canvas.setAttribute("aria-valuemax", frameTimes.number(times.length - 1));
+  canvas.ariaValueText = [at(state.time), state.span ? `${spanText(state.span)} marked` : ""].filter(Boolean).join(", ");
+  canvas.ariaValueNow = String(shownFrame() ?? 0);
+  canvas.ariaValueMax = String(frameTimes.number(times.length - 1));
   const width = canvas.clientWidth;
   const height = ROW * Math.max(1, shown.length) + 4;
   canvas.style.height = `${height}px`;
   const scale = window.devicePixelRatio || 1;
-  const [first, last] = [times[0], times.at(-1)];
+  const [first, last] = [times[0], times[times.length - 1]];
   const gap = times.reduce((least, time, row) => (row ? Math.min(least, time - times[row - 1]) : least), last - first);
   const share = Math.min(1 / times.length, gap / (last - first + gap)); // of the width, for each frame
   const each = Math.max(2, (width - NAMES) * share - 1);
-  const x = (stamp) => NAMES + each / 2 + ((Number(stamp) - first) / (last - first)) * (width - NAMES - each);
+  const x = (/** @type {string | number} */ stamp) => NAMES + each / 2 + ((Number(stamp) - first) / (last - first)) * (width - NAMES - each);
   const wanted = [changes, first, last, times.length, width, scale].join();
   if (wanted !== pictured) {
     pictured = wanted;
     drawMarks(shown, x, each, width, height, scale);
   }
   [canvas.width, canvas.height] = [width * scale, height * scale];
-  const pen = canvas.getContext("2d");
+  const pen = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
   pen.drawImage(picture, 0, 0);
   pen.scale(scale, scale);
   if (state.span) {
@@ -109,10 +110,18 @@ export function draw() {
   }
 }
 
-// Draw one bar for each pixel of a lane, however many findings a long drive has there.
+/**
+ * Draw one bar for each pixel of a lane, however many findings a long drive has there.
+ * @param {Lane[]} shown
+ * @param {(stamp: string | number) => number} x
+ * @param {number} each width of a frame
+ * @param {number} width
+ * @param {number} height
+ * @param {number} scale
+ */
 function drawMarks(shown, x, each, width, height, scale) {
   [picture.width, picture.height] = [width * scale, height * scale];
-  const pen = picture.getContext("2d");
+  const pen = /** @type {CanvasRenderingContext2D} */ (picture.getContext("2d"));
   pen.scale(scale, scale);
   const style = getComputedStyle(document.documentElement);
   pen.font = "10px system-ui, sans-serif";
@@ -133,52 +142,40 @@ function drawMarks(shown, x, each, width, height, scale) {
   }
 }
 
-// Bars of a lane: its findings at each pixel, and the nearest of them.
-function bars(lane, x) {
-  const all = new Map();
-  for (const entry of lane.entries) {
-    for (const [row, one] of entry.sights.entries()) {
-      const at = x(one.stamp);
-      const bar = all.get(Math.round(at)) ?? { x: at, count: 0, distance: null };
-      bar.count += 1;
-      if (bar.count === 1 || (one.distance ?? Infinity) < (bar.distance ?? Infinity)) Object.assign(bar, { entry, row, distance: one.distance });
-      all.set(Math.round(at), bar);
-    }
-  }
-  return [...all.values()];
-}
-
-function shade(distance) {
-  if (distance === null) return UNKNOWN;
-  const far = Math.min(1, Math.max(0, (distance - NEAR) / (FAR - NEAR)));
-  return 1 - far * (1 - FAINTEST);
-}
-
+/** @param {Mark} mark */
 function told({ entry, row, count }) {
   const when = at(entry.sights[row].stamp);
   return count === 1 ? `${entry.what} ${entry.name} at ${when}` : `${count} at ${when}; the nearest: ${entry.what} ${entry.name}`;
 }
 
+/** @param {MouseEvent} event */
 function markAt(event) {
   const near = marks.filter((mark) => Math.abs(mark.x - event.offsetX) <= mark.half && event.offsetY >= mark.y && event.offsetY < mark.y + ROW);
-  return near.reduce((best, mark) => (!best || Math.abs(mark.x - event.offsetX) < Math.abs(best.x - event.offsetX) ? mark : best), null);
+  return near.sort((a, b) => Math.abs(a.x - event.offsetX) - Math.abs(b.x - event.offsetX)).at(0);
 }
 
+/** @param {MouseEvent} event */
 function clicked(event) {
   const mark = markAt(event);
   if (mark) choose(mark.entry, mark.row);
   else seek(frameTimes.stamp(rowAt(event)));
 }
 
-// Row of the frame at the pointer.
+/**
+ * Row of the frame at the pointer.
+ * @param {MouseEvent} event
+ */
 function rowAt(event) {
   const times = frameTimes();
   const part = (event.offsetX - NAMES) / ($("events").clientWidth - NAMES);
-  const wanted = times[0] + part * (times.at(-1) - times[0]);
-  return times.reduce((row, at, other) => (Math.abs(at - wanted) < Math.abs(times[row] - wanted) ? other : row), 0);
+  return nearest(times, times[0] + part * (times[times.length - 1] - times[0]));
 }
 
-// Show the camera near a frame above the pointer, if the server has an image of it. A robot has none.
+/**
+ * Show the camera near a frame above the pointer, if the server has an image of it. A robot has none.
+ * @param {MouseEvent} event
+ * @param {number} row
+ */
 function showThumbnail(event, row) {
   if (kind === "live" || event.offsetX < NAMES) { $("thumbnail").hidden = true; return; }
   const [figure, canvas] = [$("thumbnail"), $("events")];
@@ -186,6 +183,6 @@ function showThumbnail(event, row) {
   figure.style.left = `${Math.max(112, Math.min(event.clientX, canvas.clientWidth - 112))}px`;
   figure.style.bottom = `${document.documentElement.clientHeight - canvas.getBoundingClientRect().top + 4}px`;
   figure.dataset.at = at(frameTimes.stamp(row));
-  if (figure.firstChild.getAttribute("src") !== path) figure.firstChild.src = path;
-  else figure.hidden = !figure.firstChild.naturalWidth;
+  if (image.getAttribute("src") !== path) image.src = path;
+  else figure.hidden = !image.naturalWidth;
 }

@@ -1,0 +1,38 @@
+import { element, pass } from "./browser.js";
+import assert from "node:assert/strict";
+import test from "node:test";
+
+const { requestAnimationFrame: draw, fetch } = window;
+const { compileStreaming } = WebAssembly;
+const patches = (query) => import(`../../bevviz/workbench/page/rerun_patches.js?${query}`);
+
+test("a viewer of another version is left as it is", async () => {
+  element("viewer").dataset.version = "0.45.0";
+  const { keepCompiled, wake } = await patches("other");
+  keepCompiled("http://127.0.0.1/viewer.wasm");
+  wake(1e6);
+  assert.deepEqual([window.requestAnimationFrame, window.fetch, WebAssembly.compileStreaming], [draw, fetch, compileStreaming]);
+});
+
+test("a browser that cannot compile a stream loads the viewer as ever", async () => {
+  element("viewer").dataset.version = "0.41.1";
+  delete WebAssembly.compileStreaming;
+  const { keepCompiled } = await patches("old");
+  keepCompiled("http://127.0.0.1/viewer.wasm");
+  assert.equal(window.fetch, fetch);
+});
+
+test("pictures are held back until there is something to draw", async () => {
+  window.requestAnimationFrame = draw;
+  const { wake } = await patches("own");
+  let drawn = 0;
+  const redraw = () => { drawn += 1; window.requestAnimationFrame(redraw); };
+  redraw();
+  pass(10000);
+  const before = drawn;
+  pass(10000);
+  assert.equal(drawn, before);
+  wake();
+  pass(1000);
+  assert.ok(drawn > before);
+});
