@@ -480,12 +480,19 @@ def test_the_drive_is_run_with_other_values(page: Page) -> None:
 
 
 def test_the_timeline_goes_to_findings_and_shows_the_camera(page: Page) -> None:
-    """A click on a mark chooses its finding at that frame. The camera at the pointer is shown above it."""
+    """A click or Enter on a mark chooses its finding at that frame. The camera at the pointer is above it."""
     box = page.locator("#events").bounding_box()
     assert box is not None and box["height"] > 10
     page.mouse.click(box["x"] + box["width"] - 20, box["y"] + 8)
     until(lambda: frame(page) == FRAMES - 1 and verdict(page))
     assert page.locator("#found [aria-current=true]").count() == 1
+    page.focus("#events")
+    page.keyboard.press("Home")
+    until(lambda: frame(page) == 0 and "0.00 s" in (page.get_attribute("#events", "aria-valuetext") or ""))
+    page.keyboard.press("Enter")
+    until(lambda: "frame 0" in page.inner_text("#where"))
+    page.keyboard.press("End")
+    until(lambda: frame(page) == FRAMES - 1)
     page.mouse.move(box["x"] + box["width"] - 18, box["y"] + 8)
     until(page.locator("#thumbnail").is_visible)
     assert page.evaluate("document.querySelector('#thumbnail img').naturalWidth") == WIDTH

@@ -408,14 +408,13 @@ class PageConnection:
         await self._in_turn(message["id"], lambda: reports.begin(*asked), settings)
 
     async def _note(self, message: types.AddNote) -> None:
-        file = self._workbench.tools.notes.path.name
         number, text, span = message["id"], message["text"], _span(message.get("span"))
         frame, identity = await self._frame(message), _identity(message)
         about = await self._in_turn(
             number, lambda: self._workbench.note(frame, text, identity, self._overlay, span)
         )
         said = f"Noted about {about}{'' if span else f' in frame {frame}'}."
-        await self._send({"type": "noted", "id": number, "file": file, "text": said})
+        await self._send({"type": "noted", "id": number, "text": said})
 
     async def _unnote(self, message: types.RemoveNote) -> None:
         stamp, text = int(message["stamp"]), message["text"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bevviz.config import Config, Parameter, parameters, values
 from bevviz.pipeline.notes import HandledFinding, Note
@@ -49,40 +50,21 @@ def row_remark(answer: Answer) -> RowRemark:
 
 
 def note_entry(note: Note) -> NoteEntry:
-    """Return a note for the page."""
-    return {
-        "stamp": str(note.stamp),
-        "received": str(note.received),
-        "text": note.text,
-        "about": note.about,
-        "pick": note.pick,
-        "end": str(note.end),
-    }
+    """Return a note for the page, whose times are text."""
+    times = {"stamp": str(note.stamp), "received": str(note.received), "end": str(note.end)}
+    return cast("NoteEntry", asdict(note) | times)
 
 
 def handled_entry(finding: HandledFinding) -> HandledEntry:
-    """Return a finding that the user has dealt with, for the page."""
-    return {
-        "stamp": str(finding.stamp),
-        "what": finding.what,
-        "name": finding.name,
-        "pick": finding.pick,
-        "distance": finding.distance,
-        "state": finding.state,
-        "text": finding.text,
-    }
+    """Return a finding that the user has dealt with, for the page. Its time is text."""
+    return cast("HandledEntry", asdict(finding) | {"stamp": str(finding.stamp)})
 
 
 def handled_finding(entry: HandledEntry) -> HandledFinding:
     """Return the finding that a message of the page says is done or ignored."""
+    what, name, pick, distance = entry["what"], entry["name"], entry["pick"], entry["distance"]
     return HandledFinding(
-        stamp=int(entry["stamp"]),
-        what=entry["what"],
-        name=entry["name"],
-        pick=entry["pick"],
-        distance=entry["distance"],
-        state=entry["state"],
-        text=entry["text"].strip(),
+        int(entry["stamp"]), what, name, pick, distance, entry["state"], entry["text"].strip()
     )
 
 

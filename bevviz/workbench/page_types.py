@@ -145,7 +145,7 @@ Frames = TypedDict("Frames", {"type": Literal["frames"], "frames": list[FrameTim
 # Groups with their new frames, and numbers of the groups that are gone.
 Entries = TypedDict("Entries", {"type": Literal["entries"], "entries": list[Entry], "gone": list[int]})
 Controls = TypedDict("Controls", {"type": Literal["controls"], "controls": list[Control]})
-Noted = TypedDict("Noted", {"type": Literal["noted"], "id": int, "file": str, "text": str})
+Noted = TypedDict("Noted", {"type": Literal["noted"], "id": int, "text": str})
 Held = TypedDict("Held", {"type": Literal["held"], "frame": int, "stamp": str})
 Said = TypedDict("Said", {"type": Literal["said"], "text": str, "wrong": NotRequired[bool]})
 RobotReply: TypeAlias = Held | Said

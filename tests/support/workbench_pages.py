@@ -155,7 +155,7 @@ def watched_page(browser: Browser, width: int, height: int) -> Page:
 def opened(
     browser: Browser, address: str, width: int = 1000, height: int = 620, *, draws: bool = False
 ) -> Iterator[Page]:
-    """Yield the page as soon as the viewer shows a frame.
+    """Yield the page as soon as the viewer shows a frame. It may neither fail nor warn of its own commands.
 
     Args:
         browser: the browser.
@@ -165,13 +165,16 @@ def opened(
         draws: the page has Rerun's viewer, whose pictures take seconds without a graphics card. Otherwise a
             stand-in takes its messages, and reports the same events: see ``stand_in_viewer.js``.
     """
-    page = watched_page(browser, width, height)
+    page, wrong = watched_page(browser, width, height), list[str]()
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda line: wrong.append(line.text) if line.text.startswith("Failed to") else None)
     try:
         if not draws:
             page.route("**/viewer/*/*", _stand_in)
         page.goto(address)
         until(lambda: events(page, "time_update") or events(page, "timeline_change"), "a shown frame")
         yield page
+        assert not wrong
     finally:
         page.close()
 

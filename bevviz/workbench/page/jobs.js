@@ -54,7 +54,17 @@ export function start(using) {
     const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
     seek(trial.strip[Math.min(row, trial.strip.length - 1)].stamp);
   };
+  $("strip").onkeydown = (event) => { // The arrow keys step through the frames wherever the focus is.
+    const trial = shownRun();
+    if (event.key === "Enter" && trial?.strip.length) seek(worst(trial.strip).stamp);
+  };
 }
+
+/**
+ * The frame that gets worst.
+ * @param {StripFrame[]} frames
+ */
+const worst = (frames) => frames.reduce((a, b) => (b.worse - b.better > a.worse - a.better ? b : a));
 
 /** @param {{ text: string }} message */
 export function noted({ text }) {
@@ -169,8 +179,7 @@ function strip(frames) {
   }
   draw.fillStyle = style.getPropertyValue("--line");
   draw.fillRect(0, height / 2, width, 1);
-  const worst = frames.reduce((a, b) => (b.worse - b.better > a.worse - a.better ? b : a));
-  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst.stamp)}`;
+  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst(frames).stamp)} (Enter)`;
 }
 
 // --- search of a fix ----------------------------------------------------------------------------

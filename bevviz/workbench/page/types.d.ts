@@ -248,7 +248,6 @@ export interface NoteEntry {
 export interface Noted {
   type: "noted";
   id: number;
-  file: string;
   text: string;
 }
 
