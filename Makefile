@@ -37,7 +37,7 @@ check: $(VENV)/.tested
 # The page's scripts: types, rules and tests. It needs Node.js 18 or newer, with npm.
 page-check: tests/page/node_modules/.installed
 	tests/page/node_modules/.bin/tsc --project tests/page
-	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.js bevviz/workbench/page tests/page
+	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.js bevviz/workbench/page tests/page tests/support
 	node --test tests/page/*.test.js
 
 tests/page/node_modules/.installed: tests/page/package-lock.json

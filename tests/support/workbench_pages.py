@@ -167,7 +167,9 @@ def opened(
     """
     page, wrong = watched_page(browser, width, height), list[str]()
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("console", lambda line: wrong.append(line.text) if line.text.startswith("Failed to") else None)
+    page.on(
+        "console", lambda line: wrong.append(line.text) if line.text.startswith("Failed to set") else None
+    )
     try:
         if not draws:
             page.route("**/viewer/*/*", _stand_in)
