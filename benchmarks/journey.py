@@ -1,9 +1,10 @@
 """The way from a missed object to a filed report in the workbench, in a real browser against the real server.
 
-``python -m benchmarks.journey`` goes it on the synthetic drive and on KITTI's labelled frames, prints its
-steps, its clicks and the seconds that somebody waits, clicks 40 times in the views, asks about 40 things of
-the list, and changes parameters 40 times. Of each it says what the viewer's own drawing takes, which without
-a graphics card is most of it.
+First it starts ``bevviz demo`` as on a new machine: nothing is compiled, and no browser has the viewer.
+Then it goes the way on the synthetic drive and on KITTI's labelled frames, prints its steps, its clicks and
+the seconds that somebody waits, clicks 40 times in the views, asks about 40 things of the list, and changes
+parameters 40 times. Of each it says what the viewer's own drawing takes, which without a graphics card is
+most of it.
 
 A browser gives its processes sessions and priorities of their own: ``nice`` does not reach them.
 """
@@ -28,12 +29,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import BrowserContext, Page
 
 DATA = Path(os.environ.get("BEVVIZ_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
 FRAMES = 20
 CLICKS, SECONDS = 6, 20.0  # that the journey may take
-FIRST = 3.0  # seconds to the first frame
+FIRST, FRESH = 3.0, 15.0  # seconds to the first frame, and on a new machine
 ANSWER, PICTURE = 0.7, 0.3  # seconds from a click to its answer, from a change to its picture, for 95 %
 CHANGES = {  # that are tried in turn: the first stage, the last ones, and one between
     "voxel.size": (0.08, 0.15),
@@ -75,7 +76,7 @@ def main() -> int:
     parser.add_argument(
         "--frames", type=int, default=FRAMES, help=f"of the synthetic drive (default: {FRAMES})"
     )
-    parser.add_argument("--only", choices=("demo", "kitti"), help="one of the two")
+    parser.add_argument("--only", choices=("fresh", "demo", "kitti"), help="one of the three")
     parser.add_argument("--clicks", type=int, default=40, help="of each sort, timed one by one (default: 40)")
     parser.add_argument("--once", action="store_true", help="do not start it a first time, for the browser")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each step")
@@ -84,9 +85,11 @@ def main() -> int:
     good = True
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        if options.only != "kitti":
+        if options.only in (None, "fresh"):
+            good &= _fresh(folder / "fresh")
+        if options.only in (None, "demo"):
             good &= _go("the synthetic drive", demo(folder, options.frames), folder, options)
-        if options.only != "demo":
+        if options.only in (None, "kitti"):
             if not DATA.is_dir():
                 print(f"no KITTI: {DATA} is not there")
             else:
@@ -113,10 +116,12 @@ def _kitti(folder: Path) -> list[str]:
 
 
 @contextmanager
-def serving(arguments: Sequence[str], folder: Path) -> Iterator[str]:
-    """``bevviz open`` as a user starts it: its address."""
-    command = [sys.executable, "-m", "bevviz.cli", "open", *arguments, "--no-browser"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder) as server:
+def serving(arguments: Sequence[str], folder: Path, **variables: str) -> Iterator[str]:
+    """Start a command of the workbench as a user does, and yield the address that it prints."""
+    command = [sys.executable, "-m", "bevviz.cli", *arguments]
+    environment = os.environ | {"DISPLAY": "", "BROWSER": ""} | variables
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stderr=pipe, text=True, cwd=folder, env=environment) as server:
         try:
             assert server.stderr is not None
             for line in server.stderr:
@@ -130,13 +135,14 @@ def serving(arguments: Sequence[str], folder: Path) -> Iterator[str]:
             server.communicate(timeout=60)
 
 
-def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespace) -> bool:
+@contextmanager
+def _browser(folder: Path) -> Iterator[BrowserContext]:
+    """Start a browser with an empty profile."""
     from playwright.sync_api import sync_playwright
 
     chromium = os.environ.get("BEVVIZ_CHROMIUM") or shutil.which("chromium")
     if chromium is None:
         raise SystemExit("needs a browser: apt-get install chromium (or BEVVIZ_CHROMIUM=its path)")
-    print(f"\n{name}: bevviz open {' '.join(arguments)}")
     with sync_playwright() as playwright:
         context = playwright.chromium.launch_persistent_context(
             folder / "profile",
@@ -144,14 +150,35 @@ def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespa
             args=SOFTWARE,
             viewport={"width": WIDTH, "height": HEIGHT},
         )
+        yield context
+        context.close()
+
+
+def _fresh(folder: Path) -> bool:
+    """Time the first frame of ``bevviz demo`` without compiled stages, stored results and cached viewer."""
+    folder.mkdir()
+    caches = {"NUMBA_CACHE_DIR": str(folder / "numba"), "XDG_CACHE_HOME": str(folder / "cache")}
+    print("\na new machine: bevviz demo")
+    with _browser(folder) as context:
+        start = time.monotonic()
+        with serving(["demo"], folder, **caches) as address:
+            printed = time.monotonic() - start
+            page = context.new_page()
+            page.goto(address)
+            return _first_frame(page, start, printed, "the first time", FRESH) <= FRESH
+
+
+def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespace) -> bool:
+    print(f"\n{name}: bevviz open {' '.join(arguments)}")
+    with _browser(folder) as context:
         context.add_init_script(
             "window.seen = []; window.addEventListener('viewer-event', (e) => window.seen.push(e.detail))"
         )
         for warm in (True,) if options.once else (False, True):  # the second time the browser has the viewer
             start = time.monotonic()
-            with serving(arguments, folder) as address:
-                page = context.new_page()
+            with serving(["open", *arguments, "--no-browser"], folder) as address:
                 printed = time.monotonic() - start
+                page = context.new_page()
                 page.goto(address)
                 which = "again: the browser has the viewer" if warm else "the first time"
                 _first_frame(page, start, printed, which)
@@ -159,7 +186,6 @@ def _go(name: str, arguments: list[str], folder: Path, options: argparse.Namespa
                     journey = _journey(page, name, options.pictures)
                     _latencies(page, options.clicks)
                 page.close()
-        context.close()
     print(
         f"  {journey.clicks} clicks (at most {CLICKS}), "
         f"{journey.waited:.1f} s of waiting (at most {SECONDS:g})"
@@ -318,8 +344,8 @@ def _clicks(page: Page, number: int) -> list[tuple[float, float]]:
     return found
 
 
-def _first_frame(page: Page, start: float, printed: float, which: str) -> None:
-    """Wait for it, and say how long it took since the command was started."""
+def _first_frame(page: Page, start: float, printed: float, which: str, wanted: float = FIRST) -> float:
+    """Wait for it, and return how long it took since the command was started."""
     marks = (
         "Object.fromEntries(performance.getEntriesByType('mark').map((m) => [m.name, m.startTime / 1000]))"
     )
@@ -327,10 +353,11 @@ def _first_frame(page: Page, start: float, printed: float, which: str) -> None:
     opened = time.monotonic() - start - page.evaluate("performance.now()") / 1000
     at = {name: opened + seconds for name, seconds in page.evaluate(marks).items()}
     print(
-        f"  {at['frame']:6.2f} s  from the command to the first frame drawn, {which} (wanted: {FIRST:g} s): "
+        f"  {at['frame']:6.2f} s  from the command to the first frame drawn, {which} (wanted: {wanted:g} s): "
         f"the address after {printed:.2f} s, the viewer begun {at['viewer']:.2f}, the frame at the viewer "
         f"{at['piece']:.2f}, taken by it {at['told']:.2f}"
     )
+    return at["frame"]
 
 
 def _answered(page: Page, before: str) -> Callable[[], bool]:

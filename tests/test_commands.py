@@ -88,7 +88,7 @@ def test_demo_shows_a_missed_pedestrian(tmp_path: Path) -> None:
         assert sentence.startswith(
             "0.5 s into demo.mcap: The person at 7.3 m was not reported because it was"
         )
-        assert "taken for ground" in sentence and "change ground.distance_threshold=0.3" in sentence
+        assert "taken for ground" in sentence and "change ground.distance_threshold=0.2" in sentence
         (address,) = [line for line in said if "workbench at" in line]
         assert "#bag=demo.mcap&at=1750000000500000000&pick=truth" in address
         assert any(f"ssh -N -L {port_of(address)}:localhost:{port_of(address)}" in line for line in said)

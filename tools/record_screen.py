@@ -135,7 +135,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=options.browser, args=SOFTWARE)
         bag = shutil.copy(SHIPPED, folder)  # The report is written beside it.
-        with serving([bag, "--model", "demo"], Path(folder)) as address:
+        with serving(["open", bag, "--model", "demo", "--no-browser"], Path(folder)) as address:
             page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme="dark")
             page.goto(address)
             until(lambda: page.locator("#bar").is_hidden(), 0.5)  # the drive is loaded

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from bevviz.errors import UserError
 
 if TYPE_CHECKING:
     from bevviz.config import Config
+    from bevviz.why import FrameExplainer
     from bevviz.workbench.session import WorkbenchSession
 
 EMPTY: Mapping[str, str] = MappingProxyType({})
@@ -74,13 +75,19 @@ def _open(options: OpenOptions) -> int:
     return open_page(options, load_config(options))
 
 
-def open_page(options: OpenOptions, config: Config, shown: Mapping[str, str] = EMPTY) -> int:
+def open_page(
+    options: OpenOptions,
+    config: Config,
+    shown: Mapping[str, str] = EMPTY,
+    opened: Callable[[FrameExplainer], None] = lambda explainer: None,
+) -> int:
     """Serve the workbench until the user ends it.
 
     Args:
         options: options of ``bevviz open``.
         config: configuration of the run.
         shown: state of the page, as its address holds it.
+        opened: called once a page shows the first frame, before the run.
     """
     try:
         from bevviz.workbench.server import serve
@@ -109,7 +116,7 @@ def open_page(options: OpenOptions, config: Config, shown: Mapping[str, str] = E
             if labels != (None, None):
                 source.truth_of = second_source.truth_of = truth_of
             drive = Drive(source, config)
-            return recorded_session(drive, second_source, paths, truth_of, first, labels)
+            return recorded_session(drive, second_source, paths, truth_of, first, labels, opened)
 
         def ready(address: str) -> None:
             announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, page.browser)

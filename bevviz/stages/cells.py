@@ -30,7 +30,7 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
     if strides.any():
         return keys, strides
     # The points are too scattered for 64 bits. Shorten the gaps along each axis to just beyond the reach.
-    low, _ = bounds(points)
+    low = points.min(axis=0).astype(np.float64)
     columns = []
     for axis in range(3):
         cells = np.floor((points[:, axis] - (low[axis] - shift * size)) / size)
@@ -43,20 +43,32 @@ def cell_keys(points: F32, size: float, shift: float = 0.0, reach: int = 0) -> t
 
 @kernel
 def _pack_cells(points: F32, size: float, shift: float, reach: int) -> tuple[I64, I64]:
-    """Return the keys and the strides. The strides are zero if the keys do not fit into 64 bits."""
-    low, high = bounds(points)
-    origin = low - shift * size
-    counts = np.floor((high - origin) / size) + 1 + 2 * reach
+    """Return the keys and the strides. The strides are zero if the keys do not fit into 64 bits.
+
+    It is one kernel of scalars: array expressions and further kernels double the time to compile it.
+    """
+    x0, y0, z0 = np.float64(points[0, 0]), np.float64(points[0, 1]), np.float64(points[0, 2])
+    x1, y1, z1 = x0, y0, z0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        x0, y0, z0 = min(x, x0), min(y, y0), min(z, z0)
+        x1, y1, z1 = max(x, x1), max(y, y1), max(z, z1)
+    x0, y0, z0 = x0 - shift * size, y0 - shift * size, z0 - shift * size
+    counts = np.empty(3)
+    counts[0] = np.floor((x1 - x0) / size) + 1 + 2 * reach
+    counts[1] = np.floor((y1 - y0) / size) + 1 + 2 * reach
+    counts[2] = np.floor((z1 - z0) / size) + 1 + 2 * reach
     keys = np.empty(len(points), np.int64)
     if counts[0] * counts[1] * counts[2] >= 2.0**62:
         return keys, np.zeros(3, np.int64)
     strides = _strides(counts)
     for i in range(len(points)):
         # The coordinates are not negative, so truncation equals the floor.
-        x = np.int64((points[i, 0] - origin[0]) / size)
-        y = np.int64((points[i, 1] - origin[1]) / size)
-        z = np.int64((points[i, 2] - origin[2]) / size)
-        keys[i] = x * strides[0] + y * strides[1] + z * strides[2]
+        keys[i] = (
+            np.int64((points[i, 0] - x0) / size) * strides[0]
+            + np.int64((points[i, 1] - y0) / size) * strides[1]
+            + np.int64((points[i, 2] - z0) / size) * strides[2]
+        )
     return keys, strides
 
 
@@ -77,18 +89,6 @@ def _strides(counts: F64) -> I64:
     strides[middle] = np.int64(counts[fast])
     strides[slow] = np.int64(counts[fast]) * np.int64(counts[middle])
     return strides
-
-
-@kernel
-def bounds(points: F32) -> tuple[F64, F64]:
-    """Return the (3,) lowest and (3,) highest coordinates of at least one point."""
-    x0, y0, z0 = points[0]
-    x1, y1, z1 = points[0]
-    for i in range(len(points)):
-        x, y, z = points[i]
-        x0, y0, z0 = min(x, x0), min(y, y0), min(z, z0)
-        x1, y1, z1 = max(x, x1), max(y, y1), max(z, z1)
-    return np.array([x0, y0, z0], np.float64), np.array([x1, y1, z1], np.float64)
 
 
 @kernel

@@ -40,7 +40,12 @@ def describe_clusters(points: F32, labels: I32, config: ClusteringConfig) -> Clu
         labels: (P,) int32. -1 is noise; every number from 0 to the largest is the label of a point.
         config: the size limits.
     """
-    count, centroid, low, high, oriented = _boxes(points, labels)
+    order, start = sort_by(labels + np.int32(1), int(labels.max()) + 2 if len(labels) else 1)
+    start = start[1:]  # the first group is noise
+    count = start[1:] - start[:-1]
+    centroid, oriented = np.empty((len(count), 3), np.float32), np.empty((len(count), 7), np.float32)
+    low, high = np.empty_like(centroid), np.empty_like(centroid)
+    _fill_boxes(points, order, start, centroid, low, high, oriented)
     state = np.full(len(count), ClusterState.KEPT, np.int32)
     state[count < config.min_cluster_points] = ClusterState.TOO_SMALL
     if config.max_cluster_points is not None:
@@ -397,22 +402,19 @@ def _heading(x: F64, y: F64) -> float:
 
 
 @kernel
-def _boxes(points: F32, labels: I32) -> tuple[I32, F32, F32, F32, F32]:
-    """Return point count, centroid, lowest and highest corner, and oriented box of each cluster.
+def _fill_boxes(
+    points: F32, order: I32, start: I32, centroid: F32, low: F32, high: F32, oriented: F32
+) -> None:
+    """Write centroid, lowest and highest corner, and oriented box of each cluster into the last four arrays.
 
     An oriented box is centre, size and yaw. L-shape fitting with the closeness criterion (Zhang et al. 2017)
     gives the heading, from at most about 256 evenly spread points of a cluster. All points give the extent.
     """
-    order, start = sort_by(labels + np.int32(1), max(labels) + 2 if len(labels) else 1)
-    start = start[1:]  # the first group is noise
-    clusters = len(start) - 1
-    centroid = np.empty((clusters, 3), np.float32)
-    low = np.full((clusters, 3), np.inf, np.float32)
-    high = np.full((clusters, 3), -np.inf, np.float32)
-    oriented = np.empty((clusters, 7), np.float32)
-    for k in range(clusters):
+    mean = np.empty(3)
+    for k in range(len(centroid)):
         count = start[k + 1] - start[k]
-        mean = np.zeros(3)
+        for axis in range(3):
+            mean[axis], low[k, axis], high[k, axis] = 0.0, np.inf, -np.inf
         for i in range(start[k], start[k + 1]):
             for axis in range(3):
                 value = points[order[i], axis]
@@ -445,4 +447,3 @@ def _boxes(points: F32, labels: I32) -> tuple[I32, F32, F32, F32, F32]:
             high[k, 2] - low[k, 2],
         )
         oriented[k, 6] = yaw
-    return start[1:] - start[:-1], centroid, low, high, oriented

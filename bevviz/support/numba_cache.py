@@ -140,7 +140,8 @@ def _user_kernel_folder() -> Path:
 
 def compiled(function: Callable[..., object], options: Mapping[str, object]) -> Any:
     """Return a function that numba compiles at its first call, with options of ``numba.njit``."""
-    dispatcher = numba.njit(**options)(function)
+    # No C function calls a kernel. To compile an entry for one takes a twentieth of the whole time.
+    dispatcher = numba.njit(no_cfunc_wrapper=True, **options)(function)
     if CACHED:
         dispatcher._cache = _LazyCache(function)
     return dispatcher

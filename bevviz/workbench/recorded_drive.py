@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ from bevviz.pipeline.run import run
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import logged_rows
-from bevviz.why import Answer
+from bevviz.why import Answer, FrameExplainer
 from bevviz.why.log import focus_answer, mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
@@ -54,6 +54,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         truth_of: returns the ground truth of a frame.
         first: number of the scan that is shown first.
         table: place of the list of a whole run. None: it is not kept.
+        opened: called once a page shows the first frame, before the run.
 
     Attributes:
         recording: recording of the drive.
@@ -69,12 +70,13 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         truth_of: TruthLookup | None = None,
         first: int = 0,
         table: RunTable | None = None,
+        opened: Callable[[FrameExplainer], None] = lambda explainer: None,
     ) -> None:
         super().__init__(drive.scene.name, drive.session, truth_of)
         self.drive, self.again, self.scans = drive, again, len(drive)
         recording = getattr(drive.frames, "recording", None)
         self.single_frames = bool(getattr(recording, "single_frames", False))
-        self._first, self._table = first, table
+        self._first, self._table, self._opened = first, table, opened
         self._is_listed = False  # whether the list is that of an earlier run
         self.recording = DriveRecording(drive.scene, drive.config, self.again.total)
         self._thumbnails = Thumbnails(len(self.again.scans))
@@ -141,8 +143,10 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             self._load_list()
             first = self.look(self._first)
             self.first = self._stamp_of(0)
-            self.show(first, find_findings(self.explainer(first)))
+            explainer = self.explainer(first)
+            self.show(first, find_findings(explainer))
             self._go.wait(FIRST)
+            self._opened(explainer)
             if self.again.total >= LEAST and not self._is_listed:
                 self._make_overview()
             run(self.again, self.drive.new_session(), [self], stop=self._stop)

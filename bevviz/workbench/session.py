@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -354,6 +354,7 @@ def recorded_session(
     truth_of: TruthLookup | None = None,
     first: int = 0,
     labels: tuple[str | None, Path | None] = (None, None),
+    opened: Callable[[FrameExplainer], None] = lambda explainer: None,
 ) -> WorkbenchSession:
     """Return the workbench session of a recorded drive.
 
@@ -364,11 +365,12 @@ def recorded_session(
         truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
         first: number of the scan that is shown first.
         labels: stated topic and files of the ground truth.
+        opened: called once a page shows the first frame, before the run.
     """
     recording = getattr(drive.frames, "recording", None)
     files = [] if recording is None else [file.path for file in recording.files]
     table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
-    source = RecordedDrive(drive, again, truth_of, first, table)
+    source = RecordedDrive(drive, again, truth_of, first, table, opened)
     session = WorkbenchSession(source)
 
     def bag_of(number: int) -> ReportedBag:
