@@ -10,7 +10,7 @@ import urllib.request
 from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -23,6 +23,9 @@ from bevviz.workbench.buffers import AHEAD
 from tests.support.small_disk import small_disk
 from tests.support.waiting import PATIENCE
 from tests.support.workbench_pages import FRAMES, Talk, channel, demo_bag, served
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 Hinted = list[tuple[int, str, dict[str, Any]]]  # time and pick of each missed object, and its hints
 
@@ -311,21 +314,31 @@ def test_a_report_has_the_notes_of_its_window(bag: Path, tmp_path: Path) -> None
 
 
 def test_the_frame_that_is_looked_at_comes_first(address: str) -> None:
-    """A page that acknowledges no piece gets a few pieces, and the one that it asks for."""
+    """A page that acknowledges no piece gets a few pieces, and the one that it asks for, after its number."""
+
+    def piece(page: ClientConnection) -> tuple[str, bytes]:
+        number, content = "", page.recv(timeout=PATIENCE)
+        if isinstance(content, str):
+            number, content = content, page.recv(timeout=PATIENCE)
+        assert isinstance(content, bytes)
+        return number, content
+
     with Talk(address) as talk:
         last = max(int(s["stamp"]) for entry in talk.of("missed", "false") for s in entry["sights"])
     with channel(address, "/recording") as page:
-        whole = list[str | bytes]()
+        whole = list[tuple[str, bytes]]()
         while len(whole) <= FRAMES:
-            whole.append(page.recv(timeout=PATIENCE))
+            whole.append(piece(page))
             page.send("got it")
+    numbers = dict.fromkeys(number for number, _ in whole if number)  # The first frame is recorded again.
+    assert list(numbers) == [str(number) for number in range(FRAMES)]
     with channel(address, "/recording") as page:
-        assert [page.recv(timeout=PATIENCE) for _ in range(AHEAD)] == whole[:AHEAD]
+        assert [piece(page) for _ in range(AHEAD)] == whole[:AHEAD]
     with channel(address, "/recording") as page:
         page.send(str(last))
-        asked = [page.recv(timeout=PATIENCE)]
+        asked = [piece(page)]
         while asked[-1] != whole[FRAMES]:
-            asked.append(page.recv(timeout=PATIENCE))
+            asked.append(piece(page))
     assert len(set(asked)) == len(asked) <= AHEAD + 1
 
 

@@ -378,6 +378,11 @@ def test_a_click_and_a_row_are_answered_with_what_would_help(page: Page) -> None
     chosen = page.locator("#found [aria-current=true]")
     until(lambda: str(chosen.get_attribute("title")).endswith(sentence))
     assert "hint" not in chosen.inner_text()
+    similar = page.locator("#steps button", has_text="see a similar case: missed")
+    fact = similar.first.locator("small").inner_text()
+    similar.first.click()
+    until(lambda: fact.split(", ")[0] in page.inner_text("#found [aria-current=true]"))
+    assert similar.count() <= 2 and fact.split(", ")[2] in page.inner_text("#found [aria-current=true]")
     choose_missed(page, with_hints=True)
     button = page.locator("#hints button").first
     settings = button.inner_text().splitlines()[0].removeprefix("try ")
@@ -523,6 +528,10 @@ def test_an_address_and_a_shared_link_open_the_same(
         there.goto(link._replace(netloc=urlsplit(other).netloc).geturl())
         until(lambda: verdict(there) == text)
         assert there.locator("#linked").is_hidden()
+        there.goto(other)
+        until(lambda: page.inner_text("#where"))
+        there.evaluate(PASTE, link.geturl())
+        until(lambda: verdict(there) == text and state(there) == held)
         strange = link.fragment.replace(bag.name, "another.mcap")
         there.goto(link._replace(netloc=urlsplit(other).netloc, fragment=strange).geturl())
         until(lambda: "The link is about another.mcap" in there.inner_text("#linked"))
@@ -530,6 +539,13 @@ def test_an_address_and_a_shared_link_open_the_same(
     stranger.goto(link.geturl())
     assert "Start bevviz open with the same bag" in stranger.inner_text("body")
     stranger.context.close()
+
+
+PASTE = """(text) => {
+  const clipboardData = new DataTransfer();
+  clipboardData.setData("text", text);
+  document.body.dispatchEvent(new ClipboardEvent("paste", { clipboardData, bubbles: true }));
+}"""
 
 
 @pytest.mark.long
@@ -549,11 +565,19 @@ def test_two_pages_find_a_server_again_that_was_killed(bag: Path, browser: Brows
         server.kill()
         until(lambda: "The server is gone" in page.inner_text("#gone"))
         server.wait()
-        with serving("open", str(bag), "--port", str(urlsplit(address).port)) as (again, _):
+        with serving("open", str(bag), "--port", str(urlsplit(address).port)) as (again, again_server):
             assert again == address
             until(lambda: page.locator("#gone").is_hidden() and verdict(page) == text)
             assert state(page) == held
             until(lambda: other.locator("#gone").is_hidden() and listed(other))
+            again_server.kill()
+            until(lambda: "The server is gone" in page.inner_text("#gone"))
+            again_server.wait()
+            page.keyboard.press("n")
+            until(lambda: verdict(page) == "The server is away: this is asked when it is back.")
+            with serving("open", str(bag), "--port", str(urlsplit(address).port)):
+                new_verdict(page, verdict(page))
+                assert state(page)["at"] != held["at"] or state(page)["pick"] != held["pick"]
 
 
 def test_a_phone_has_the_panel_below_the_viewer(browser: Browser, address: str) -> None:

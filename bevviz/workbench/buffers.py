@@ -215,6 +215,10 @@ class BufferReader:
         if row is None:
             return ()
         self._sent += 1
+        return self._pieces(row)
+
+    def _pieces(self, row: int) -> Sequence[bytes | str]:
+        """Return the piece of a row, and before it what the page has to know of it."""
         return (self._buffer[row],)
 
     def _requested_row(self) -> int | None:
@@ -236,6 +240,9 @@ class FrameMaker(Protocol):
 
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame at a stamp. None: there is none, or not yet."""
+
+    def number_in(self, row: int) -> int | None:
+        """Return the number of the frame that a row has. None: it has none."""
 
     def number_at(self, stamp: int) -> int:
         """Return the number of the frame at a stamp."""
@@ -281,6 +288,11 @@ class DriveReader(BufferReader):
             pieces = str(frame[0]), frame[1]
         self._sent += bool(pieces)
         return pieces
+
+    def _pieces(self, row: int) -> Sequence[bytes | str]:
+        """Return the piece of a row, after the number of its frame. The page tells what it lacks."""
+        number = self._frames.number_in(row)
+        return super()._pieces(row) if number is None else (str(number), self._buffer[row])
 
     def _frame(self) -> tuple[int, bytes] | None:
         """Return the next frame and its number. None: the page waits for nothing, or can take no more."""

@@ -57,6 +57,7 @@ class DriveRecording(Closable):
         self._frames: FrameCache | None = None
         self._frame_versions: dict[int, int] = {}  # of the frames in ``_frames``
         self._rows_by_stamp: dict[int, int] = {}
+        self._numbers_by_row: dict[int, int] = {}
         self._drawn: list[tuple[int, int, int]] = []  # stamp, number and receive time, sorted
         self._rows = RowCache()  # by frame number and settings
         self._recoloured: set[int] = set()  # numbers of frames whose raw cloud was drawn with other values
@@ -128,6 +129,7 @@ class DriveRecording(Closable):
             self._frames, self.on_demand = FrameCache(), True
             self._logger.streams_video = False  # A page may lack the packets that a picture depends on.
         self._rows_by_stamp[result.frame.stamp] = len(self.rows)
+        self._numbers_by_row[len(self.rows)] = result.frame.index
         self.rows.add(piece)
 
     def _log_usual_focus(self, frame: Frame, first: int) -> None:
@@ -138,6 +140,10 @@ class DriveRecording(Closable):
     def row(self, stamp: int) -> int | None:
         """Return the row of the frame with this stamp."""
         return self._rows_by_stamp.get(stamp)
+
+    def number_in(self, row: int) -> int | None:
+        """Return the number of the frame that a row has. None: it has none."""
+        return self._numbers_by_row.get(row)
 
     def frame(self, number: int, version: int) -> bytes | None:
         """Return the piece of a frame, if it is kept in this version."""

@@ -274,9 +274,9 @@ class PageConnection:
                 number, lambda: workbench.hints(frame, settings, selection), settings, idle=True
             )
             if hints is not None:
-                asked, changes = message.get("pick", tree["pick"]), answer_tree(hints)["hints"]
+                row, changes = str(answer.selection or selection), answer_tree(hints)["hints"]
                 await self._send(
-                    {"type": "hints", **head, "row_pick": asked, "hints": changes, **row_remark(hints)}
+                    {"type": "hints", **head, "row_pick": row, "hints": changes, **row_remark(hints)}
                 )
 
         async def follow_robot() -> None:

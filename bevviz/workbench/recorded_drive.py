@@ -296,6 +296,10 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         recorded = self.shown_at(stamp)
         return None if recorded is None else self.recording.row(recorded[0])
 
+    def number_in(self, row: int) -> int | None:
+        """Return the number of the frame that a row has. None: it has none."""
+        return self.recording.number_in(row)
+
     def version(self, number: int) -> int:
         """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
         return int(number in self._facts)

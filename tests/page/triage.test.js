@@ -2,7 +2,7 @@ import "./browser.js";
 import assert from "node:assert/strict";
 import test from "node:test";
 import { state } from "../../bevviz/workbench/page/page_state.js";
-import { csv, matches, severity, sorted } from "../../bevviz/workbench/page/triage.js";
+import { csv, matches, severity, similar, sorted } from "../../bevviz/workbench/page/triage.js";
 
 const sight = (more = {}) => ({
   frame: 0, stamp: "1000000000", distance: 30, pick: "truth//0", tried: false, text: "merged", remark: "", in_way: false, ...more,
@@ -18,6 +18,20 @@ test("each reason that makes a finding severe counts once", () => {
   assert.deepEqual(severity(finding(2)), []);
   assert.deepEqual(severity(finding(3, { what: "note" }, sight({ distance: 1 }))), []);
   assert.equal(severity(finding(4, { what: "anomaly", name: "sync" })).length, 1);
+});
+
+test("a second name is not severe", () => {
+  assert.deepEqual(severity(finding(1, {}, sight({ distance: 2, text: "second name" }))), []);
+});
+
+test("similar cases have the reason first, then the kind, the class and the distance", () => {
+  const own = finding("own");
+  const others = [
+    finding("another reason", {}, sight({ text: "ground" })), finding("another kind", { what: "false" }), finding("far", {}, sight({ distance: 45 })),
+    finding("handled", { handled: { state: "done" } }), finding("near", {}, sight({ distance: 29 })), finding("note", { what: "note" }),
+  ];
+  assert.deepEqual(keys(similar(own, [own, ...others])), ["near", "another kind"]);
+  assert.deepEqual(keys(similar(own, [own, ...others], 9)), ["near", "another kind", "far", "another reason"]);
 });
 
 test("severe ones come first, handled ones last", () => {

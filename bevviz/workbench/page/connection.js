@@ -57,18 +57,18 @@ function receive(lane) {
   const socket = socketAt(`/recording?lane=${lane}&from=${first}`);
   socket.binaryType = "arraybuffer";
   /** @type {number | null} */
-  let announced = null; // number of the frame on demand that comes next
+  let announced = null; // number of the frame that comes next
   socket.onmessage = ({ data }) => {
     if (typeof data === "string") { announced = Number(data); return; }
     if (!counted("recording")) performance.mark("piece");
     toViewer({ type: "rrd" }, [new DataView(data)]);
-    if (announced === null) pieces.set(lane, counted(lane) + 1);
+    if (announced !== null) handlers.made?.(announced);
+    if (announced === null || !state.demand) pieces.set(lane, counted(lane) + 1);
     else {
       held += data.byteLength;
-      handlers.made?.(announced);
-      announced = null;
       if (held > LIMIT) handlers.full?.();
     }
+    announced = null;
     for (const one of awaited.filter(([, count]) => counted(overlay) >= count)) one[0]();
     awaited = awaited.filter(([, count]) => counted(overlay) < count);
     if (overlay) follow(overlay);

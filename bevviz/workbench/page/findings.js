@@ -1,7 +1,7 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
 import { $, at, element, remember, spanText, state, stated } from "./page_state.js";
-import { away, cause, csv, hasCause, KINDS, matches, severity, sorted } from "./triage.js";
+import { away, cause, csv, hasCause, KINDS, matches, severity, similar, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
@@ -89,6 +89,37 @@ export function explain({ frame, pick, remark, chip }, tried = false) {
     if (one) Object.assign(one, { remark: remark || " ", chip });
   }
   draw();
+}
+
+/**
+ * Buttons of what can be done about a listed object that no change helps.
+ * @param {number} frame
+ * @param {string} pick
+ */
+export function nextSteps(frame, pick) {
+  const all = [...entries.values()];
+  const own = all.find((entry) => hasCause(entry) && entry.sights.some((one) => one.frame === frame && one.pick === pick && !one.tried));
+  if (!own) return [];
+  const steps = similar(own, all).map((entry) => {
+    const one = entry.sights[entry.best];
+    const facts = [at(one.stamp, one.frame), one.distance === null ? "" : `${one.distance} m`, one.text].filter(Boolean).join(", ");
+    return offered(`see a similar case: ${entry.what} ${entry.name}`, facts, () => choose(entry, entry.best));
+  });
+  if (does.handle && !own.handled && own.what === "unmatched") {
+    steps.unshift(offered("nothing was missed", "a false detection: ignore this finding", () => mark(own, "ignored", "the detector's own: nothing was missed")));
+  }
+  return steps;
+}
+
+/**
+ * @param {string} text
+ * @param {string} meaning
+ * @param {() => void} action
+ */
+export function offered(text, meaning, action) {
+  const button = element("button", "", text, element("small", "", meaning));
+  button.onclick = action;
+  return button;
 }
 
 // Something else is asked about. The next finding is still the one after the chosen one.

@@ -30,11 +30,14 @@ const shownKey = () => [shownFrame() ?? state.time, ...shownSet()].join();
 const frameName = (/** @type {number | null} */ frame) => (frame === null ? `the frame at ${seconds(state.time)}` : `frame ${frame}`);
 const withValues = (/** @type {string[]} */ set) => (set.length ? ` with ${set.join(", ")}` : "");
 
+// A reloaded page does not know the numbers of the frames yet.
+const unsentKey = () => [state.time, ...shownSet()].join();
+
 // A question that was asked while the server was away is asked when it is back, by this page or the reloaded one.
 function askUnsent() {
   const unsent = JSON.parse(sessionStorage.getItem("unsent") ?? "null");
   sessionStorage.removeItem("unsent");
-  if (unsent && unsent.bag === state.bag && unsent.key === shownKey()) ask(unsent.what);
+  if (unsent && unsent.bag === state.bag && unsent.key === unsentKey()) ask(unsent.what);
   else return false;
   return true;
 }
@@ -43,7 +46,7 @@ function askUnsent() {
 function ask(what) {
   if (state.time === null) return;
   if (!isConnected()) {
-    sessionStorage.setItem("unsent", JSON.stringify({ bag: state.bag, key: shownKey(), what }));
+    sessionStorage.setItem("unsent", JSON.stringify({ bag: state.bag, key: unsentKey(), what }));
     clear("", "The server is away: this is asked when it is back.");
     return;
   }
@@ -84,7 +87,7 @@ function clear(className, text, where = "") {
   $("answer").className = className;
   $("verdict").textContent = text;
   $("where").textContent = where;
-  for (const id of /** @type {const} */ (["chain", "beside", "hints", "robot-chain", "further"])) $(id).replaceChildren();
+  for (const id of /** @type {const} */ (["chain", "beside", "steps", "hints", "robot-chain", "further"])) $(id).replaceChildren();
   for (const id of /** @type {const} */ (["beside-title", "robot-title"])) $(id).hidden = true;
   freshness();
 }
@@ -95,7 +98,7 @@ function forget() {
   clear("", "Click a box, a point, a pixel: it answers why it is what it is.");
 }
 
-// Frames on demand that the viewer has. While it plays, they are requested a few times in a second.
+// Frames that the viewer has. Those on demand are requested a few times in a second while it plays.
 const made = new Set();
 let lastRequest = 0;
 function requestOften() {
@@ -107,7 +110,8 @@ function requestOften() {
 // Tell which frame is shown, and mark an answer or an effect of another frame or of other values.
 function freshness() {
   const frame = shownFrame();
-  const making = state.demand && frame !== null && !made.has(frame) ? ", being made ..." : "";
+  const isMade = kind === "live" || frame === null || made.has(frame);
+  const making = isMade ? "" : state.demand ? ", being made ..." : ", on its way: the views show an earlier frame ...";
   const at = state.single ? "" : seconds(state.time); // empty beside a robot
   $("shown").textContent = frame === null ? at : `Frame ${frame}${at && ` at ${at}`}${making}`;
   const { answer } = state;
@@ -153,6 +157,7 @@ function answer(message) {
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
+  $("steps").replaceChildren();
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
   freshness();
   list.showAnswer();
@@ -215,14 +220,16 @@ function failed(message) {
 function hints(message) {
   if (message.id !== asking) return;
   $("hints").replaceChildren(...message.hints.map((hint) => {
-    const button = element("button", "", `try ${hint.settings.join(", ")}`,
-      element("small", "", [hint.text, effects(hint)].filter(Boolean).join("; ")));
-    button.onclick = () => change(hint.settings);
-    return button;
+    const meaning = [hint.text, effects(hint)].filter(Boolean).join("; ");
+    return list.offered(`try ${hint.settings.join(", ")}`, meaning, () => change(hint.settings));
   }));
   freshness();
   if (!message.remark) return;
-  if (!message.hints.length) $("hints").textContent = message.remark;
+  if (!message.hints.length) {
+    $("hints").textContent = message.remark;
+    $("steps").replaceChildren(...(askedTried ? [] : list.nextSteps(message.frame, message.row_pick)),
+      list.offered("hand it on", "a report of this frame and answer, to be run again elsewhere", () => $("report").click()));
+  }
   list.explain({ ...message, pick: message.row_pick }, askedTried);
 }
 

@@ -13,8 +13,15 @@ export function start() {
     parts.set("first", String(state.first));
     parts.set("opened", opened);
     await navigator.clipboard.writeText(`${location.origin}/shared#${parts}`);
-    $("shared").textContent = `Copied. It opens wherever 'bevviz open' shows ${state.bag}.`;
+    $("shared").textContent = `Copied. It opens wherever 'bevviz open' shows ${state.bag}: at another port, paste it into that page.`;
   };
+  // The link names our port. A page at another port takes what it says about the drive.
+  window.addEventListener("paste", (event) => {
+    const link = /^https?:\/\/[^/]+\/shared(#.+)$/.exec(event.clipboardData?.getData("text").trim() ?? "");
+    if (!link || (event.target instanceof Element && event.target.matches("aside input"))) return;
+    history.replaceState(null, "", link[1]);
+    location.reload();
+  });
   // A link was put into the address. Ours is only a sign to the viewer, or a step of the history, which has a state.
   window.addEventListener("hashchange", (event) => event.isTrusted && !history.state && location.reload());
 }

@@ -36,7 +36,7 @@ export const cause = (/** @type {Finding} */ entry) => (hasCause(entry) ? entry.
  */
 export function severity(entry) {
   if (entry.what === "anomaly" && SENSORS.includes(entry.name)) return ["concerns everything that the sensors see"];
-  if (!hasCause(entry)) return [];
+  if (!hasCause(entry) || entry.sights.every((one) => one.text === "second name")) return [];
   const stamps = entry.sights.map((one) => Number(one.stamp));
   const lasts = Math.max(...stamps) - Math.min(...stamps);
   const reasons = [];
@@ -51,6 +51,18 @@ const rank = (/** @type {Finding} */ entry) => RANK.get(entry.what) ?? KINDS.len
 const order = (/** @type {Finding} */ a, /** @type {Finding} */ b) => Number(Boolean(a.handled)) - Number(Boolean(b.handled)) || level(b) - level(a)
   || rank(a) - rank(b) || away(a.sights[a.best]) - away(b.sights[b.best])
   || Number(a.sights[0].stamp) - Number(b.sights[0].stamp);
+
+/**
+ * The findings of other objects that are most like one: by reason, kind, class and distance.
+ * @param {Finding} own
+ * @param {Finding[]} entries
+ */
+export function similar(own, entries, most = 2) {
+  const unlike = (/** @type {Finding} */ entry) => 2 * Number(cause(entry) !== cause(own)) + Number(entry.what !== own.what)
+    + Number(entry.name !== own.name) + Math.abs(away(entry.sights[entry.best]) - away(own.sights[own.best])) / NEAR;
+  const others = entries.filter((entry) => entry !== own && hasCause(entry) && !entry.handled);
+  return others.sort((a, b) => unlike(a) - unlike(b)).slice(0, most);
+}
 
 /**
  * Sort by severity. With groups, the group of the severest finding comes first.

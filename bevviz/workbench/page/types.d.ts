@@ -565,11 +565,12 @@ export interface Elements {
   "verdict": HTMLElementTagNameMap["p"];
   "where": HTMLElementTagNameMap["p"];
   "of": HTMLElementTagNameMap["p"];
+  "steps": HTMLElementTagNameMap["div"];
+  "hints": HTMLElementTagNameMap["div"];
   "chain": HTMLElementTagNameMap["ol"];
   "robot-title": HTMLElementTagNameMap["p"];
   "robot-chain": HTMLElementTagNameMap["ol"];
   "further": HTMLElementTagNameMap["div"];
-  "hints": HTMLElementTagNameMap["div"];
   "beside-title": HTMLElementTagNameMap["p"];
   "beside": HTMLElementTagNameMap["ul"];
   "changed": HTMLElementTagNameMap["section"];
