@@ -51,6 +51,7 @@ def interleaved(repetitions: int, *sides: Callable[[], object]) -> list[Times]:
 @dataclass(frozen=True, slots=True)
 class Finished:
     seconds: float
+    processor: float  # seconds of processor time of all its threads
     memory: float  # MB at most, in the process's own pages
 
 
@@ -62,7 +63,7 @@ def run(*command: str) -> Finished:
     """
     program = Path(sys.executable).with_name(command[0])
     with tempfile.TemporaryFile() as said:
-        start = time.perf_counter()
+        start, used = time.perf_counter(), children_time()
         process = subprocess.Popen([program, *command[1:]], stdout=subprocess.DEVNULL, stderr=said)
         # Not what wait4 tells: a child that was forked has its parent's peak in it.
         looks: list[float] = [0.0]
@@ -74,7 +75,7 @@ def run(*command: str) -> Finished:
         if process.returncode != 0:
             said.seek(0)
             raise SystemExit(f"{' '.join(command)}: {said.read().decode().strip()}")
-    return Finished(seconds, max(looks))
+    return Finished(seconds, children_time() - used, max(looks))
 
 
 def _watch(process: subprocess.Popen[bytes], looks: list[float]) -> None:

@@ -1,14 +1,20 @@
-"""Whole runs, each in a process of its own, its start included."""
+"""Whole runs, each in a process of its own, its start included.
+
+``python -m benchmarks.runs`` prints the rows of ``bag`` without a network against ``rerun mcap convert``.
+"""
 
 from __future__ import annotations
 
+import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from rerun.chunk import RrdReader
 from tqdm import tqdm
 
-from benchmarks.measure import Finished, Times, run
+from benchmarks import bags
+from benchmarks.measure import Finished, Times, machine, run
 from bevviz.bags.bag import Recording
 from bevviz.messages.clouds import decode_cloud
 from bevviz.recording import entities
@@ -41,7 +47,9 @@ def compare(bag: Path, repetitions: int) -> list[str]:
     if logged_points(saved) != points:
         raise SystemExit("points of the bag are missing in the recording")
 
-    def further(more: str, fewer: str, number: int) -> float:
+    used = {name: Times([f.processor for f in all_]) for name, all_ in found.items()}
+
+    def further(more: str, fewer: str, number: int, times: dict[str, Times] = times) -> float:
         """Milliseconds for each scan beyond the fewer ones."""
         return 1e3 * (times[more].median - times[fewer].median) / number
 
@@ -49,6 +57,10 @@ def compare(bag: Path, repetitions: int) -> list[str]:
     theirs, ours = times["theirs"], times["ours"]
     big, small = converted.stat().st_size, saved.stat().st_size
     slope, our_slope = further("theirs", "their few", scans - few), further("ours", "our few", scans - few)
+    work, our_work = (
+        further("theirs", "their few", scans - few, used),
+        further("ours", "our few", scans - few, used),
+    )
     early, late = further("our few", "our first", few - 1), further("ours", "our first", scans - 1)
     least, most = memory["our few"], memory["ours"]
     return [
@@ -56,6 +68,10 @@ def compare(bag: Path, repetitions: int) -> list[str]:
         f"| {theirs.median / ours.median:.2f} x | 1 x | |",
         f"| each further scan of it | rerun mcap convert | {slope:.1f} ms | {our_slope:.1f} ms "
         f"| {slope / our_slope:.2f} x | 1 x | |",
+        f"| processor time of each further scan | rerun mcap convert | {work:.1f} ms | {our_work:.1f} ms "
+        f"| {work / our_work:.2f} x | | |",
+        f"| cores that a further scan keeps busy | rerun mcap convert | {work / slope:.2f} "
+        f"| {our_work / our_slope:.2f} | | 1.8 | |",
         f"| .rrd, everything in it | rerun mcap convert | {big / 1e6:.0f} MB | {small / 1e6:.0f} MB "
         f"| {small / big:.2f} | 0.5 | every point there |",
         f"| time, frames x 10 ({few}, {scans}), beyond the start of {times['our first'].median:.2g} s | "
@@ -106,3 +122,20 @@ def logged_points(recording: Path) -> int:
             column = batch.column("Points3D:positions")
             total += int(np.sum(column.value_lengths().drop_null().to_numpy(zero_copy_only=False)))
     return total
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", type=float, default=1.0, help="GB of the bag (default: 1, 280 scans)")
+    parser.add_argument("--repetitions", type=int, default=3, metavar="N", help="of each run (default: 3)")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        drive = bags.simulate(40, Path(name) / "drive.mcap")
+        bag = bags.repeat(drive, Path(name) / "repeated", int(1e9 * options.size))
+        print(machine(), *compare(bag, options.repetitions), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

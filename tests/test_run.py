@@ -12,6 +12,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from typing import Any
 
+import cv2
 import pytest
 
 import bevviz.pipeline.run
@@ -238,6 +239,14 @@ def test_the_collector_is_left_as_it_was() -> None:
 
 
 # --- the newest win ----------------------------------------------------------------------------
+
+
+def test_opencv_has_one_thread_during_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(cv2, "getNumThreads", lambda: 7)
+    monkeypatch.setattr(cv2, "setNumThreads", calls.append)
+    calls.extend(iterate_results(Numbers(), Squares()))
+    assert calls == [1, *finished(10), 7]
 
 
 def test_slow_work_takes_the_newest() -> None:

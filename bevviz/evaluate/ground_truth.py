@@ -191,10 +191,14 @@ def must_be_found(frame: Frame, boxes: Boxes3D, labels: Sequence[str]) -> Bool:
     rules = {label: rule_of(label, frame.label_names) for label in labels}
     wanted = np.array([rules[label].judged for label in labels], bool)
     must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes) & wanted, bool)
+    rows_of: dict[str, list[int]] = {}  # by label in lower case
+    for k, label in enumerate(labels):
+        rows_of.setdefault(label.lower(), []).append(k)
     for row in np.flatnonzero(must).tolist():
-        whole = [k for k, label in enumerate(labels) if label.lower() == rules[labels[row]].whole]
-        away = np.hypot(*(boxes.center[whole, :2] - boxes.center[row, :2]).T)
-        must[row] = not (away <= SAME_PLACE).any()
+        whole = rows_of.get(rules[labels[row]].whole, [])
+        if whole:
+            away = np.hypot(*(boxes.center[whole, :2] - boxes.center[row, :2]).T)
+            must[row] = not (away <= SAME_PLACE).any()
     rows = np.flatnonzero(must)
     must[rows] = [len(hits) >= MIN_HITS for _, hits in inside_each(frame.points, boxes.chosen(rows))]
     return must

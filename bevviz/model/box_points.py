@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, I64, Boxes3D
 from bevviz.support.numba_kernel import kernel
 
@@ -19,9 +18,13 @@ def inside_each(points: F32, boxes: Boxes3D) -> Iterator[tuple[int, I64]]:
     reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]).astype(np.float64)[:, None] / 2 + ROUNDING
     center = boxes.center[:, :2].astype(np.float64)
     first, near = rows_in_rectangles(points, center - reach, center + reach)
-    for k in range(len(boxes)):
-        rows = near[first[k] : first[k + 1]]
-        yield k, rows[geometry.inside(points[rows], boxes, k)]
+    box = np.repeat(np.arange(len(boxes)), np.diff(first))
+    x, y, z = (points[near] - boxes.center[box]).T
+    c, s = np.cos(boxes.yaw)[box], np.sin(boxes.yaw)[box]
+    local = np.column_stack([c * x + s * y, c * y - s * x, z])
+    is_inside = (np.abs(local) <= boxes.size[box] / 2).all(axis=1)
+    ends = np.searchsorted(box[is_inside], np.arange(1, len(boxes)))
+    yield from enumerate(np.split(near[is_inside], ends) if len(boxes) else [])
 
 
 @kernel

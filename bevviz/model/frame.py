@@ -350,7 +350,8 @@ class Frame:
     @property
     def is_planar(self) -> bool:
         """Whether the clouds are scans of one plane through the sensor, which no floor is in."""
-        return bool(self.clouds) and not any(cloud.xyz[:, 2].any() for cloud in self.clouds)
+        heights = [cloud.xyz[:, 2] for cloud in self.clouds]
+        return bool(heights) and not any(z[:1].any() or z.any() for z in heights)  # mostly the first tells
 
     @property
     def pose(self) -> F64:

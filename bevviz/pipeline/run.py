@@ -164,10 +164,24 @@ def _process(
     One of the ``depth`` items that are read ahead is in ``finish``. A further item is being read.
     """
     with (
+        _single_opencv_thread(),
         closing(_read_ahead(items)) as read,
         closing(map_ahead(read, lambda item: processor.perceive(item, network), depth - 1)) as perceived,
     ):
         yield from map_ahead(perceived, processor.finish, 1, "finish")
+
+
+@contextmanager
+def _single_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV to the thread that calls it. Its own threads spin while they wait, beside a run's."""
+    import cv2  # takes 0.1 s, and not every import of this module leads to a run
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def _read_ahead(items: Iterable[T]) -> Generator[T, None, None]:

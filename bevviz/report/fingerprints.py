@@ -83,13 +83,13 @@ def compare(stored: tuple[StageDigest, ...], current: tuple[StageDigest, ...]) -
 
 
 def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
-    """Pack fingerprints for a recording: lines of text and a compressed block of arrays."""
+    """Pack fingerprints for a recording: lines of text and a block of arrays. Rerun compresses the block."""
     block: dict[str, NDArray[Any]] = {}
     for stage in stages:
         block |= {f"whole/{stage.name}/{name}": array for name, array in stage.whole.items()}
         block |= {f"large/{stage.name}/{name}": np.array(large) for name, large in stage.large.items()}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **block)  # type: ignore[arg-type]  # no key is the name of an option
+    np.savez(buffer, **block)  # type: ignore[arg-type]  # no key is the name of an option
     return [f"{stage.fingerprint} {stage.name}" for stage in stages], np.frombuffer(
         buffer.getvalue(), np.uint8
     )
@@ -182,7 +182,7 @@ def _stage(name: str, arrays: Arrays) -> StageDigest:
     whole, large = {}, {}
     for key, value in arrays.items():
         array = np.ascontiguousarray(value)
-        data = "\n".join(array.tolist()).encode() if array.dtype.kind == "U" else array.tobytes()
+        data = "\n".join(array.tolist()).encode() if array.dtype.kind == "U" else array.data
         fingerprint = sha256(data).hexdigest()
         kind = "text" if array.dtype.kind == "U" else array.dtype.str
         content.update(f"{key} {kind} {array.shape} {fingerprint}\n".encode())

@@ -420,8 +420,8 @@ class _CameraFrustums:
             long = np.nan_to_num(self._sizes[d][:, 0].max(), nan=candidate.depth * self._wide[d])
             rows = np.concatenate([rows, beyond[np.hypot(away[:, 0], away[:, 1]) <= long]])
         flat, is_whole = self._fit(d, rows, candidate.depth).flat, False
-        own = self._without_others(d, kin)
-        if len(own) > len(rows) and self._sizes[d][:, 0].max() >= NO_SIDES:
+        is_long = self._sizes[d][:, 0].max() >= NO_SIDES
+        if is_long and len(own := self._without_others(d, kin)) > len(rows):
             whole = self._fit(d, own, candidate.depth).flat
             is_whole = share_inside(work.points, own, whole) >= WHOLE_SHARE
             flat, kin = (whole, own) if is_whole else (flat, kin)
