@@ -24,13 +24,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 from rosbags.interfaces import Connection
 
 from bevviz.bags.compression import unpack
-from bevviz.bags.damage import DamageReport
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, Message
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
@@ -81,15 +79,6 @@ class FileIndex:
         return first, max((chunk.end for chunk in filled), default=-1) + 1
 
 
-class Descriptions(Protocol):
-    """Connections of a file by the descriptions found so far."""
-
-    def __contains__(self, number: object) -> bool: ...
-
-    def connections(self, counts: Mapping[int, int]) -> list[Connection]:
-        """Return the connections with their message counts."""
-
-
 @dataclass(frozen=True, slots=True)
 class ChunkFormat:
     """Functions of one chunked file format."""
@@ -98,10 +87,6 @@ class ChunkFormat:
     read_times: Callable[[FileBytes, Chunk, int], I64]  # log times of a connection by the index
     parse: Callable[[memoryview, Container[int]], tuple[list[ChunkMessage], bool]]
     """Messages in the content of a chunk, and whether the lengths of its records lead to its end."""
-    descriptions: Callable[[], Descriptions]  # none yet
-    note_all: Callable[[bytes, Any], None]  # adds the descriptions in the content of a chunk
-    walk: Callable[[FileBytes, Any, DamageReport], Iterator[Chunk]]
-    """Chunks from front to back, up to the first broken record. Descriptions outside chunks are added."""
     read_single: Callable[[FileBytes, Chunk, int, int, int], list[ChunkMessage]] | None = None
     """Messages of a connection between two times, without the rest of a chunk that is not packed."""
 

@@ -10,7 +10,6 @@ from typing import Protocol
 from bevviz.bags.reader import Reader, megabytes
 
 REPAIR = "'bevviz recover' writes a sound copy"
-EXTRA = "the extra rescue searches it for more: pip install 'bevviz[rescue]'"
 
 
 @dataclass
@@ -30,7 +29,6 @@ class DamageReport:
     passed: int = 0  # bytes passed over in these places
     log_pages: int = 0  # pages of a database's log with a wrong checksum
     stated: int | None = None  # messages by the statistics of the file
-    is_partial: bool = False  # bytes after the damage or in a log were not read, see ``bags.prefix``
 
     @property
     def lost(self) -> int:
@@ -50,8 +48,7 @@ class DamageReport:
         if self.chunks:
             ((why, _),) = Counter(self.chunks.values()).most_common(1)
             doubt = f", {self.doubtful} that were kept may be wrong" if self.doubtful else ""
-            lost = "what follows in them is" if self.is_partial else f"{self.missing} messages"
-            notes.append(f"{len(self.chunks)} damaged chunk(s), {why}: {lost} lost{doubt}")
+            notes.append(f"{len(self.chunks)} damaged chunk(s), {why}: {self.missing} messages lost{doubt}")
         elif self.missing:
             notes.append(f"{self.missing} messages that the index of a chunk lists are not there: lost")
         if self.incomplete:
@@ -67,8 +64,6 @@ class DamageReport:
             notes.append(f"{self.unread} messages could no longer be read: lost")
         if self.read is not None and self.stated is not None and self.stated > self.read:
             notes.append(f"its statistics count {self.stated} messages: {self.stated - self.read} are lost")
-        if self.is_partial:
-            notes.append(EXTRA)
         return notes
 
 

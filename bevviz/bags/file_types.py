@@ -10,10 +10,9 @@ from pathlib import Path
 from rosbags.interfaces import Connection
 
 from bevviz.bags import mcap, ros1, sqlite
-from bevviz.bags.chunks import ChunkFormat, ChunkReader
+from bevviz.bags.chunks import ChunkReader
 from bevviz.bags.compression import ZSTD, unpack_file
 from bevviz.bags.damage import DamagedReader
-from bevviz.bags.prefix import PrefixChunkReader, PrefixSqliteReader
 from bevviz.bags.reader import (
     LAST_TIME,
     DamageError,
@@ -47,30 +46,18 @@ class FileFormat:
         magic: first bytes of a file.
         suffix: usual file suffix, by which rosbags knows the format.
         sound: opens a sound file. Its second argument is the same file under a name with that suffix.
-        damaged: opens a file up to its damage, where no extra of the group ``bevviz.rescuers`` is registered
-            for the suffix. None: no file that could be damaged.
     """
 
     name: str
     magic: bytes
     suffix: str
     sound: Callable[[Path, Path], Reader]
-    damaged: Callable[[Path, Path], DamagedReader] | None = None
 
 
-def _chunked(name: str, magic: bytes, suffix: str, form: ChunkFormat) -> FileFormat:
-    """Return a format whose files consist of chunks."""
-    return FileFormat(
-        *(name, magic, suffix),
-        sound=lambda path, _: ChunkReader(path, form),
-        damaged=lambda path, _: PrefixChunkReader(path, form),
-    )
-
-
-SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader, PrefixSqliteReader)
+SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader)
 FORMATS = (
-    _chunked("MCAP", mcap.MAGIC, ".mcap", mcap.FORM),
-    _chunked("ROS 1 bag", ros1.MAGIC, ".bag", ros1.FORM),
+    FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path, _: ChunkReader(path, mcap.FORM)),
+    FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path, _: ChunkReader(path, ros1.FORM)),
     SQLITE,
 )
 HEAD_SIZE = 16  # bytes read to recognise a format
@@ -309,13 +296,12 @@ def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
 
     def damaged() -> DamagedReader:
         rescuer = registered("rescuers").get(kind.suffix.removeprefix("."))
-        if rescuer is not None:
-            reader: DamagedReader = load(rescuer)(path)
-            return reader
-        assert kind.damaged is not None
-        return kind.damaged(path, public)
+        if rescuer is None:
+            raise UserError(f"{path}: it is damaged, and no package is installed that rescues a {kind.name}")
+        reader: DamagedReader = load(rescuer)(path)
+        return reader
 
-    return BagFile(path, kind.name, lambda: kind.sound(path, public), damaged if kind.damaged else None)
+    return BagFile(path, kind.name, lambda: kind.sound(path, public), damaged)
 
 
 def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> Path:

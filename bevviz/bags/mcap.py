@@ -6,7 +6,7 @@ import re
 import struct
 from binascii import crc32
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
@@ -23,7 +23,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2.metadata import parse_qos
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
-from bevviz.bags.damage import DamageReport
 from bevviz.bags.reader import LAST_TIME, DamageError, FileBytes, UnindexedError, as_damage, megabytes
 from bevviz.bags.remote import open_bytes
 from bevviz.model.frame import I64
@@ -33,14 +32,12 @@ from bevviz.support.limits import (
     MAX_INDEX,
     MAX_PROFILE,
     MAX_PROFILES,
-    MAX_RECORD,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT = range(1, 10)
 ATTACHMENT_INDEX, STATISTICS, DATA_END = 0x0A, 0x0B, 0x0F
 FIRST_PRIVATE = 0x80  # Opcodes from here on are private to applications.
-FLAT = 1 << 20  # bytes of messages outside chunks that are read together
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -368,41 +365,6 @@ def parse(data: memoryview, channels: Container[int]) -> tuple[list[ChunkMessage
     return messages, offset == size
 
 
-def walk(file: FileBytes, channels: Channels, report: DamageReport) -> Iterator[Chunk]:
-    """Yield the chunks of a file from front to back, up to the first broken record.
-
-    Channels outside chunks are added to ``channels``. Messages outside chunks, one after the other, count as
-    a chunk that is not packed.
-    """
-    offset, flat = len(MAGIC), len(MAGIC)  # flat: first of the messages outside chunks that come last
-    while len(head := file.read(offset, RECORD.size)) == RECORD.size:
-        opcode, length = RECORD.unpack(head)
-        body, end = offset + RECORD.size, offset + RECORD.size + length
-        if opcode != MESSAGE or offset - flat >= FLAT:
-            if offset > flat:
-                yield Chunk(LAST_TIME, -1, flat, offset - flat, offset - flat, "", {})
-            flat = end if opcode != MESSAGE else offset
-        if opcode == FOOTER:
-            return
-        chunk = chunk_at(file, body, end) if opcode == CHUNK else None
-        if chunk is not None:
-            yield chunk
-            if chunk.cut:
-                return
-        is_known = opcode in range(HEADER, DATA_END + 1) or opcode >= FIRST_PRIVATE
-        if end > file.size or not is_known or (opcode == CHUNK and chunk is None):
-            break
-        if opcode in (SCHEMA, CHANNEL) and length <= MAX_RECORD:
-            with suppress(struct.error):
-                channels.note(opcode, file.read(body, length))
-        elif opcode == STATISTICS:
-            report.stated = int.from_bytes(file.read(body, 8), "little")
-        offset = end
-    if offset > flat:
-        yield Chunk(LAST_TIME, -1, flat, offset - flat, offset - flat, "", {})
-    report.broken, report.passed = int(offset < file.size), file.size - offset
-
-
 def chunk_at(file: FileBytes, body: int, end: int) -> Chunk | None:
     """Return the chunk of a record without its messages, or None if its head is damaged."""
     head = file.read(body, CHUNK_HEAD.size + 12)
@@ -444,4 +406,4 @@ def read_metadata(record: bytes) -> dict[str, str]:
     return dict(zip(texts[::2], texts[1::2], strict=True))
 
 
-FORM = ChunkFormat(read_index, read_times, parse, Channels, note_all, walk, read_single)
+FORM = ChunkFormat(read_index, read_times, parse, read_single)

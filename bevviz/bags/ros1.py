@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +12,10 @@ import numpy as np
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.bags.chunks import Chunk, ChunkFormat, ChunkMessage, FileIndex
-from bevviz.bags.damage import DamageReport
 from bevviz.bags.reader import (
     LAST_TIME,
     DamageError,
     FileBytes,
-    MemoryBytes,
     UnindexedError,
     megabytes,
     normalized,
@@ -279,33 +277,6 @@ def parse(data: memoryview, connections: Container[int]) -> tuple[list[ChunkMess
     return messages, offset == size
 
 
-def note_all(content: bytes, connections: Connections) -> None:
-    """Note the connection records in the content of a chunk."""
-    source, offset = MemoryBytes(content), 0
-    while (record := read_record(source, offset)) is not None:
-        if record.kind == "connection" and record.end <= len(content):
-            connections.note(record, content[record.body : record.end])
-        offset = record.end
-
-
-def walk(file: FileBytes, connections: Connections, report: DamageReport) -> Iterator[Chunk]:
-    """Yield the chunks of a file from front to back, up to the first broken record.
-
-    Connections outside chunks are added to ``connections``.
-    """
-    offset = len(MAGIC)
-    while offset < file.size:
-        record = read_record(file, offset)
-        if record is None or not is_sane(record, file.size):
-            report.broken, report.passed = 1, file.size - offset
-            return
-        if record.kind == "connection":
-            connections.note(record, file.read(record.body, record.end - record.body))
-        elif record.kind == "chunk":
-            yield chunk_of(record, file.size)
-        offset = record.end
-
-
 def chunk_of(record: Record, size: int) -> Chunk:
     """Return the chunk of a record of a file of ``size`` bytes, without messages."""
     compression = record.fields["compression"].decode(errors="replace")
@@ -313,4 +284,4 @@ def chunk_of(record: Record, size: int) -> Chunk:
     return Chunk(LAST_TIME, -1, record.body, packed, unpacked, compression, {}, cut=record.end > size)
 
 
-FORM = ChunkFormat(read_index, read_times, parse, Connections, note_all, walk)
+FORM = ChunkFormat(read_index, read_times, parse)

@@ -49,7 +49,9 @@ class SqliteReader:
             raise DamageError(f"the recorder did not close it, messages lie in {log.name}")
         self._public = PublicReader(public)
         with as_damage():
-            self._queries = open_database(public)
+            # Without its log, so that nothing is written beside it.
+            flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+            self._queries = apsw.Connection(f"file:{public}?immutable=1", flags=flags)
             check_count(path, self._numbers("SELECT count(*) FROM topics")[0][0])  # rosbags reads all of them
             self._public.open()
         self.connections: Sequence[Connection] = list(self._public.connections)
@@ -106,17 +108,6 @@ class SqliteReader:
         self._file.close()
         self._public.close()
         self._queries.close()
-
-
-def open_database(public: Path, access: str | None = None) -> apsw.Connection:
-    """Open a database without its log, so that nothing is written beside it.
-
-    Args:
-        public: file, under a name without special characters.
-        access: name of a registered VFS; None: that of sqlite3.
-    """
-    flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-    return apsw.Connection(f"file:{public}?immutable=1", flags=flags, vfs=access)
 
 
 def page_size_of(head: bytes) -> int | None:

@@ -35,7 +35,6 @@ CORE = {
     "compare": ("compare", "what if? two configurations, or the robot"),
     "evaluate": ("evaluate", "how right it is, where the truth is known; a gate for CI"),
     "report": ("report", "a bug report that stands on its own, and its check"),
-    "recover": ("recover", "a sound copy of a damaged bag"),
     "cut": ("cut", "a window of a drive with chosen topics, as a bag"),
     "live": ("live", "run the pipeline beside a robot"),
     "snap": ("live", "save the last seconds of a running 'bevviz live'"),

@@ -34,7 +34,6 @@ MIN_CHUNK = 1 << 26  # a chunk may unpack to so much, even if it states less: th
 MAX_CHUNK = 1 << 29  # a chunk after unpacking; recorders close one at 1 to 4 MB
 MIN_CLOUD = 1 << 24  # a compressed cloud may unpack to so much, even if it states less
 MAX_INDEX = 1 << 26  # index of a bag: that of 100 channels in 200 GB
-MAX_RECORD = 1 << 26  # a record that describes a topic, where no index tells its place
 MAX_ATTACHMENT = 1 << 26  # all attachments of an MCAP file that are read: calibrations of 100 kB each
 MAX_PACKET = 1 << 18  # packet of a network capture: four times the longest one of IP
 MAX_REQUEST = 1 << 28  # bytes asked for at once at an address; an index or a chunk has some megabytes

@@ -50,7 +50,7 @@ class RecordWalker(ABC, Generic[R]):
         passed: bytes in these places.
     """
 
-    descriptions: ClassVar[Callable[[], Any]]  # makes the empty ``Descriptions`` of a file
+    descriptions: ClassVar[Callable[[], Any]]  # makes the table of connections of a file, empty
     first: ClassVar[int]  # offset of the first record of a file
 
     def __init__(self, source: FileBytes, known: Any, span: tuple[int, int] | None = None) -> None:

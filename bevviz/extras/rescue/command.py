@@ -22,6 +22,7 @@ class RecoverOptions:
 
 @command(
     "recover",
+    help="a sound copy of a damaged bag",
     description="Write all messages that can be read of a damaged bag, or of one without an index, to an "
     "MCAP file, byte for byte.",
 )
