@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from bevviz.errors import UserError
 from bevviz.model.frame import Cloud
@@ -73,44 +73,6 @@ def read_header(data: bytes | memoryview, order: str, topic: str) -> tuple[int, 
         return sec * 1_000_000_000 + nanosec, frame_name(name.rstrip(b"\0").decode())
     except (struct.error, UnicodeDecodeError):
         raise MessageError(f"{topic}: a message of {len(data)} bytes has no header") from None
-
-
-@dataclass(frozen=True, slots=True)
-class ListMessage:
-    """Beginning of a serialised message with a std_msgs/Header and a list."""
-
-    order: Literal["<", ">"]  # byte order, as struct and numpy write it
-    stamp: int  # of the header, nanoseconds
-    frame_id: str
-    count: int  # length that the list states
-    at: int  # byte at which its first item begins
-
-
-def read_list_message(
-    data: bytes | memoryview, *, ros1: bool, alignment: int = 4, skipped: int = 0
-) -> ListMessage:
-    """Read the beginning of a message.
-
-    Args:
-        data: serialised message.
-        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
-        alignment: bytes to which CDR aligns the field behind the header.
-        skipped: bytes of the fields between the header and the list.
-
-    Raises:
-        ValueError: the data are no such message.
-    """
-    order: Literal["<", ">"] = "<" if ros1 or data[1:2] != b"\0" else ">"
-    try:
-        # Behind the encapsulation header of CDR, or the seq of ROS 1.
-        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
-        at = 16 + length
-        frame_id = bytes(data[16:at]).rstrip(b"\0").decode()
-        at += skipped + (0 if ros1 else -(at - 4) % alignment)
-        (count,) = struct.unpack_from(f"{order}I", data, at)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{len(data)} bytes end before the list of the message") from error
-    return ListMessage(order, sec * SECOND + nanosec, frame_id, count, at + 4)
 
 
 def frame_name(name: str) -> str:

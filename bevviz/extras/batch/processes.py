@@ -14,9 +14,9 @@ import cv2
 
 from bevviz.extras.batch.bag_job import run
 from bevviz.extras.batch.jobs import Job, JobResult, JobResults
+from bevviz.extras.batch.worker_processes import WorkerProcess, start_worker
 from bevviz.support import progress
 from bevviz.support.contexts import Closable
-from bevviz.support.worker_processes import WorkerProcess, start_worker
 
 # concurrent.futures does not fit: a worker that dies breaks the pool and all its jobs.
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from bevviz.extras.lidars.scan_messages import read_list_message
 from bevviz.messages.clouds import make_cloud
-from bevviz.messages.decoders import Bytes, Decoder, Serialization, read_list_message
+from bevviz.messages.decoders import Bytes, Decoder, Serialization
 from bevviz.model.frame import Cloud
 from bevviz.support.limits import MOST_POINTS
 

@@ -8,13 +8,52 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from bevviz.messages.decoders import SECOND, read_list_message
+from bevviz.messages.decoders import SECOND
 from bevviz.model.frame import I64, U8
 
 MOST_PACKETS = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class ListMessage:
+    """Beginning of a serialised message with a std_msgs/Header and a list."""
+
+    order: Literal["<", ">"]  # byte order, as struct and numpy write it
+    stamp: int  # of the header, nanoseconds
+    frame_id: str
+    count: int  # length that the list states
+    at: int  # byte at which its first item begins
+
+
+def read_list_message(
+    data: bytes | memoryview, *, ros1: bool, alignment: int = 4, skipped: int = 0
+) -> ListMessage:
+    """Read the beginning of a message.
+
+    Args:
+        data: serialised message.
+        ros1: whether ROS 1 serialised the message; otherwise it is CDR.
+        alignment: bytes to which CDR aligns the field behind the header.
+        skipped: bytes of the fields between the header and the list.
+
+    Raises:
+        ValueError: the data are no such message.
+    """
+    order: Literal["<", ">"] = "<" if ros1 or data[1:2] != b"\0" else ">"
+    try:
+        # Behind the encapsulation header of CDR, or the seq of ROS 1.
+        sec, nanosec, length = struct.unpack_from(f"{order}III", data, 4)
+        at = 16 + length
+        frame_id = bytes(data[16:at]).rstrip(b"\0").decode()
+        at += skipped + (0 if ros1 else -(at - 4) % alignment)
+        (count,) = struct.unpack_from(f"{order}I", data, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ValueError(f"{len(data)} bytes end before the list of the message") from error
+    return ListMessage(order, sec * SECOND + nanosec, frame_id, count, at + 4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,10 @@ from bevviz.errors import UserError
 from bevviz.extras.pillars.group import Pillars, group, scatter
 from bevviz.extras.pillars.heads import find_head
 from bevviz.extras.pillars.params import MAX_POINTS, PillarParams
+from bevviz.extras.pillars.rotated_boxes import survivors
 from bevviz.model.frame import F32, Boxes3D
 from bevviz.stages.detector.providers import open_session, say_once
 from bevviz.stages.detector.session import NetworkSession, clip, list_tensors, reading_answer
-from bevviz.stages.rotated_boxes import survivors
 
 FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 NUMBERS = {**FLOATS, "tensor(int32)": np.int32, "tensor(int64)": np.int64}

@@ -23,12 +23,12 @@ from bevviz.extras.pillars.group import Pillars, group, scatter
 from bevviz.extras.pillars.heads import anchor_boxes, decode_boxes
 from bevviz.extras.pillars.network import PROBE_POINTS, PillarNetwork
 from bevviz.extras.pillars.params import Feature, PillarParams
+from bevviz.extras.pillars.rotated_boxes import survivors
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
-from bevviz.stages.rotated_boxes import survivors
 from bevviz.workbench.page_messages import controls
 from tests.support import kept_drives
 from tests.support.onnx_networks import FLOAT, node, save
