@@ -7,7 +7,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-from bevviz.workbench.page_types import FROM_PAGE, TO_PAGE
+from pydantic import TypeAdapter
+
+from bevviz.workbench.page_types import FROM_PAGE, AnyToPage
 
 PAGE = Path(__file__).resolve().parents[1] / "bevviz" / "workbench" / "page"
 FILE = PAGE / "types.d.ts"
@@ -16,7 +18,8 @@ HEAD = "// Types of the page's messages and elements, by 'python -m tools.make_p
 
 def page_types() -> str:
     """Return the types of the page's messages and elements in TypeScript, for the page's comments."""
-    to_page, from_page = TO_PAGE.json_schema(mode="serialization"), FROM_PAGE.json_schema(mode="validation")
+    to_page = TypeAdapter[Any](AnyToPage).json_schema(mode="serialization")
+    from_page = FROM_PAGE.json_schema(mode="validation")
     forms = to_page["$defs"] | from_page["$defs"]
     unions = [
         f"export type {name} = {' | '.join(map(_type, tree['oneOf']))};\n"

@@ -348,5 +348,5 @@ FromPage: TypeAlias = (
     Ask | Try | Settle | MakeReport | AddNote | RunDrive | Cancel | Handle | Remarks | Shown | FindFix
 ) | (RemoveNote | Hold | ListHeld | Snap | Mark)  # fmt: skip
 
-TO_PAGE: TypeAdapter[Any] = TypeAdapter(Annotated[ToPage | AnswerMessage, Field(discriminator="type")])
+AnyToPage: TypeAlias = Annotated[ToPage | AnswerMessage, Field(discriminator="type")]
 FROM_PAGE: TypeAdapter[Any] = TypeAdapter(Annotated[FromPage, Field(discriminator="type")])

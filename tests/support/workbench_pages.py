@@ -19,12 +19,13 @@ from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
+from pydantic import TypeAdapter
 
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
 from bevviz.evaluate import truth_source
-from bevviz.workbench.page_types import TO_PAGE
+from bevviz.workbench.page_types import AnyToPage
 from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE, until
 
@@ -41,6 +42,7 @@ SOFTWARE_GL = [
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 ]
+TO_PAGE = TypeAdapter[Any](AnyToPage)
 EMPTY_WASM = b"\0asm\1\0\0\0"  # a module without content: the stand-in for the viewer's 64 MB
 
 
