@@ -53,14 +53,14 @@ const order = (/** @type {Finding} */ a, /** @type {Finding} */ b) => Number(Boo
   || Number(a.sights[0].stamp) - Number(b.sights[0].stamp);
 
 /**
- * The findings of other objects that are most like one: by reason, kind, class and distance.
+ * The findings of other objects that are most like one: of its reason, by kind, class and distance.
  * @param {Finding} own
  * @param {Finding[]} entries
  */
 export function similar(own, entries, most = 2) {
-  const unlike = (/** @type {Finding} */ entry) => 2 * Number(cause(entry) !== cause(own)) + Number(entry.what !== own.what)
-    + Number(entry.name !== own.name) + Math.abs(away(entry.sights[entry.best]) - away(own.sights[own.best])) / NEAR;
-  const others = entries.filter((entry) => entry !== own && hasCause(entry) && !entry.handled);
+  const unlike = (/** @type {Finding} */ entry) => Number(entry.what !== own.what) + Number(entry.name !== own.name)
+    + Math.abs(away(entry.sights[entry.best]) - away(own.sights[own.best])) / NEAR;
+  const others = entries.filter((entry) => entry !== own && hasCause(entry) && !entry.handled && cause(entry) === cause(own));
   return others.sort((a, b) => unlike(a) - unlike(b)).slice(0, most);
 }
 

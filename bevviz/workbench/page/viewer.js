@@ -1,6 +1,6 @@
 // Rerun's viewer, as its notebook widget. The widget wraps the viewer of its version; this page acts as the notebook.
 
-import { $, asked, shownFrame, state } from "./page_state.js";
+import { $, asked, element, shownFrame, state } from "./page_state.js";
 import { keepCompiled, nextPicture, wake } from "./rerun_patches.js";
 
 /** @typedef {{ entity: string, instance: number | null, position: number[] | null, view: string }} Click */
@@ -54,10 +54,14 @@ function cameraOnly() {
   const [text, image] = [document.createElement("p"), new Image()];
   text.textContent = "This browser has no WebGL, so there are no views in space. The camera is shown, and the list answers.";
   image.alt = "camera of the frame";
+  const missing = element("p", "faint", "There is no image of this frame.");
+  const tell = (/** @type {boolean} */ isShown) => () => { [image.hidden, missing.hidden] = [!isShown, isShown]; };
+  [image.onload, image.onerror] = [tell(true), tell(false)];
+  tell(true)();
   const show = () => { const frame = shownFrame(); if (frame !== null) image.src = `/thumbnail/${frame}`; };
   return { render: ({ model, el }) => {
     const figure = Object.assign(document.createElement("figure"), { id: "no-graphics" });
-    figure.append(text, image);
+    figure.append(text, image, missing);
     el.append(figure);
     model.on("msg:custom", (message) => {
       if (message.type !== "time_ctrl") return;
