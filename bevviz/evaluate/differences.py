@@ -213,7 +213,7 @@ def _make_pairs(
 class ChangedObjects:
     """Objects of a frame that a change affects, by class and distance."""
 
-    fixed: tuple[str, ...]  # labelled objects that were missed and are found; the object in question is first
+    fixed: tuple[str, ...]  # labelled objects that are found now; the object in question is first
     added: tuple[str, ...]  # other new objects
     false: tuple[str, ...]  # new false objects
     lost: tuple[str, ...]  # objects that are gone, without the false ones
@@ -294,11 +294,9 @@ class BeforeAfter:
     def names(self) -> ChangedObjects:
         """Names of the objects that the change affects."""
         before_of, after_of = _rows_by_label(self.before), _rows_by_label(self.after)
-        rows = set(self.fixed)
-        if self.asked in after_of and self.asked not in before_of:
-            rows.add(self.asked)  # It may be one that need not be found.
+        rows = after_of.keys() - before_of.keys()  # also those that need not be found
         fixed = sorted((row != self.asked, self.label_text(row)) for row in rows)
-        right = [before_of[row] for row in self.broken]
+        right = sorted(before_of[row] for row in before_of.keys() - after_of.keys())
         false, false_gone = ([], []) if self.truth is None else (self.new_false, self.false_gone)
         new, gone = self._only(Change.ONLY_B), self._only(Change.ONLY_A)
         own = {after_of[row] for row in rows}
@@ -331,7 +329,8 @@ class BeforeAfter:
         The objects that are gone then count without the doubtful ones among them.
         """
         if self.truth is not None:
-            return self.balance[1]
+            names = self.names
+            return len(names.false) + len(names.right)
         gone = len(self._only(Change.ONLY_A))
         return max(self.doubtful, 0) + max(gone + min(self.doubtful, 0), 0)
 
