@@ -100,6 +100,22 @@ def test_findings_of_single_frames_end_where_the_run_comes() -> None:
     assert [0, 8] not in groups(listed) and [CELL, CELL + 8] in groups(listed)
 
 
+def test_a_page_gets_each_frame_of_a_finding_once() -> None:
+    """Also of a group that goes on after others have begun. Groups that are removed are told once."""
+    listed, sent, received = FindingList(), dict[int, int](), dict[int, list[int]]()
+    for frame in range(12):
+        listed.add([finding(frame, 1, 3.0), *([finding(frame, 2, 30.0)] if frame % 3 == 0 else [])])
+        if frame % 2:
+            entries, gone = listed.news(sent)
+            assert not gone
+            for entry in entries:
+                received.setdefault(entry["number"], []).extend(one["frame"] for one in entry["sights"])
+    assert received == {1: [*range(12)], 2: [0, 3, 6, 9]}
+    assert listed.news(sent) == ([], [])
+    listed.replace(["missed"])
+    assert listed.news(sent) == ([], [1, 2]) and listed.news(sent) == ([], [])
+
+
 def test_an_overview_lists_images_that_show_nothing() -> None:
     """A covered camera is listed once within each part of the drive, from frames far apart."""
     image = np.random.default_rng(1).integers(0, 255, (90, 160, 3), np.uint8)

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 import numpy as np
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
@@ -118,7 +119,7 @@ class FindingList:
     """All groups of findings. One thread at a time may add to it, any thread may read it."""
 
     def __init__(self) -> None:
-        self._groups: dict[int, FindingGroup] = {}
+        self._groups: dict[int, FindingGroup] = {}  # by number, in the order of their last changes
         self._recent: dict[tuple[str, str], list[FindingGroup]] = {}
         self._overview: dict[int, list[FindingGroup]] = {}  # groups of single frames, by cell of the drive
         self._anomalies: set[str] = set()  # numbers of those that have begun
@@ -173,6 +174,7 @@ class FindingList:
     ) -> None:
         """Add one finding to a group."""
         taken_groups.add(group.number)
+        self._groups[group.number] = self._groups.pop(group.number)
         group.position, group.box, group.subject = finding.position, finding.box, finding.subject
         group.frames.append(
             FindingFrame(
@@ -206,7 +208,8 @@ class FindingList:
     def content(self) -> list[tuple[str, str, list[FindingFrame]]]:
         """Return kind, name and frames of each group."""
         with self._lock:
-            return [(group.what, group.name, list(group.frames)) for group in self._groups.values()]
+            groups = sorted(self._groups.values(), key=lambda group: group.number)
+            return [(group.what, group.name, list(group.frames)) for group in groups]
 
     def restore(self, groups: Iterable[tuple[str, str, list[FindingFrame]]]) -> None:
         """Add whole groups of an earlier run."""
@@ -237,12 +240,14 @@ class FindingList:
             sent_counts: number of the frames that the page has of each group. It is updated.
         """
         with self._lock:
-            gone = [number for number in sent_counts if number not in self._groups]
+            # A group that the page has whole ends the search: all before it changed earlier.
             changed_groups = [
-                group
-                for group in self._groups.values()
-                if len(group.frames) > sent_counts.get(group.number, 0)
+                *takewhile(
+                    lambda group: len(group.frames) > sent_counts.get(group.number, 0),
+                    reversed(self._groups.values()),
+                )
             ]
+            changed_groups.sort(key=lambda group: group.number)
             entries: list[Entry] = [
                 {
                     "number": group.number,
@@ -253,6 +258,9 @@ class FindingList:
                 for group in changed_groups
             ]
             sent_counts.update((group.number, len(group.frames)) for group in changed_groups)
+            gone: list[int] = []
+            if len(sent_counts) > len(self._groups):
+                gone = [number for number in sent_counts if number not in self._groups]
         for number in gone:
             del sent_counts[number]
         return entries, gone

@@ -10,6 +10,7 @@ from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,7 +130,7 @@ class GrowingDrive(Closable):
         self._held: OrderedDict[int, FrameResult] = OrderedDict()  # results that stay, by number
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
         self._facts: dict[int, FrameFacts] = {}  # of the frames that the run has made, by number
-        self._stamps: dict[int, int] = {}  # of each known frame, by number
+        self._stamps: dict[int, int] = {}  # of each known frame, by number, the newest known last
         self._times: list[tuple[int, int]] = []  # stamp and number of each known frame, sorted
         self._lock = threading.Lock()  # guards the results and facts. Nobody computes with it
         self._frames: OrderedDict[int, Frame] = OrderedDict()  # frames as read, by number
@@ -170,6 +171,15 @@ class GrowingDrive(Closable):
         """Return stamp and number of each frame that a page can show."""
         with self._lock:
             return list(self._times)
+
+    def unsent_frames(self, sent_numbers: set[int]) -> list[tuple[int, int]]:
+        """Return stamp and number of each frame that a page does not have. Add them to its numbers."""
+        with self._lock:
+            new = [*takewhile(lambda number: number not in sent_numbers, reversed(self._stamps))]
+            sent_numbers.update(new)
+            if len(sent_numbers) > len(self._stamps):  # Frames of a robot are forgotten.
+                sent_numbers.intersection_update(self._stamps)
+            return sorted((self._stamps[number], number) for number in new)
 
     def shown_at(self, stamp: int) -> tuple[int, int] | None:
         """Return stamp and number of the known frame that a viewer shows at a stamp. None: there is none."""

@@ -125,7 +125,7 @@ class PageConnection:
     async def _tell(self, news: asyncio.Event) -> None:
         """Send news of the run whenever there are any."""
         sent_counts: dict[int, int] = {}
-        sent_times: set[tuple[int, int]] = set()
+        sent_numbers: set[int] = set()  # of frames
         opening_sent, notes_version, workbench, source = False, -1, self._workbench, self._source
         while True:
             news.clear()
@@ -139,8 +139,7 @@ class PageConnection:
                         "demand": source.on_demand,
                     }
                 )
-            now_times = set(source.frame_times())
-            times, sent_times = sorted(now_times - sent_times), now_times
+            times = source.unsent_frames(sent_numbers)
             if times:
                 frames: list[types.FrameTime] = [{"stamp": str(at), "frame": number} for at, number in times]
                 await self._send({"type": "frames", "frames": frames})
