@@ -6,12 +6,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks import InputChecks
 from bevviz.config import Config
 from bevviz.config.reloading import ReloadableConfig
@@ -32,6 +33,7 @@ from bevviz.live.status import Health, Notes
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
+from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -348,9 +350,23 @@ class LoggingObserver(Observer[FrameResult]):
 
 
 class LiveSession(Session):
-    """Session that leaves the robot's motion to its transforms: an estimate would delay each result."""
+    """Session that leaves the robot's motion to its transforms: an estimate would delay each result.
+
+    Its sensors are judged while the results are explained, which takes as long.
+    """
 
     estimates_motion = False
+
+    def __init__(self, config: Config, loader: StageLoader | None = None) -> None:
+        self._sensors, self._worker = SensorWatch(), ThreadPoolExecutor(1, "sensors")
+        super().__init__(config, loader=loader, sensors=self._sensors)
+
+    def finish(self, result: FrameResult) -> FrameResult:
+        """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
+        sensors = self._worker.submit(self._sensors.update, result)
+        explained = add_explanations(result)
+        sensors.result()
+        return self.add_anomalies(explained)
 
 
 class ObservingSession(Session):
