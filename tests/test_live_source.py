@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
+from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests
 from bevviz.live.input_problems import remedy
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.source import LiveSource
@@ -318,7 +320,23 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(graph: FedGraph, cloud: 
 def test_what_helps_against_losses_depends_on_the_size() -> None:
     assert "segment" in remedy(1.9e6, 1.9e6) and "docs/live.md" in remedy(1.9e6, 1.9e6)
     assert "clouds or images fill the transport" in remedy(300, 1.9e6)
+    assert "clouds of 50 MB" in remedy(1e6, 50e6) and "depth" in remedy(1e6, 50e6)
     assert "segment" not in remedy(300, 300) and "queue" in remedy(300, 300)
+
+
+def test_images_that_wait_are_taken_with_the_first() -> None:
+    """One for each cloud of 50 MB is what rclpy takes, and the middleware overwrites the others."""
+    graph, taken = FedGraph(), list[bytes]()
+    node: Any = SimpleNamespace(
+        input=SimpleNamespace(create_subscription=lambda *given, **options: graph.subscribe(*given))
+    )
+    subscriptions = Subscriptions(node, TypeRequests(node), lambda topic, data, info: taken.append(data))
+    for kind in ("Image", "PointCloud2"):
+        assert subscriptions.listen(PublishedTopic(f"/{kind}", f"sensor_msgs/msg/{kind}", ())) is None
+    for subscription in graph.subscriptions:
+        subscription.handle.messages += [(b"second", {}), (b"third", {})]
+        subscription.receive(subscription.topic.encode(), {})
+    assert taken == [b"/Image", b"second", b"third", b"/PointCloud2"]
 
 
 @pytest.mark.long

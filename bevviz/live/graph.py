@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from bevviz.errors import UserError
@@ -12,6 +14,7 @@ from bevviz.live.node import Node
 from bevviz.live.typesupport import message_type
 from bevviz.messages.decoders import reads_bytes
 from bevviz.messages.definitions import learn, store_of
+from bevviz.messages.topics import CLOUDS
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's node name for a publisher that is discovered before its node
 LATCHED_DEPTH = 100  # one message of each node that publishes static transforms
@@ -226,13 +229,25 @@ class Subscriptions:
         hurried = _hurried_qos(qos) if topic.type == TRANSFORMS else None
         take = receive if hurried is None else _first_of_two(receive)
         node, events = self._node.input, self._events(topic.name)
-        handles = []
+        handles: list[Any] = []
+
+        def take_all(row: int, data: bytes, info: dict[str, Any]) -> None:
+            # rclpy takes one message of each topic in turn. While clouds of 50 MB wait, each would let one
+            # image pass, and the others would be overwritten.
+            take(data, info)
+            if topic.type.rpartition("/")[2] not in CLOUDS:
+                for more in _waiting(handles[row]):
+                    take(*more)
+
         try:
-            handles.append(
-                node.create_subscription(kind, topic.name, take, qos, event_callbacks=events, raw=True)
-            )
-            if hurried is not None:
-                handles.append(node.create_subscription(kind, topic.name, take, hurried, raw=True))
+            for row, (quality, callbacks) in enumerate([(qos, events), (hurried, None)]):
+                if quality is not None:
+                    each = partial(take_all, row)
+                    handles.append(
+                        node.create_subscription(
+                            kind, topic.name, each, quality, event_callbacks=callbacks, raw=True
+                        )
+                    )
         except Exception as error:  # this process still has an endpoint of another type on that name
             return f"the middleware refuses {topic.type}: {' '.join(str(error).split())}"
         self._by_topic[topic.name] = _Subscription(handles, topic.type, qos)
@@ -273,6 +288,19 @@ class Subscriptions:
                 who = full_name(publisher)
                 text = reason.removeprefix("ERROR: ").rstrip(".;")
                 yield f"{topic.name}: {who} is not heard, its quality of service does not fit ({text})"
+
+
+def _waiting(subscription: Any) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Yield the messages that wait in a subscription, until it is destroyed."""
+    from rclpy.exceptions import InvalidHandle
+
+    with suppress(InvalidHandle):
+        while True:
+            with subscription.handle:
+                message = subscription.handle.take_message(subscription.msg_type, True)
+            if message is None:
+                return
+            yield message
 
 
 def _hurried_qos(qos: Any) -> Any:

@@ -25,6 +25,7 @@ WAITING, WAITS = 0.2, 20  # seconds that frames may wait, median of this many fr
 SLOW = 0.3  # seconds between two messages of a topic that frames wait for
 LATE = 0.15  # seconds that a topic may come later than the LiDAR
 PIECE = 65_000  # bytes, largest message that DDS sends in one piece
+HUGE = 10_000_000  # bytes of a cloud beside which images are lost even with a larger segment
 PROFILE = (
     "give the publishers of the clouds ros/config/fastdds.xml by FASTRTPS_DEFAULT_PROFILES_FILE, see "
     "'Clouds were lost on the way' in docs/live.md"
@@ -326,6 +327,11 @@ def merged_robots(topics: Mapping[str, PublishedTopic], frame_ids: Mapping[str, 
 
 def remedy(size: float, largest: float) -> str:
     """Return advice for lost messages, given their size and that of the largest messages here, in bytes."""
+    if size < HUGE <= largest:
+        return (
+            f"clouds of {largest / 1e6:.0f} MB fill the transport: give their publisher a larger segment, "
+            "and this one's a queue of a second (depth), see 'Clouds were lost on the way' in docs/live.md"
+        )
     if size > PIECE:
         return "a larger segment of the publisher's helps, see 'Clouds were lost on the way' in docs/live.md"
     if largest > PIECE:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -61,6 +61,22 @@ class _Subscription:
     type: Any
     receive: Callable[[bytes, dict[str, Any]], None]
     qos: Any
+    handle: _Queue = field(default_factory=lambda: _Queue())
+
+    @property
+    def msg_type(self) -> Any:
+        return self.type
+
+
+class _Queue(nullcontext[None]):
+    """Messages that wait in the middleware."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.messages: list[tuple[bytes, dict[str, Any]]] = []
+
+    def take_message(self, kind: Any, raw: bool) -> tuple[bytes, dict[str, Any]] | None:
+        return self.messages.pop(0) if self.messages else None
 
 
 @dataclass
