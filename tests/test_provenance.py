@@ -36,7 +36,6 @@ NEUTRAL = {
     "annotated-types": "the configuration's types",
     "tqdm": "progress bars",
     "argcomplete": "completion in a shell",
-    "motmetrics": "scores of results",
     "jinja2": "pages about results",
     "starlette": "the workbench's server",
     "websockets": "the server for Foxglove",

@@ -15,7 +15,7 @@ from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, Av
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
 from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
 from bevviz.evaluate.metrics import LimitResult, base_of, ranges
-from bevviz.evaluate.tracking_score import HINT, TrackScore
+from bevviz.evaluate.tracking_score import TrackScore
 from bevviz.model.frame import Frame
 from bevviz.model.protocols import Observer
 from bevviz.model.reasons import Reason
@@ -334,8 +334,6 @@ def _lines(
     if any(labels <= RECALL_POINTS for labels in evaluation.labels.values()):
         few = f"of {RECALL_POINTS} labels or fewer"
         yield f"({few} an average precision is (labels - 1) / {RECALL_POINTS} at best, by KITTI's rule)"
-    if "hota" in evaluation.metrics and "mota" not in evaluation.metrics:
-        yield f"({HINT})"
     worst = evaluation.worst
     yield ""
     if not worst:

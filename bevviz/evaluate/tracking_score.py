@@ -1,7 +1,8 @@
-"""Tracking metrics: CLEAR MOT and IDF1 by py-motmetrics, and HOTA.
+"""Tracking metrics: CLEAR MOT, IDF1 and HOTA.
 
-HOTA is implemented here. The two libraries that have it (TrackEval, trackers) install opencv-python, which
-overwrites the headless OpenCV that bevviz needs. A test compares the results with those of TrackEval.
+The libraries that have HOTA (TrackEval, trackers) install opencv-python, which overwrites the headless OpenCV
+that bevviz needs, and py-motmetrics imports pandas and scipy, which takes two seconds. A test compares the
+results with those of TrackEval.
 """
 
 from __future__ import annotations
@@ -21,14 +22,7 @@ from bevviz.model.results import FrameResult
 from bevviz.stages.fusion import assign
 
 ALPHAS = np.arange(0.05, 0.99, 0.05)  # similarity thresholds of HOTA
-CLEAR = {
-    "mota": "mota",
-    "motp_m": "motp",
-    "idf1": "idf1",
-    "id_switches": "num_switches",
-    "fragmentations": "num_fragmentations",
-}
-HINT = "MOTA and IDF1 need py-motmetrics: pip install 'bevviz[evaluate]'"
+LARGE = 1e6  # metres: more pairs are better than nearer ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +95,51 @@ class ClassTracks:
             "assa": float(assa.mean()),
         }
 
-    def clear(self) -> dict[str, float] | None:
-        """Return CLEAR MOT and IDF1. None: py-motmetrics is not installed."""
-        try:
-            import motmetrics
-        except ImportError:
-            return None
-        accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    def clear(self) -> dict[str, float]:
+        """Return CLEAR MOT (Bernardin and Stiefelhagen 2008) and IDF1 (Ristani et al. 2016).
+
+        An object keeps its track as long as that is near enough. The others are assigned by least distance.
+        """
+        together = np.zeros((len(self._objects), len(self._tracks)))  # frames in which a pair is near enough
+        track_of: dict[int, int] = {}  # last track of each object
+        is_tracked: dict[int, bool] = {}  # whether an object was tracked in its last frame
+        pairs = switches = fragmentations = 0
+        total = 0.0  # metres
         for step in self.steps:
-            distance = np.where(np.isfinite(step.distance), step.distance, np.nan)
-            accumulator.update(step.objects.tolist(), step.tracks.tolist(), distance)
-        host = motmetrics.metrics.create()
-        row = host.compute(accumulator, metrics=list(CLEAR.values()), return_dataframe=False)
-        return {ours: float(row[theirs]) for ours, theirs in CLEAR.items()}
+            near = np.isfinite(step.distance)
+            together[np.ix_(step.objects, step.tracks)] += near
+            column_of = {track: column for column, track in enumerate(step.tracks.tolist())}
+            columns = np.full(len(step.objects), -1)
+            for row, number in enumerate(step.objects.tolist()):
+                column = column_of.get(track_of.get(number, -1), -1)
+                if column >= 0 and near[row, column] and column not in columns:
+                    columns[row] = column
+            free_rows, free = np.flatnonzero(columns < 0), np.setdiff1d(np.arange(len(column_of)), columns)
+            assigned = assign(step.distance[np.ix_(free_rows, free)], unmatched=LARGE)
+            columns[free_rows[assigned >= 0]] = free[assigned[assigned >= 0]]
+            for row, number in enumerate(step.objects.tolist()):
+                column = int(columns[row])
+                if column >= 0:
+                    pairs, total = pairs + 1, total + float(step.distance[row, column])
+                    track = int(step.tracks[column])
+                    switches += track_of.get(number, track) != track
+                    fragmentations += is_tracked.get(number) is False
+                    track_of[number] = track
+                if column >= 0 or number in is_tracked:  # It is not yet lost before it is first tracked.
+                    is_tracked[number] = column >= 0
+        objects = sum(len(step.objects) for step in self.steps)
+        tracks = sum(len(step.tracks) for step in self.steps)
+        most = together.max(initial=0.0)
+        best = assign(most - together, unmatched=most)
+        same = float(together[best >= 0, best[best >= 0]].sum())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return {
+                "mota": float(1 - np.float64(objects + tracks - 2 * pairs + switches) / objects),
+                "motp_m": float(np.float64(total) / pairs),
+                "idf1": float(np.float64(2 * same) / (objects + tracks)),
+                "id_switches": float(switches),
+                "fragmentations": float(fragmentations),
+            }
 
 
 class TrackScore:
@@ -160,5 +186,5 @@ class TrackScore:
         results = {}
         for name, identities in sorted(self.classes.items()):
             if any(len(step.objects) for step in identities.steps):
-                results[name] = {**identities.hota(), **(identities.clear() or {})}
+                results[name] = {**identities.hota(), **identities.clear()}
         return results
