@@ -465,7 +465,7 @@ SENTENCES: dict[ReasonKind, Callable[[Reason, Subject], str]] = {  # the words a
     ReasonKind.BELOW_THRESHOLD: _below_threshold,
     ReasonKind.SUPPRESSED: _suppressed,
     ReasonKind.SECOND_NAME: lambda reason, _: (
-        f"its image box is in that one's, and its points are in the same cluster {reason['cluster']}"
+        f"both have the same image box and the same cluster {reason['cluster']}"
     ),
     ReasonKind.NOT_FUSED: _not_fused,
     ReasonKind.LOW_OVERLAP: _low_overlap,
