@@ -357,7 +357,7 @@ def _first_frame(page: Page, start: float, printed: float, which: str, wanted: f
         f"the address after {printed:.2f} s, the viewer begun {at['viewer']:.2f}, the frame at the viewer "
         f"{at['piece']:.2f}, taken by it {at['told']:.2f}"
     )
-    return at["frame"]
+    return float(at["frame"])
 
 
 def _answered(page: Page, before: str) -> Callable[[], bool]:

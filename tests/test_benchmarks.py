@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_every_point_of_a_bag_is_counted_in_its_recording(
 def test_the_robot_of_the_soak_writes_transforms_as_ros_does() -> None:
     values = [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]
     data = transforms_of(7_000_000_001, [("map", "base_link", values), ("base_link", "lidar", values)])
-    message = typestore().deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
+    message: Any = typestore().deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
     assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == [
         ("map", "base_link"),
         ("base_link", "lidar"),

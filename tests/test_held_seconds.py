@@ -123,6 +123,7 @@ def test_frames_without_messages_are_forgotten(robot: RunningRobot, drive: Drive
 @pytest.mark.long
 def test_the_held_seconds_are_listed(robot: RunningRobot) -> None:
     said = robot.commands["list"]({})
+    assert said["type"] == "said"
     assert said["text"] == "Listing the held seconds, each frame ..."
     until(lambda: robot._listing is not None and not robot._listing.is_alive())
     groups = robot.findings.content()

@@ -157,8 +157,9 @@ class Oracle:
         )
         assert frame.truth is not None
         made = trial_effects(before, after, truth_of(frame, frame.truth))
-        changed = made["effects"].pop("changed")
-        words = {name for names in made["effects"].values() for name in names}
+        effects: dict[str, Any] = dict(made["effects"])
+        changed = effects.pop("changed")
+        words = {name for names in effects.values() for name in names}
         words |= {" → ".join("–" if one is None else f"{one:g}" for one in made["f1"].values())}  # noqa: RUF001
         return sorted(words | ({f"changes {changed}"} if changed else set()), key=len, reverse=True)
 
