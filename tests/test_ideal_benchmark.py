@@ -181,7 +181,13 @@ def test_shares_count_cases_and_draw_whole_drives() -> None:
 
 def test_every_reason_of_a_loss_has_a_stage() -> None:
     stageless = {"reported", "failed", "out of view", "hidden", "no points"}
-    others = {"contradicted", "detector's own error", "not among the objects", "lost in the fusion"}
+    others = {
+        "contradicted",
+        "detector's own error",
+        "not among the objects",
+        "lost in the fusion",
+        "second name",
+    }
     losses = {kind.value for kind in list(ReasonKind)[: list(ReasonKind).index(ReasonKind.KEPT)]}
     assert losses - stageless - others == set(ideal.STAGE_OF)
 
