@@ -229,8 +229,8 @@ def test_a_full_disk_ends_the_run_early(tmp_path: Path) -> None:
     (left,) = unfinished_files(tmp_path / "out.rrd")
     assert f"what was made until then is in {left.name}" in errors[0]
     assert Path("out.rrd").read_text() == "an older result"
-    frames = len(Recording(left).rows["/bev"])
-    assert 0 < frames < scans
+    readable = len(Recording(left).rows["/world/velodyne/points"])  # Rerun writes small tables later.
+    assert 0 < readable < scans
 
 
 def test_a_full_temporary_disk_names_its_folder(
