@@ -14,7 +14,7 @@ import pytest
 import bevviz
 from bevviz.config import changed_config
 from bevviz.errors import UserError
-from bevviz.evaluate import match, truth_of
+from bevviz.evaluate import match, truth_in, truth_of
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
@@ -199,7 +199,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     from rerun.chunk import RrdReader
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
-        bench = RecordedDrive(drive, again.frames)
+        bench = RecordedDrive(drive, again.frames, truth_in(again.frames))
         session = WorkbenchSession(bench)
         bench.observe(drive.at(frame=0))
         overlay, other = bench.open_overlay(), bench.open_overlay()

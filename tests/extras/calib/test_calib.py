@@ -458,7 +458,7 @@ def test_the_command_reports_and_records_the_calibration(turned: Path, capsys: C
 
     assert main(["calib", str(turned), "--config", "fixed.yaml", "--json", "--frames", ":8"]) == 0
     tree = json.loads(capsys.readouterr().out)
-    documented_json.check(tree, "bevviz.extras.calib/1")
+    documented_json.check(tree, "bevviz.calib/1")
     (again,) = tree["cameras"]
     assert not [name for name, axis in again["axes"].items() if axis["finding"] == "off"]
 
