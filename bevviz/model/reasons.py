@@ -68,7 +68,7 @@ class ReasonKind(StrEnum):
 
 
 class ReasonFacts(NamedTuple):
-    """What is known of a kind of reason that an answer can have.
+    """Facts about a kind of reason that an answer can have.
 
     Attributes:
         meaning: its meaning, for the docs and the page.

@@ -205,7 +205,7 @@ class AnswerMessage(AnswerResult):
 
 
 class Nothing(Reply):
-    """What was clicked cannot be asked about."""
+    """Answer to a click on something that cannot be asked about."""
 
     type: Literal["nothing"]
     entity: str
@@ -234,7 +234,7 @@ class Remark(Row, RowRemark):
 
 
 class Robot(Reply, RobotSteps):
-    """What the robot's nodes did with the object."""
+    """Account of the robot's nodes: their steps with the object."""
 
     type: Literal["robot"]
 

@@ -259,7 +259,7 @@ export interface Notes {
   error: string;
 }
 
-/** What was clicked cannot be asked about. */
+/** Answer to a click on something that cannot be asked about. */
 export interface Nothing {
   id: number;
   frame: number;
@@ -350,7 +350,7 @@ export interface ReportFile {
   megabytes: number;
 }
 
-/** What the robot's nodes did with the object. */
+/** Account of the robot's nodes: their steps with the object. */
 export interface Robot {
   id: number;
   frame: number;
