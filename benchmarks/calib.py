@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.extras.calib import AXES, Axis, AxisFinding, Calibration
-from bevviz.extras.calib.result import SCALES, TIME
+from bevviz.extras.calib.result import AXES, SCALES, TIME, Axis, AxisFinding, Calibration
 from bevviz.model.frame import F64
 from tests.support.miscalibrated_drives import EVERY, Drive, Kitti
 

@@ -166,16 +166,20 @@ def test_every_command_has_help(capsys: Capture) -> None:
         with pytest.raises(SystemExit) as ended:
             main([*command, "--help"])
         assert ended.value.code == 0
-    assert (
-        "examples:"
-        in subprocess.run(
-            [sys.executable, "-m", "bevviz.cli", "--help"],
-            capture_output=True,
-            text=True,
-            check=True,
-            env=environment(),
-        ).stdout
+
+
+def test_the_help_imports_no_library() -> None:
+    """Shell completion makes the parsers of all commands, too."""
+    code = (
+        "import sys; before = {*sys.modules}; from bevviz.cli import main, make_parser; make_parser()\n"
+        "try: main(['--help'])\n"
+        "finally:\n"
+        " imported = {name.partition('.')[0] for name in {*sys.modules} - before}\n"
+        " print(sorted(imported - sys.stdlib_module_names), file=sys.stderr)"
     )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "examples:" in done.stdout
+    assert done.stderr == "['bevviz']\n"
 
 
 # --- wrong input: one clear line, exit status 2 --------------------------------------------------

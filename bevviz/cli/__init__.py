@@ -21,7 +21,6 @@ from bevviz.cli.outputs import check_outputs, join_json_option, print_error
 from bevviz.cli.parser import COMMAND, Parser
 from bevviz.errors import UserError, first_line, interrupt_in
 from bevviz.support.extensions import load_all, registered
-from bevviz.support.version import __version__
 
 if TYPE_CHECKING:
     from logging import Logger
@@ -171,6 +170,16 @@ def _warn(text: str) -> None:
     outputs.warn([text])
 
 
+class _ShowVersion(argparse.Action):
+    """Option that prints the version, which is looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from bevviz.support.version import __version__
+
+        print(f"bevviz {__version__}")
+        parser.exit()
+
+
 def make_parser(word: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
     """Return the parser of the program, and those of the commands by name.
 
@@ -183,7 +192,9 @@ def make_parser(word: str = "") -> tuple[argparse.ArgumentParser, Mapping[str, a
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"bevviz {__version__}")
+    parser.add_argument(
+        "--version", action=_ShowVersion, nargs=0, help="show program's version number and exit"
+    )
     subparsers = parser.add_subparsers(required=True, metavar=COMMAND)
     for name, line, command in _find_commands(word):
         command_parser = subparsers.add_parser(name, help=line)

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from bevviz.extras.calib import Calibration, calibrate, gather
-from bevviz.extras.calib.result import TIME, error_pose
+from bevviz.extras.calib.result import TIME, Calibration, error_pose
+from bevviz.extras.calib.score import gather
+from bevviz.extras.calib.solve import calibrate
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model import geometry
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics

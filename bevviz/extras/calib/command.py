@@ -15,8 +15,8 @@ from bevviz.support import progress
 
 if TYPE_CHECKING:
     from bevviz.config import Config
-    from bevviz.extras.calib import Calibration, Shots
-    from bevviz.extras.calib.score import Pose
+    from bevviz.extras.calib.result import Calibration
+    from bevviz.extras.calib.score import Pose, Shots
     from bevviz.model.frame import Frame, Scene
 
 FRAMES = 30  # Number of frames to use without --every.
@@ -102,7 +102,8 @@ def calibrate_cameras(
         pose: see ``gather``.
         offsets: stated offsets of the clocks.
     """
-    from bevviz.extras.calib import calibrate, gather
+    from bevviz.extras.calib.score import gather
+    from bevviz.extras.calib.solve import calibrate
 
     bar = progress.bar(frames, total=total, unit="frame", desc="find edges")
     shots, results = gather(bar, cameras, pose), []

@@ -42,8 +42,8 @@ class SweepOptions:
 def _sweep(options: SweepOptions) -> int:
     from bevviz.checks import InputChecks
     from bevviz.config import flatten
-    from bevviz.extras.sweep import Sweep, combine, parse
     from bevviz.extras.sweep.log import layout, log_sweep
+    from bevviz.extras.sweep.run import Sweep, combine, parse
     from bevviz.pipeline.session import common_frames
 
     parameters, constant = parse(options.config.set)

@@ -14,11 +14,18 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.errors import UserError
-from bevviz.extras.calib import AXES, AxisFinding, Calibration, Shots, calibrate, gather
-from bevviz.extras.calib.result import SCALES, TIME, correction_yaml, error_pose
-from bevviz.extras.calib.score import Scorer
+from bevviz.extras.calib.result import (
+    AXES,
+    SCALES,
+    TIME,
+    AxisFinding,
+    Calibration,
+    correction_yaml,
+    error_pose,
+)
+from bevviz.extras.calib.score import Scorer, Shots, gather
 from bevviz.extras.calib.search import search
-from bevviz.extras.calib.solve import FIT
+from bevviz.extras.calib.solve import FIT, calibrate
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import PERIOD, START, SyntheticSource
 from bevviz.model import geometry

@@ -20,8 +20,8 @@ from bevviz.errors import UserError
 from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
-from bevviz.extras.sweep import Parameter, Sweep, combine, parse
 from bevviz.extras.sweep.log import HEIGHT, WIDTH, axis_scale
+from bevviz.extras.sweep.run import Parameter, Sweep, combine, parse
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import apply as move
 from bevviz.model.geometry import corners, project
