@@ -630,6 +630,8 @@ def test_a_recording_may_start_at_any_whole_packet(
     assert [p.whole for p in packets] == [True, True]
     application = blueprints.application_id("live", drive.scene, config)
     assert {store.application_id for store in RrdReader(path).recordings()} == {application}
+    styled = {chunk.entity_path for chunk in RrdReader(path).stream() if chunk.is_static}
+    assert {"/world/rslidar/points/ground", "/anomalies/count"} < styled
     recording = Recording(path)
     assert recording.cleared("/world/rslidar/clusters") == {1}
     assert recording.column("/world/zed/image", "EncodedImage:blob")

@@ -138,16 +138,22 @@ class Encoder:
         self._config, self._scene = config, scene
         self.application = blueprints.application_id(blueprint, scene, config)
         self._stream = _Stream(self.application)
+        self.recording_id: str = self._stream.recording.get_recording_id() or ""
+        # Each style is encoded once. Each whole packet repeats the bytes of all styles so far.
+        self._style_stream = _Stream(self.application, self.recording_id)
+        self._style_stream.read()
+        self._styles = b""
         self._logger = _FrameLogger(self._stream.recording, config, scene, network=network)
+        self._logger.styles = self._style_stream.recording
         self.rows = RowCache()
         self._whole = float("-inf")
         self._lock = threading.Lock()
-        self.recording_id: str = self._stream.recording.get_recording_id() or ""
         self.header = self._stream.read()  # packets after it can be read, without static data
 
     def close(self) -> None:
-        """Close the recording stream."""
+        """Close the recording streams."""
         self._stream.close()
+        self._style_stream.close()
 
     @property
     def context(self) -> RecordingContext:
@@ -180,7 +186,9 @@ class Encoder:
             self._logger.limit = None
             self.rows.put(result.frame.index, self._logger.rows)
             self._log_differences(compared, whole)
-            data, thinned = self._stream.read(), None
+            new_styles = self._style_stream.read()
+            self._styles += new_styles
+            data, thinned = (self._styles if whole else new_styles) + self._stream.read(), None
             if self._logger.clouds:
                 everything, few = self._encode_clouds(result)
                 data, thinned = data + everything, data + few
@@ -222,6 +230,7 @@ class Encoder:
             return
         if self._differences is None:
             self._differences = DifferenceLogger(self._stream.recording, self._against.names, "")
+            self._differences.styles = self._style_stream.recording
         if whole:
             self._differences.refresh()
         for comparison in compared:

@@ -221,9 +221,11 @@ class _Loop(Generic[T, R]):
         if not self.admission.get():
             return
         try:
-            with rare_garbage_collections(), ExitStack() as stack:
+            with ExitStack() as stack:
                 network = stack.enter_context(ThreadPoolExecutor(1, "network"))
                 observers = [stack.enter_context(self._observing(observer)) for observer in self._observers]
+                # What the observers have loaded until here is not searched again and again either.
+                stack.enter_context(rare_garbage_collections())
                 for result in stack.enter_context(closing(self._results(network))):
                     if self._stop.is_set():
                         break

@@ -170,8 +170,9 @@ def log_tracks(to: Writer, frame: Frame, tracks: Tracks, config: BevConfig) -> N
 
 def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
     """Log the speed of each lane's track. ``rows`` is lane -> row of its track."""
-    if to.is_first(entities.TRACK_SPEEDS):
-        to.static(entities.TRACK_SPEEDS, rr.SeriesLines(names=[f"{n:02}" for n in range(TRACK_LANES)]))
+    to.static_once(
+        entities.TRACK_SPEEDS, lambda: rr.SeriesLines(names=[f"{n:02}" for n in range(TRACK_LANES)])
+    )
     speeds = np.full(TRACK_LANES, np.nan)
     speeds[list(rows)] = tracks.speed[list(rows.values())]
     to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))

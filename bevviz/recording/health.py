@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import rerun as rr
@@ -71,8 +72,8 @@ def log_health(
     """
     for path, value in (*health(result, last, rates), *extra_scalars.items()):
         if np.isfinite(value):
-            if (color := _COLORS.get(path)) is not None and to.is_first(path):
-                to.static(path, rr.SeriesLines(colors=[color], widths=[1.5]))
+            if (color := _COLORS.get(path)) is not None:
+                to.static_once(path, partial(rr.SeriesLines, colors=[color], widths=[1.5]))
             to.scalar(path, float(value))
 
 
@@ -115,7 +116,6 @@ def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -
         entities.ANOMALY_LOG,
         [(new_anomaly.severity, f"{new_anomaly.kind}: {new_anomaly.text}") for new_anomaly in started],
     )
-    if to.is_first(entities.ANOMALY_COUNTS):
-        to.static(entities.ANOMALY_COUNTS, rr.SeriesLines(names=list(KINDS)))
+    to.static_once(entities.ANOMALY_COUNTS, lambda: rr.SeriesLines(names=list(KINDS)))
     count = Counter(anomaly.kind for anomaly in result.anomalies)
     to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))

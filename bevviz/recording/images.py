@@ -247,8 +247,7 @@ def log_projected_points(to: Writer, result: CameraResult, *, packed: bool = Fal
             )
         name = result.camera.name
         path, style = entities.PROJECTED.path(name), Style(width=1.5, labels=False, order=10.0)
-        if to.is_first(path):
-            to.static(path, depth_annotations())
+        to.static_once(path, depth_annotations)
         draw(to, Layer(path, uv, style, class_ids=depth, frame=name))
 
 

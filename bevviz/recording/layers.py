@@ -60,7 +60,7 @@ class Style:
         return {name: value for name, value in fields.items() if value is not None}
 
 
-_OUTLINE = Style(width=2.5)
+_NO_STYLE, _OUTLINE = Style(), Style(width=2.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +117,8 @@ def _draw(to: Writer, layer: Layer, put: Callable[..., None]) -> None:
     if layer.widths is not None:
         fields["radii"] = rr.Radius.ui_points(layer.widths)
     values = dict(layer.values) if layer.says is None else {"says": layer.says, **layer.values}
-    if to.is_first(layer.path, archetype.__name__, layer.style) and layer.style.fields:
-        to.static(layer.path, archetype.from_fields(**layer.style.fields))
+    if (style := layer.style) != _NO_STYLE:
+        to.static_once(layer.path, lambda: archetype.from_fields(**style.fields), archetype.__name__, style)
     if isinstance(layer.frame, str):
         _log_image_frame(to, layer.path, layer.frame)
     elif layer.frame is not None:
@@ -164,8 +164,8 @@ def _log_image_frame(to: Writer, path: str, camera: str) -> None:
     The frame is static, because Rerun drops a frame that is logged at the time of a recursive clear.
     """
     image = entities.IMAGE.path(camera)
-    if (to.root or not path.startswith(f"{image}/")) and to.is_first(path, image):
-        to.static(path, rr.CoordinateFrame(entities.space(image)))
+    if to.root or not path.startswith(f"{image}/"):
+        to.static_once(path, lambda: rr.CoordinateFrame(entities.space(image)), image)
 
 
 def callouts(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Hashable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 
 import numpy as np
 import rerun as rr
@@ -46,7 +46,7 @@ class Writer(Closable):
         wait: float = 0.0,
         stamps: Sequence[str] = (entities.STAMP,),
     ) -> None:
-        self.recording = recording
+        self.recording = self.styles = recording  # ``styles``: stream of ``static_once``
         self.root = root
         self.sequences: Mapping[str, int] = {}  # further timelines, and the position on each
         self._wait, self._stamps = wait, stamps
@@ -61,7 +61,7 @@ class Writer(Closable):
         self.streams_video = True  # False: each video picture is logged as an image
         self._codecs: dict[str, Codec] = {}  # codec of entities that are video
         self._last_packets: dict[str, tuple[tuple[int, int], dict[str, int]]] = {}  # last packet and its time
-        self._logged_once: set[tuple[Hashable, ...]] = set()  # keys of ``is_first``
+        self._logged_once: set[tuple[Hashable, ...]] = set()  # keys of ``static_once``
         self._versions: dict[str, int] = {}  # entity -> version in the last ``keep``
 
     def begin(self, index: int, stamp: int, received: int) -> None:
@@ -98,7 +98,8 @@ class Writer(Closable):
         """
         self._previous_entities = self._all_entities | known
         self._versions.clear()
-        self._logged_once.clear()
+        if self.styles is self.recording:  # the owner of a separate stream repeats its bytes
+            self._logged_once.clear()
         self._last_packets.clear()
 
     @property
@@ -134,15 +135,14 @@ class Writer(Closable):
         for archetype in archetypes:
             self.recording.log(self.root + path, archetype, static=True)
 
-    def is_first(self, *key: Hashable) -> bool:
-        """Return whether the key is new in this recording, so that its static data must be logged.
+    def static_once(self, path: str, make: Callable[[], rr.AsComponents], *key: Hashable) -> None:
+        """Log static data of an entity, unless it was logged with this key before.
 
-        After ``refresh``, all keys are new, because a viewer may lack what was logged before.
+        After ``refresh`` it is logged again, because a viewer may lack what was logged before.
         """
-        if key in self._logged_once:
-            return False
-        self._logged_once.add(key)
-        return True
+        if (path, *key) not in self._logged_once:
+            self._logged_once.add((path, *key))
+            self.styles.log(self.root + path, make(), static=True)
 
     def put(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Log data of this frame alone. The next frame without data for the entity clears it."""
