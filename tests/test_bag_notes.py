@@ -63,6 +63,18 @@ def test_an_unwritable_notes_file_is_reported(bag: Path) -> None:
         notes.add(LATE)
 
 
+def test_notes_of_a_read_only_folder_are_in_the_users_data(
+    bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(data := bag.parent / "data"))
+    monkeypatch.setattr("os.access", lambda path, mode: path != bag.parent)
+    notes = Notes([bag])
+    notes.add(LATE)
+    assert notes.path.parent == data / "bevviz" / "notes" and list(Notes([bag])) == [LATE]
+    other = Notes([bag.parent / "other" / "drive.mcap"])
+    assert not list(other) and other.path != notes.path, "another bag of that name has its own"
+
+
 @pytest.mark.parametrize("text", ["", "  \n", "x" * 3000])
 def test_empty_and_overlong_notes_are_refused(bag: Path, text: str) -> None:
     with pytest.raises(UserError, match="characters"):
@@ -75,5 +87,5 @@ def test_notes_are_plain_json(bag: Path) -> None:
     (note,) = json.loads(Notes([bag]).path.read_text())["notes"]
     assert note == {
         "stamp": 100, "received": 110, "text": "Größe: 3 m", "about": "car at 3 m", "pick": "truth//1",
-        "end": 0,
+        "end": 0, "label": "", "box": [], "points_frame": "",
     }  # fmt: skip

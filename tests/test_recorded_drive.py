@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,10 +27,11 @@ from bevviz.recording.addresses import RowCache
 from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
+from bevviz.why.kept_labels import box_of
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.recorded_drive import RecordedDrive
-from bevviz.workbench.session import WorkbenchSession
+from bevviz.workbench.session import WorkbenchSession, recorded_session
 from bevviz.workbench.thumbnails import MOST, WIDTH, Thumbnails
 from tests.support.logged_frames import frame_with_image
 from tests.support.workbench_pages import FRAMES, demo_bag
@@ -45,6 +47,10 @@ def result(bag: Path) -> Iterator[FrameResult]:
     some_are_set_aside = {"clustering.min_cluster_points": 30}
     with bevviz.open(bag, model="demo", set=some_are_set_aside) as drive:
         yield drive.at(frame=1)
+
+
+def without_truth(result: FrameResult) -> FrameResult:
+    return replace(result, frame=replace(result.frame, truth=None))
 
 
 # --- what a click is on -------------------------------------------------------------------------
@@ -372,3 +378,29 @@ def test_thumbnails_are_bounded() -> None:
     assert picture is not None and picture.shape == (WIDTH // 2, WIDTH, 3)
     assert abs(picture.mean() - 21) < 2  # frames 20 to 29 are a part
     assert Thumbnails(10).near(3) is None
+
+
+@pytest.mark.long
+def test_a_label_is_kept_changed_and_removed(bag: Path, tmp_path: Path) -> None:
+    """It is there in the next session, and the answer is about its object."""
+    copy = Path(shutil.copy(bag, tmp_path / "drive.mcap"))
+    changed = "person", box_of((9, 2, 0, 4, 2, 2, 0.5))
+    for label, kept in ((None, True), (changed, True), (None, False)):
+        with bevviz.open(copy, model="demo") as drive, bevviz.open(copy, model="demo") as again:
+            session = recorded_session(drive, again.frames, [copy])
+            result = session.source._results[0, ()] = without_truth(drive.at(frame=0))
+            camera = result.cameras[0].camera.name
+            selection = Selection(detection=0, camera=camera)
+            before = session.ask(0, (), selection)[0]
+            about = session.identity(0, (), selection, before, None)
+            drawn = session.draw_label(0, about, label)
+            assert (before.label < 0) == (not list(session.tools.notes))
+            if kept:
+                assert str(tmp_path / "drive.mcap.notes.json") in session.keep_label(0, drawn)
+            else:
+                assert drawn.label == "person" and drawn.box.center[0].tolist() == [9, 2, 0], "that is kept"
+                (note,) = session.tools.notes
+                session.remove_note(note.stamp, note.text)
+            assert (session.ask(0, (), selection)[0].label == 0) == kept
+            assert len(list(session.tools.notes)) == kept
+            session.close()

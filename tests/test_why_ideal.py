@@ -11,7 +11,9 @@ import pytest
 from bevviz.config import load
 from bevviz.evaluate import MAX_DISTANCE, judge
 from bevviz.evaluate.matching import image_boxes_of
+from bevviz.findings.frame_findings import find_findings
 from bevviz.model.reasons import ReasonKind
+from bevviz.pipeline.notes import Note
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -21,6 +23,8 @@ from bevviz.why.assumed_truth import assumed_truth
 from bevviz.why.changes import changes_for
 from bevviz.why.collect import collect_evidence
 from bevviz.why.ideal import IdealStages
+from bevviz.why.kept_labels import kept_truth
+from bevviz.why.subject import single_box
 from bevviz.why.verdict import ground_lost
 from tests.support.planted_faults import at
 
@@ -135,6 +139,52 @@ def test_an_assumed_object_is_where_its_label_is() -> None:
         away = np.linalg.norm(assumed.boxes.center[0, :2] - truth.boxes.center[row, :2])
         right += bool(away < MAX_DISTANCE) and assumed.labels[0] in truth.accepted[row]
     assert right >= 0.8 * len(rows), "the boxes of a few objects are mostly of others before them"
+
+
+def labelled(asked: FrameExplainer, row: int) -> FrameExplainer:
+    """Return the explainer without ground truth, but with the label of one object that a user keeps."""
+    truth, frame = asked.traces.labels_in_evaluate, asked.traces.result.frame
+    assert truth is not None
+    box = single_box(truth.boxes, row)
+    values = (*box.center[0].tolist(), *box.size[0].tolist(), float(box.yaw[0]))
+    note = Note(
+        frame.stamp,
+        0,
+        "kept",
+        "",
+        '{"kind": "point", "label": "", "frame": 0}',
+        0,
+        truth.labels[row],
+        values,
+        frame.points_frame,
+    )
+    blind = without_truth(asked).traces.result
+    return FrameExplainer(blind, classes=CLASSES, labels=kept_truth([note], blind.frame, CLASSES))
+
+
+@pytest.mark.parametrize(("planted", "stage"), PLANTED[1:2])
+def test_a_kept_label_makes_the_answer_exact(planted: str, stage: str) -> None:
+    """It is the answer with ground truth, at the image box and at the place."""
+    sound, asked = explained(), explained(planted)
+    assert sound.traces.matches is not None and asked.traces.matches is not None
+    row = int(np.flatnonzero(asked.traces.matches.missed & ~sound.traces.matches.missed)[0])
+    known, blind = asked.about(Selection(truth=row)), labelled(asked, row)
+    assert known.center is not None
+    for selection in (box_of(asked, row), Selection(point=known.center)):
+        answer = blind.ask(selection)[0]
+        assert answer.text == known.text and answer.points == known.points and not answer.likely
+        assert answer.restored_by == known.restored_by and (stage,) in answer.restored_by
+        assert [step.text for step in answer.steps[1:]] == [step.text for step in known.steps]
+        assert answer.steps[0].stage == "label"
+
+
+def test_a_kept_label_says_nothing_about_other_objects() -> None:
+    asked = explained()
+    blind = labelled(asked, row=0)
+    before, after = find_findings(without_truth(asked)), find_findings(blind)
+    assert [(one.what, one.selection) for one in before] == [(one.what, one.selection) for one in after]
+    assert blind._labelled is not None and (matches := blind._labelled.traces.matches) is not None
+    assert (matches.partner < 0).any() and not matches.false.any()
 
 
 def test_a_height_of_the_sensor_is_tried_against_a_roof() -> None:

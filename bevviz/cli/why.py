@@ -72,10 +72,12 @@ class WhyOptions:
 def _why(options: WhyOptions) -> int:
     from bevviz.bags.source import BagSource
     from bevviz.checks import InputChecks
+    from bevviz.pipeline.notes import Notes
     from bevviz.pipeline.session import Session
     from bevviz.pipeline.stage_loader import StageLoader
     from bevviz.why import FrameExplainer
     from bevviz.why.answer_text import plain_text
+    from bevviz.why.kept_labels import kept_truth
     from bevviz.why.neighbours import frames_beside
 
     config, subject, at = load_config(options), options.subject, options.frame.at
@@ -103,7 +105,9 @@ def _why(options: WhyOptions) -> int:
         checks.observe(result)
         warn(checks.warnings_beside(early))
         beside = frames_beside(source, frame.index)
-        questioner = FrameExplainer(result, loader, session.stages.class_names, neighbours=beside)
+        names = session.stages.class_names
+        labels = kept_truth(Notes(options.drive.paths), frame, names)
+        questioner = FrameExplainer(result, loader, names, neighbours=beside, labels=labels)
         bar = partial(progress.bar, unit="object", desc="what would change it", leave=False)
         answers = questioner.explain(selection, subject.limit, bar, everything=subject.all)
         neighbours = _neighbours(questioner, selection, answers)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from bevviz.config.module_folder import WORKING_DIRECTORY, ModuleFolder, find_source, hash_sources
 from bevviz.errors import UserError
-from bevviz.support.files import check_owned, read_bytes, save_text
+from bevviz.support.files import check_owned, data_folder, read_bytes, save_text
 from bevviz.support.limits import CONFIG_LIMIT
 
 
@@ -212,17 +212,12 @@ def _check(folder: Path) -> None:
 
 
 def _folder() -> Path:
-    """Return the folder of the records. A relative XDG_DATA_HOME does not count, as its specification says.
+    """Return the folder of the records.
 
     Raises:
         UserError: the user has no home folder.
     """
-    data_home = Path(os.environ.get("XDG_DATA_HOME", ""))
-    try:
-        data = data_home if data_home.is_absolute() else Path.home() / ".local" / "share"
-    except RuntimeError:
-        raise UserError("there is no folder for what you trust: set XDG_DATA_HOME") from None
-    return data / "bevviz" / "trusted"
+    return data_folder("what you trust") / "trusted"
 
 
 def _name(path: Path) -> str:

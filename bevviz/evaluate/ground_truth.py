@@ -46,11 +46,12 @@ class Truth:
     camera: Camera | None = None  # camera of that image
     unusable: tuple[str, ...] = ()  # one sentence for each label that cannot be used
     judged: Bool | None = None  # (K,) False: an object on it is neither right nor wrong; None: all are judged
+    whole: bool = True  # whether an object without a label can be false
 
     @property
     def judged_names(self) -> frozenset[str]:
         """Names, in lower case, of which an object without a label is false."""
-        return judged_names(self.labels).union(*self.accepted)
+        return judged_names(self.labels).union(*self.accepted) if self.whole else frozenset()
 
     def unjudged_label(self, boxes: Boxes3D) -> I64:
         """Return (J,) the row of the label of an unjudged type that a box is on, -1: none.

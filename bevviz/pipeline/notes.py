@@ -1,9 +1,15 @@
-"""Notes of a user about a drive and its findings, in a file beside the bag: ``drive.mcap.notes.json``."""
+"""Notes of a user about a drive and its findings, in a file beside the bag: ``drive.mcap.notes.json``.
+
+Where the folder of the bag is read-only, the file is in the folder of the user's data.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +17,7 @@ from pydantic import TypeAdapter
 
 from bevviz.bags.remote import beside
 from bevviz.errors import UserError
-from bevviz.support.files import atomic_write, read_text
+from bevviz.support.files import atomic_write, data_folder, read_text
 
 SUFFIX = ".notes.json"
 LONGEST = 2000  # most characters of a note
@@ -29,6 +35,9 @@ class Note:
         about: the object in words. Empty: the note is about the frame.
         pick: query parameter that selects the object in the workbench.
         end: sensor time of the last frame of the span that it is about, in nanoseconds. 0: a single frame.
+        label: class of an object that is there, which the user has drawn a box of. Empty: it is a remark.
+        box: centre x, y, z, length, width, height and yaw of that box in the frame of the points.
+        points_frame: name of that frame.
     """
 
     stamp: int
@@ -37,6 +46,9 @@ class Note:
     about: str = ""
     pick: str = ""
     end: int = 0
+    label: str = ""
+    box: tuple[float, ...] = ()
+    points_frame: str = ""
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}" if self.about else self.text
@@ -86,11 +98,13 @@ class Notes:
 
     Args:
         paths: paths of the drive. The file lies beside the first.
+
+    Raises:
+        UserError: the folder is read-only, and the user has no home folder.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        bag = beside(paths[0])
-        self.path = bag.with_name(bag.name + SUFFIX)
+        self.path = _path_for(beside(paths[0]))
         self._lock = threading.Lock()
 
     def __iter__(self) -> Iterator[Note]:
@@ -176,3 +190,14 @@ class Notes:
                 file.path.write_bytes(f"{text}\n".encode(errors="replace"))
             except OSError as error:
                 raise UserError(f"{self.path}: cannot write the notes: {error.strerror}") from None
+
+
+def _path_for(bag: Path) -> Path:
+    """Return the path of the notes of a bag."""
+    file = bag.with_name(bag.name + SUFFIX)
+    if file.exists() or not file.parent.is_dir() or os.access(file.parent, os.W_OK):
+        return file
+    folder, place = data_folder("the notes") / "notes", hashlib.sha256(os.fsencode(bag)).hexdigest()[:8]
+    with suppress(OSError):  # The first note says so.
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder / f"{bag.name}.{place}{SUFFIX}"

@@ -95,6 +95,23 @@ def is_locked(path: Path) -> bool:
     return False
 
 
+def data_folder(what: str) -> Path:
+    """Return the folder of a user's data. A relative XDG_DATA_HOME does not count, as its specification says.
+
+    Args:
+        what: content, for the message.
+
+    Raises:
+        UserError: the user has no home folder.
+    """
+    data_home = Path(os.environ.get("XDG_DATA_HOME", ""))
+    try:
+        data = data_home if data_home.is_absolute() else Path.home() / ".local" / "share"
+    except RuntimeError:
+        raise UserError(f"there is no folder for {what}: set XDG_DATA_HOME") from None
+    return data / "bevviz"
+
+
 def create_file(path: Path) -> int:
     """Create a file for writing and return its descriptor. Fail if the name exists, even as a link."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)

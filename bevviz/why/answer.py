@@ -19,6 +19,7 @@ from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.hints import Hint, HintFinder, HintSearch, TriedChange
 from bevviz.why.ideal import StageSet
+from bevviz.why.kept_labels import label_of
 from bevviz.why.neighbours import FrameLookup, NeighbourRuns
 from bevviz.why.reruns import FrameRuns
 from bevviz.why.resolve import object_subject, select_subjects, subjects_at_place
@@ -50,6 +51,7 @@ class Answer:
             be. Empty: none was searched, or there is nothing to mend.
         likely: two reasons that each lost much of it where nothing tells which one mattered; else empty.
         near: whether the pipeline had to report it, see ``FrameIndex.must``.
+        label: row of the label of the user that the answer is about. -1: none.
     """
 
     subject: Subject
@@ -64,6 +66,7 @@ class Answer:
     remark: str = ""
     likely: tuple[ReasonKind, ...] = ()
     near: bool = False
+    label: int = -1
 
     @property
     def restored_by(self) -> tuple[StageSet, ...]:
@@ -150,6 +153,8 @@ class FrameExplainer:
         classes: names of the classes that the detector knows.
         truth: ground truth of the frame; None: its own.
         neighbours: returns the frames before and after, on which hints are tried, too.
+        labels: labels that the user keeps. Where there is no ground truth, they make the answers about their
+            objects exact, and tell nothing about others.
     """
 
     def __init__(
@@ -159,8 +164,12 @@ class FrameExplainer:
         classes: Sequence[str] = (),
         truth: Truth | None = None,
         neighbours: FrameLookup = tuple,
+        labels: Truth | None = None,
     ) -> None:
         self.traces = FrameIndex(result, classes, truth)
+        self._labelled: FrameExplainer | None = None
+        if labels is not None and self.traces.labels_in_evaluate is None:
+            self._labelled = FrameExplainer(result, loader, classes, labels, neighbours)
         loader = loader or StageLoader()
         self._runs = FrameRuns(self.traces, loader)
         self._hint_finder = HintFinder(
@@ -182,7 +191,7 @@ class FrameExplainer:
             if candidates:
                 return candidates[:1]
         answers = [self._answer(subject) for subject in select_subjects(self.traces, selection)]
-        return sorted(answers, key=_rank)
+        return _once_by_label(sorted(answers, key=_rank))
 
     def explain(
         self,
@@ -224,7 +233,7 @@ class FrameExplainer:
             (self._answer(subject), shows) for subject, shows in subjects_at_place(self.traces, selection)
         ]
         order = sorted(answers, key=lambda pair: _place_rank(*pair))
-        return [answer for answer, _ in order]
+        return _once_by_label([answer for answer, _ in order])
 
     def about(self, selection: Selection) -> Answer:
         """Explain the one subject of a selection that selects a row."""
@@ -256,6 +265,11 @@ class FrameExplainer:
         """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
         if answer.empty:
             return answer
+        if answer.label >= 0 and (labelled := self._labelled) is not None:
+            exact = labelled.with_hints(
+                replace(answer, subject=labelled.traces.truth[answer.label], label=-1)
+            )
+            return replace(exact, subject=answer.subject, label=answer.label)
         if answer.verdict.kind is ReasonKind.SECOND_NAME:
             remark = untried_text(answer.subject, answer.verdict)
             return replace(answer, remark=f"{remark[0].upper()}{remark[1:]}.")
@@ -291,6 +305,8 @@ class FrameExplainer:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
+        if (exact := self._by_label(subject)) is not None:
+            return exact
         evidence = collect_evidence(subject, self.traces)
         reason, reported = find_reason(subject, evidence, self.traces)
         restored_by: tuple[StageSet, ...] = ()
@@ -307,6 +323,19 @@ class FrameExplainer:
             self._answers[subject.key] = answer
         return answer
 
+    def _by_label(self, subject: Subject) -> Answer | None:
+        """Return the answer about the object of the label that a subject is on. None: there is no label."""
+        if (labelled := self._labelled) is None:
+            return None
+        row = label_of(subject, self.traces, labelled.traces)
+        if row < 0:
+            return None
+        label = labelled.traces.truth[row]
+        exact = labelled.about(Selection(truth=row))
+        step = Step("label", f"{label.name} is kept as truth, so this answer is exact")
+        subject = replace(subject, name=label.name, box=label.box)
+        return replace(exact, subject=subject, steps=(step, *exact.steps), label=row)
+
 
 def why(
     result: FrameResult,
@@ -319,6 +348,14 @@ def why(
 ) -> list[Answer]:
     """Answer one question about a result; see ``FrameExplainer.explain``."""
     return FrameExplainer(result, loader, classes).explain(selection, hints, everything=everything)
+
+
+def _once_by_label(answers: Sequence[Answer]) -> list[Answer]:
+    """Return the answers without a second one about the same label."""
+    labels = [answer.label for answer in answers]
+    return [
+        answer for row, answer in enumerate(answers) if answer.label < 0 or answer.label not in labels[:row]
+    ]
 
 
 def _some(settings: Sequence[str], named: int) -> str:

@@ -45,10 +45,10 @@ def false_reasons(traces: FrameIndex) -> Mapping[int, Reason]:
 
 def _false_reasons(traces: FrameIndex) -> Iterator[tuple[int, Reason]]:
     """Yield the false objects with their causes."""
-    objects, truth, matches = traces.result.objects, traces.labels_in_evaluate, traces.matches
+    objects, matches = traces.result.objects, traces.matches
     if objects is None:
         return
-    if truth is None or matches is None:
+    if matches is None or not traces.is_labelled:
         for row in range(len(objects)) if traces.origin("objects").ours else ():
             if (doubt := _doubt(traces, objects, row)) is not None:
                 yield row, doubt

@@ -274,6 +274,12 @@ class FrameIndex:
             return self._truth
         return truth_of(frame, frame.truth)
 
+    @property
+    def is_labelled(self) -> bool:
+        """Whether the ground truth names every object of the frame."""
+        truth = self.labels_in_evaluate
+        return truth is not None and truth.whole
+
     @cached_property
     def matches(self) -> Matches | None:
         """The judgement of ``evaluate`` about the objects of the frame."""

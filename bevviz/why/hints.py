@@ -277,17 +277,17 @@ class HintFinder:
         """Return a hint with its effects on all objects of the frame, as ``evaluate`` counts them."""
         before = self._traces
         self._change_of[_settings(change)] = change
-        more = 0 if before.truth else len(false_reasons(after)) - len(false_reasons(before))
+        more = 0 if before.is_labelled else len(false_reasons(after)) - len(false_reasons(before))
         changed = before_after(
             before.result.objects,
             after.result.objects,
-            before.labels_in_evaluate,
+            before.labels_in_evaluate if before.is_labelled else None,
             cameras=(before.result.cameras, after.result.cameras),
             asked=asked,
             own=own,
             doubtful=more,
         )
-        if before.matches is None or after.matches is None:
+        if before.matches is None or after.matches is None or not before.is_labelled:
             return Hint(_settings(change), text, changed, max(changed.good, 1) - changed.harm)
         right = int((after.matches.partner >= 0).sum()) - int((before.matches.partner >= 0).sum())
         false = int(after.matches.false.sum()) - int(before.matches.false.sum())

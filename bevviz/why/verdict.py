@@ -132,7 +132,7 @@ def likely_reasons(
         ReasonKind.TOO_SMALL: evidence.aside_points,
     }
     first = kind if aside is None or kind is not ReasonKind.TOO_LARGE else ReasonKind.TOO_SMALL
-    if traces.result.frame.truth is not None or subject.is_place or first not in lost or evidence.main >= 0:
+    if traces.labels_in_evaluate is not None or subject.is_place or first not in lost or evidence.main >= 0:
         return ()
     second = max((other for other in lost if other is not first), key=lambda other: lost[other])
     if lost[second] < NEARLY * lost[first]:

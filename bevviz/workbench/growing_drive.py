@@ -109,6 +109,7 @@ class GrowingDrive(Closable):
         findings: findings, grouped over frames.
         news: tells of each new frame and of all other news for the page.
         first: stamp that the page counts seconds from.
+        kept_labels: returns the labels of a frame that the user keeps.
         opening: stamp of the frame that a page opens at. None: no frame is shown yet, or the newest one.
         commands: further messages of the page by type, each with the function that returns the reply.
     """
@@ -120,6 +121,7 @@ class GrowingDrive(Closable):
         self.scans, self.single_frames = 0, False
         self.findings, self.news = FindingList(), News()
         self.opening: int | None = None
+        self.kept_labels: TruthLookup = lambda frame: None
         self._remarks: dict[tuple[int, str], Answer] = {}  # by frame and text of the selection
         self._remarking = threading.Lock()
         self.following = threading.Lock()  # guards the bag that the robot's chain is read from
@@ -302,7 +304,10 @@ class GrowingDrive(Closable):
     def explainer(self, result: FrameResult) -> FrameExplainer:
         """Return an explainer of a result, for the list and for questions."""
         names, number = self.pipeline.stages.class_names, result.frame.index
-        return FrameExplainer(result, self.pipeline.loader, names, neighbours=lambda: [*self._beside(number)])
+        labels = self.kept_labels(result.frame)
+        return FrameExplainer(
+            result, self.pipeline.loader, names, neighbours=lambda: [*self._beside(number)], labels=labels
+        )
 
     def _beside(self, number: int) -> Iterator[Frame]:
         """Yield the frames before and after one, as far as they can be read."""
@@ -336,6 +341,12 @@ class GrowingDrive(Closable):
                 answer = self._aside.about(Selection.parse(pick))
                 self._remarks[number, pick] = self._aside.with_hints(answer)
             return self._remarks[number, pick]
+
+    def forget_remarks(self) -> None:
+        """Forget the answers about findings, which a label has changed."""
+        with self._remarking:
+            self._aside = None
+            self._remarks.clear()
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
         """Return the questions about the robot's own chain. None: the robot has not two topics of objects.

@@ -73,6 +73,7 @@ class PageConnection:
             "note": self._note,
             "unnote": self._unnote,
             "handle": self._handle_finding,
+            "draw": self._draw_label,
         }
 
     async def stay(self) -> None:
@@ -256,8 +257,9 @@ class PageConnection:
                 return {"type": "absent", **head, "text": text, "pick": str(identity)}
             answer, *others = workbench.ask(frame, settings, selection)
             pick = str(workbench.identity(frame, settings, selection, answer, identity))
-            followed = {"pick": pick, "found": found, "beside": list(other_answers(others))}
-            tree = {"type": "answer", **head, **answer_tree(answer), **followed}
+            followed = {"pick": pick, "found": found, "labelled": answer.label >= 0}
+            beside = {"beside": list(other_answers(others))}
+            tree = {"type": "answer", **head, **answer_tree(answer), **followed, **beside}
             return selection, self._source.look(frame, settings), answer, tree
 
         answered = await self._in_turn(number, work, settings)
@@ -418,6 +420,33 @@ class PageConnection:
     async def _unnote(self, message: types.RemoveNote) -> None:
         stamp, text = int(message["stamp"]), message["text"]
         await self._in_turn(message["id"], lambda: self._workbench.remove_note(stamp, text))
+
+    async def _draw_label(self, message: types.DrawLabel) -> None:
+        """Draw a label of an object, and keep it if the page says so."""
+        from bevviz.workbench.page_messages import label_box, label_of_page
+
+        workbench, source, number = self._workbench, self._source, message["id"]
+        frame, identity = await self._frame(message), _identity(message)
+        if identity is None:
+            raise UserError("ask about an object or a place first")
+        drawn = label_of_page(message["box"]) if "box" in message else None
+
+        def work() -> types.Label:
+            label = workbench.draw_label(frame, identity, drawn, self._overlay)
+            kept = workbench.keep_label(frame, label) if message.get("keep") else ""
+            return {
+                "type": "label",
+                "id": number,
+                "frame": frame,
+                "set": (),
+                "box": label_box(label.label, label.box),
+                "points": label.points,
+                "pick": label.pick,
+                "classes": source.pipeline.stages.class_names,
+                "kept": kept,
+            }
+
+        await self._send(await self._in_turn(number, work))
 
     async def _handle_finding(self, message: types.Handle) -> None:
         """Keep that a finding is done or ignored."""

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 from bevviz.config import Config, Parameter, parameters, values
+from bevviz.errors import UserError
+from bevviz.model.frame import Boxes3D
 from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer
 from bevviz.why.answer_results import AnswerResult
-from bevviz.workbench.page_types import Chip, Control, HandledEntry, NoteEntry, OtherObject, RowRemark
+from bevviz.why.kept_labels import box_of
+from bevviz.workbench.page_types import (
+    Chip,
+    Control,
+    HandledEntry,
+    LabelBox,
+    NoteEntry,
+    OtherObject,
+    RowRemark,
+)
 
 UNSEEN = ("source.", "live.", "logging.", "sync.", "detector.model")  # no effect on a single frame
 BESIDE = 6  # further answers that are listed
@@ -53,6 +65,24 @@ def note_entry(note: Note) -> NoteEntry:
     """Return a note for the page, whose times are text."""
     times = {"stamp": str(note.stamp), "received": str(note.received), "end": str(note.end)}
     return cast("NoteEntry", asdict(note) | times)
+
+
+def label_box(label: str, box: Boxes3D) -> LabelBox:
+    """Return a label for the page."""
+    center, size = ([round(value, 2) for value in row[0].tolist()] for row in (box.center, box.size))
+    return {"label": label, "center": center, "size": size, "yaw": round(math.degrees(box.yaw[0]), 1)}
+
+
+def label_of_page(box: LabelBox) -> tuple[str, Boxes3D]:
+    """Return class and box of a label that the user has drawn.
+
+    Raises:
+        UserError: a number is missing or no size.
+    """
+    values, label = [*box["center"], *box["size"], math.radians(box["yaw"])], box["label"].strip()
+    if not label or len(values) != 7 or not all(map(math.isfinite, values)) or min(box["size"]) <= 0:
+        raise UserError("a label has a class, a centre of 3 numbers, a size of 3 above 0, and a yaw")
+    return label, box_of(values)
 
 
 def handled_entry(finding: HandledFinding) -> HandledEntry:

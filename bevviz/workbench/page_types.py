@@ -59,6 +59,15 @@ class SideEffects(TypedDict):
     changed: int
 
 
+class LabelBox(TypedDict):
+    """Label of an object: its class, and its box in the frame of the points, in metres and degrees."""
+
+    label: str
+    center: list[float]
+    size: list[float]
+    yaw: float
+
+
 class HandledEntry(TypedDict):
     """A finding that the user has dealt with."""
 
@@ -80,6 +89,9 @@ class NoteEntry(TypedDict):
     about: str
     pick: str
     end: str
+    label: str
+    box: list[float]
+    points_frame: str
 
 
 class JobEntry(TypedDict):
@@ -202,6 +214,7 @@ class AnswerMessage(AnswerResult):
     pick: str
     found: str
     beside: Sequence[OtherObject]
+    labelled: bool
 
 
 class Nothing(Reply):
@@ -233,6 +246,17 @@ class Remark(Row, RowRemark):
     type: Literal["remark"]
 
 
+class Label(Reply):
+    """A label is drawn. ``kept`` says where it is kept; empty: it is not. ``pick`` asks about it then."""
+
+    type: Literal["label"]
+    box: LabelBox
+    points: int
+    pick: str
+    classes: Sequence[str]
+    kept: str
+
+
 class Robot(Reply, RobotSteps):
     """Account of the robot's nodes: their steps with the object."""
 
@@ -258,7 +282,7 @@ class Tried(Reply, TriedEffects):
 
 ToPage: TypeAlias = (
     Welcome | Failed | Error | Opening | Frames | Entries | Notes | Progress | Nothing | Absent | Hints
-) | (Robot | Remark | Tried | Controls | Noted | RobotReply)  # fmt: skip
+) | (Robot | Label | Remark | Tried | Controls | Noted | RobotReply)  # fmt: skip
 
 # --- messages from the page --------------------------------------------------------------------
 
@@ -312,6 +336,14 @@ class AddNote(AboutFrame):
     span: NotRequired[Span | None]
 
 
+class DrawLabel(AboutFrame):
+    """Draw a label of an object, and keep it. Without a box: the one that the object has or seems to have."""
+
+    type: Literal["draw"]
+    box: NotRequired[LabelBox]
+    keep: NotRequired[bool]
+
+
 class RunDrive(TypedDict):
     """Run the drive, or a span of it, with the values."""
 
@@ -345,8 +377,8 @@ ListHeld = TypedDict("ListHeld", {"type": Literal["list"], "id": int})
 Snap = TypedDict("Snap", {"type": Literal["snap"], "id": int})
 Mark = TypedDict("Mark", {"type": Literal["mark"], "id": int, "time": float, "text": str})
 FromPage: TypeAlias = (
-    Ask | Try | Settle | MakeReport | AddNote | RunDrive | Cancel | Handle | Remarks | Shown | FindFix
-) | (RemoveNote | Hold | ListHeld | Snap | Mark)  # fmt: skip
+    Ask | Try | Settle | MakeReport | AddNote | DrawLabel | RunDrive | Cancel | Handle | Remarks | Shown
+) | (FindFix | RemoveNote | Hold | ListHeld | Snap | Mark)  # fmt: skip
 
 AnyToPage: TypeAlias = Annotated[ToPage | AnswerMessage, Field(discriminator="type")]
 FROM_PAGE: TypeAdapter[Any] = TypeAdapter(Annotated[FromPage, Field(discriminator="type")])

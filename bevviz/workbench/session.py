@@ -5,14 +5,17 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.drive import Drive
 from bevviz.errors import UserError
+from bevviz.evaluate import Truth
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.run_table import run_table
+from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.protocols import FrameSource
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.report.report_subject import TriedValues
@@ -20,7 +23,9 @@ from bevviz.support.contexts import Closable
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.identity import Identity, find, identify
+from bevviz.why.kept_labels import box_of, is_label_in, kept_truth, proposed_label
 from bevviz.why.resolve import select_subjects
+from bevviz.why.subject import points_in_box
 from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
@@ -49,6 +54,25 @@ class DriveTools:
     notes: Notes
 
 
+@dataclass(frozen=True, slots=True)
+class DrawnLabel:
+    """A label that the user draws.
+
+    Attributes:
+        label: its class.
+        box: its box in the frame of the points.
+        points: number of raw points in the box.
+        answer: answer about the object that it is drawn for.
+        pick: identity of that object as text.
+    """
+
+    label: str
+    box: Boxes3D
+    points: int
+    answer: Answer
+    pick: str
+
+
 class WorkbenchSession(Closable):
     """Workbench session of a drive or a robot. Several threads may ask, each about results of its own.
 
@@ -65,6 +89,7 @@ class WorkbenchSession(Closable):
         self._tools: DriveTools | None = None
         self._reports: ReportMaker | None = None
         self._local = threading.local()  # The explainer of each thread that asks.
+        self._labels = 0  # number of changes of the labels until now
         self._lock = threading.Lock()  # guards _answers
         self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
 
@@ -101,6 +126,7 @@ class WorkbenchSession(Closable):
         self._reports = reports
         if tools is not None:
             self._tools, self.notes_version = tools, 0
+            self.source.kept_labels = self._kept_labels
 
     def start(self) -> None:
         """Start to make frames."""
@@ -199,9 +225,11 @@ class WorkbenchSession(Closable):
     ) -> tuple[FrameExplainer, list[Answer], list[Answer]]:
         """Return the explainer of the frame, the answers, and those of them that a place selects."""
         result = self.source.look(number, settings)
-        explainer: FrameExplainer | None = getattr(self._local, "explainer", None)
-        if explainer is None or explainer.traces.result is not result:
-            explainer = self._local.explainer = self.source.explainer(result)
+        made_of, explainer = getattr(self._local, "explainer", ((None, 0), None))
+        if explainer is None or made_of[0] is not result or made_of[1] != self._labels:
+            made_of = result, self._labels
+            explainer = self.source.explainer(result)
+            self._local.explainer = made_of, explainer
         candidates = explainer.candidates(selection) if selection.is_place else []
         return explainer, candidates or explainer.ask(selection), candidates
 
@@ -328,10 +356,87 @@ class WorkbenchSession(Closable):
         Raises:
             UserError: the file cannot be written.
         """
-        for note in list(self.tools.notes):
-            if (note.stamp, note.text) == (stamp, text):
-                self.tools.notes.remove(note)
+        notes = [note for note in self.tools.notes if (note.stamp, note.text) == (stamp, text)]
+        for note in notes:
+            self.tools.notes.remove(note)
+        if any(note.label for note in notes):
+            self._forget_answers()
         self._tell_notes()
+
+    # --- labels --------------------------------------------------------------------------------
+
+    def draw_label(
+        self,
+        number: int,
+        identity: Identity,
+        drawn: tuple[str, Boxes3D] | None = None,
+        overlay: PageOverlay | None = None,
+    ) -> DrawnLabel:
+        """Show a label of an object in every view of a page, and return it.
+
+        Args:
+            number: number of the frame.
+            identity: the object.
+            drawn: class and box. None: those that are kept, or that the object seems to have.
+            overlay: overlay of the page.
+
+        Raises:
+            UserError: the object is not in the frame.
+        """
+        selection, reason = self.follow(identity, number)
+        if selection is None:
+            raise UserError(f"{identity.name} is not in frame {number}: {reason}")
+        explainer, answers, _ = self._answers_about(number, (), selection)
+        answer, traces = answers[0], explainer.traces
+        if drawn is None and (note := self._note_of(answer, traces.result.frame)) is not None:
+            drawn = note.label, box_of(note.box)
+        label, box = drawn or proposed_label(answer.subject, traces)
+        subject = replace(answer.subject, name=f"your label: {label}", box=box, xyxy=None)
+        self.source.mark(traces.result, replace(answer, subject=subject), overlay)
+        points = int(points_in_box(box, traces.result.frame.points).sum())
+        about = self.identity(number, (), selection, answer, identity)
+        if answer.subject.kind != "detection":  # An image box finds its label, wherever that is drawn.
+            x, y, z = (round(value, 2) for value in box.center[0].tolist())
+            place = Selection(point=(x, y, z))
+            about = Identity(kind="point", label=f"the place of the {label}", frame=number, place=str(place))
+        return DrawnLabel(label, box, points, answer, str(about))
+
+    def keep_label(self, number: int, drawn: DrawnLabel) -> str:
+        """Keep a label beside the bag, in place of an earlier one of the same object. Return what was done.
+
+        Raises:
+            UserError: the file cannot be written.
+        """
+        frame, notes = self.source.look(number).frame, self.tools.notes
+        if (earlier := self._note_of(drawn.answer, frame)) is not None:
+            notes.remove(earlier)
+        center, size = drawn.box.center[0].tolist(), drawn.box.size[0].tolist()
+        box = tuple(round(value, 3) for value in (*center, *size, float(drawn.box.yaw[0])))
+        text = f"kept as truth: {' x '.join(f'{value:.2f}' for value in size)} m"
+        about = f"{drawn.label} at {float(drawn.box.distance[0]):.1f} m"
+        times = frame.stamp, frame.received
+        notes.add(Note(*times, text, about, drawn.pick, 0, drawn.label, box, frame.points_frame))
+        self._forget_answers()
+        self._tell_notes()
+        return f"Kept in {notes.path}: the {about}. The note in the list removes it."
+
+    def _note_of(self, answer: Answer, frame: Frame) -> Note | None:
+        """Return the note with the label that an answer is about. None: there is no label."""
+        labels = [note for note in self.tools.notes if is_label_in(note, frame)]
+        return labels[answer.label] if 0 <= answer.label < len(labels) else None
+
+    def _kept_labels(self, frame: Frame) -> Truth | None:
+        """Return the labels of a frame that the user keeps. None: there are none, or they cannot be read."""
+        with suppress(UserError):
+            return kept_truth(self.tools.notes, frame, self.source.pipeline.stages.class_names)
+        return None
+
+    def _forget_answers(self) -> None:
+        """Forget the answers that were made with other labels."""
+        self._labels += 1
+        self.source.forget_remarks()
+        with self._lock:
+            self._answers.clear()
 
     def handle(self, finding: HandledFinding) -> None:
         """Keep that a finding is done or ignored.

@@ -3,6 +3,7 @@
 import { connect, isConnected, on, send, want, withPieces } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
+import * as label from "./label.js";
 import { $, addFrames, asked, beforeAfter, element, frameTimes, neighbour, remember, seconds, shownFrame, spanText, state, stated } from "./page_state.js";
 import * as parameters from "./parameters.js";
 import * as playback from "./playback.js";
@@ -84,6 +85,7 @@ const askAgain = () => {
  */
 function clear(className, text, where = "") {
   state.answer = null;
+  label.close();
   $("answer").className = className;
   $("verdict").textContent = text;
   $("where").textContent = where;
@@ -157,7 +159,8 @@ function answer(message) {
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
-  $("steps").replaceChildren();
+  label.close();
+  $("steps").replaceChildren(...(message.labelled || message.pick.includes('"place"') ? labelStep(message.labelled) : []));
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
   freshness();
   list.showAnswer();
@@ -227,10 +230,23 @@ function hints(message) {
   if (!message.remark) return;
   if (!message.hints.length) {
     $("hints").textContent = message.remark;
-    $("steps").replaceChildren(...(askedTried ? [] : list.nextSteps(message.frame, message.row_pick)),
+    const own = $("steps").querySelector(".label");
+    $("steps").replaceChildren(...(own ? [own] : labelStep(false)), ...(askedTried ? [] : list.nextSteps(message.frame, message.row_pick)),
       list.offered("hand it on", "a report of this frame and answer, to be run again elsewhere", () => $("report").click()));
   }
   list.explain({ ...message, pick: message.row_pick }, askedTried);
+}
+
+/**
+ * The button by which the user draws the object's box. A bag with ground truth needs none.
+ * @param {boolean} isKept
+ */
+function labelStep(isKept) {
+  if (state.truth || kind === "live" || askedTried) return [];
+  const button = list.offered(isKept ? "change its label" : "draw its box", isKept ? "the × of its note in the list removes it"
+    : "it is kept as truth beside the bag, and the answer becomes exact", label.open);
+  button.classList.add("label");
+  return [button];
 }
 
 /**
@@ -438,9 +454,18 @@ function legend(classes) {
   }));
 }
 
+/** @type {string | null} */
+let knownLabels = null; // The shown answer may depend on them.
 on({
   welcome, controls: (message) => parameters.offer(message.controls), answer, robot: robotChain, nothing, absent, hints, frames: (message) => { addFrames(message); freshness(); },
-  tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, notes: list.notes, noted: jobs.noted,
+  tried, opening: open, error: failed, progress: jobs.progress, entries: list.update, noted: jobs.noted,
+  notes: (message) => {
+    list.notes(message);
+    const labels = JSON.stringify(message.notes.filter((note) => note.label));
+    if (knownLabels !== null && labels !== knownLabels) askAgain();
+    knownLabels = labels;
+  },
+  label: label.drawn,
   remark: (message) => list.explain(message),
   made: (frame) => { made.add(frame); freshness(); },
   // The viewer frees nothing, and loses its layout where a recording is closed. The address shows the same again.
@@ -612,6 +637,7 @@ list.start({
   unnote: (note) => send({ type: "unnote", stamp: note.stamp, text: note.text }),
 });
 parameters.start(change);
+label.start(askAgain);
 timeline.start(list.choose, markSpan);
 if (kind !== "live") playback.start();
 share.start();

@@ -51,6 +51,7 @@ export interface AnswerMessage {
   pick: string;
   found: string;
   beside: OtherObject[];
+  labelled: boolean;
 }
 
 /** A question about a pick, or about a click in the viewer. */
@@ -94,6 +95,17 @@ export interface Control {
 export interface Controls {
   type: "controls";
   controls: Control[];
+}
+
+/** Draw a label of an object, and keep it. Without a box: the one that the object has or seems to have. */
+export interface DrawLabel {
+  id: number;
+  time: number;
+  set?: string[];
+  pick?: string;
+  type: "draw";
+  box?: LabelBox;
+  keep?: boolean;
 }
 
 export interface Entries {
@@ -211,6 +223,27 @@ export interface Hold {
   time: number;
 }
 
+/** A label is drawn. ``kept`` says where it is kept; empty: it is not. ``pick`` asks about it then. */
+export interface Label {
+  id: number;
+  frame: number;
+  set: string[];
+  type: "label";
+  box: LabelBox;
+  points: number;
+  pick: string;
+  classes: string[];
+  kept: string;
+}
+
+/** Label of an object: its class, and its box in the frame of the points, in metres and degrees. */
+export interface LabelBox {
+  label: string;
+  center: number[];
+  size: number[];
+  yaw: number;
+}
+
 export interface ListHeld {
   type: "list";
   id: number;
@@ -243,6 +276,9 @@ export interface NoteEntry {
   about: string;
   pick: string;
   end: string;
+  label: string;
+  box: number[];
+  points_frame: string;
 }
 
 export interface Noted {
@@ -507,9 +543,9 @@ export interface Welcome {
   meanings: Record<string, string>;
 }
 
-export type ToPage = Welcome | Failed | Error | Opening | Frames | Entries | Notes | Progress | Nothing | Absent | Hints | Robot | Remark | Tried | Controls | Noted | Held | Said | AnswerMessage;
+export type ToPage = Welcome | Failed | Error | Opening | Frames | Entries | Notes | Progress | Nothing | Absent | Hints | Robot | Label | Remark | Tried | Controls | Noted | Held | Said | AnswerMessage;
 
-export type FromPage = Ask | Try | Settle | MakeReport | AddNote | RunDrive | Cancel | Handle | Remarks | Shown | FindFix | RemoveNote | Hold | ListHeld | Snap | Mark;
+export type FromPage = Ask | Try | Settle | MakeReport | AddNote | DrawLabel | RunDrive | Cancel | Handle | Remarks | Shown | FindFix | RemoveNote | Hold | ListHeld | Snap | Mark;
 
 /** Elements of index.html by their ids. */
 export interface Elements {
@@ -565,6 +601,12 @@ export interface Elements {
   "verdict": HTMLElementTagNameMap["p"];
   "where": HTMLElementTagNameMap["p"];
   "of": HTMLElementTagNameMap["p"];
+  "label": HTMLElementTagNameMap["form"];
+  "label-class": HTMLElementTagNameMap["input"];
+  "label-classes": HTMLElementTagNameMap["datalist"];
+  "label-numbers": HTMLElementTagNameMap["p"];
+  "label-cancel": HTMLElementTagNameMap["button"];
+  "label-text": HTMLElementTagNameMap["p"];
   "steps": HTMLElementTagNameMap["div"];
   "hints": HTMLElementTagNameMap["div"];
   "chain": HTMLElementTagNameMap["ol"];
