@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
 import time
+from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import numba
 import pytest
 
-from bevviz.support import progress
+from bevviz.extras.demo.command import SHIPPED
+from bevviz.support import compile_ahead, progress
 from bevviz.support.compile_clock import common_clock, thread_clock
 from bevviz.support.numba_cache import _CompileAnnouncer
 from bevviz.support.numba_kernel import kernel
@@ -37,6 +41,44 @@ three = np.ones((1, 3), np.float32)
 print([rows.tolist() for _, rows in inside_each(three, Boxes3D(three, three, np.zeros(1, np.float32)))])
 print("scipy.linalg" in sys.modules)
 """
+
+COMPILED = """
+import sys
+from numba.core import event
+from bevviz.cli import main
+from bevviz.support import compile_ahead, numba_cache
+with event.install_recorder("numba:compile") as recorder:
+    if len(sys.argv) == 1:
+        compile_ahead.main()
+    else:
+        event.unregister("numba:compile", numba_cache.announcer)
+        main(sys.argv[1:])
+kernels = [record.data["dispatcher"] for _, record in recorder.buffer if record.is_start]
+print(*[f"{each.__module__}:{each.__name__}" for each in kernels if each.__module__.startswith("bevviz.")])
+"""
+
+
+@pytest.mark.long
+def test_processes_compile_each_kernel_once(tmp_path: Path) -> None:
+    """Two processes compile the list at once, and the first frame of the demo needs none of it again."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-c", COMPILED]
+
+    def start(*arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True, env=environment)
+
+    both = [start(), start()]
+    listed = {path for path, _ in compile_ahead.KERNELS}
+    compiled = [path for process in both for path in process.communicate()[0].split()]
+    assert listed <= {*compiled}
+    assert {path: n for path, n in Counter(compiled).items() if n > 1} == {
+        "bevviz.stages.clustering:_root": 2,  # two types of arguments
+        "bevviz.stages.voxel:spread_to_points": 2,
+    }
+    settings = ("--model", "demo", "--preset", "reference", "--frames", "5:6")
+    run = start("bag", str(SHIPPED), *settings, "--save", str(tmp_path / "frame.rrd"))
+    again = [path for path in run.communicate()[0].split() if path in compiled]
+    assert again == ["bevviz.stages.voxel:spread_to_points"]  # rings of 16 bits
 
 
 @pytest.mark.long
@@ -97,8 +139,9 @@ def test_compiling_in_another_thread_is_not_counted() -> None:
     assert thread_clock() - start >= wall > common_clock() - common
 
 
-def test_compiling_is_announced_once() -> None:
-    said: list[str] = []
+def test_compiling_is_announced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    said, started = list[str](), list[list[str]]()
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: started.append(command))
     progress.set_receiver(said.append)
     try:
         listener = _CompileAnnouncer()
@@ -108,3 +151,5 @@ def test_compiling_is_announced_once() -> None:
         progress.set_receiver(lambda text: None)
     (line,) = said
     assert line.startswith("compiling the stages for this machine")
+    ((*_, module),) = started
+    assert module == compile_ahead.__name__

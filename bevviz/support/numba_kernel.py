@@ -31,6 +31,10 @@ class _Kernel:
         """Type by which numba knows this function in another kernel."""
         return (self._dispatcher or self._compiled())._numba_type_
 
+    def compile(self, arguments: tuple[object, ...]) -> None:
+        """Compile the function for arguments of these types of numba."""
+        (self._dispatcher or self._compiled()).compile(arguments)
+
     def _compiled(self) -> Any:
         """Return numba's dispatcher of the function."""
         with self._lock:
