@@ -159,6 +159,17 @@ def test_objects_missed_against_the_truth_are_listed(result: FrameResult) -> Non
             assert any(near)
 
 
+def test_an_overview_leaves_the_cause_of_a_miss_to_later(result: FrameResult) -> None:
+    """It lists the same findings at the same places. A question afterwards gets the whole answer."""
+    explainer = FrameExplainer(result)
+    early, whole = find_findings(explainer, restore=False), find_findings(explainer)
+    assert [find.reason for find in whole] == [find.reason for find in find_findings(FrameExplainer(result))]
+    assert any(find.what == "missed" for find in early)
+    for one, other in zip(early, whole, strict=True):
+        assert (one.selection, one.position, one.in_way) == (other.selection, other.position, other.in_way)
+        assert one.reason == ("" if one.what == "missed" else other.reason)
+
+
 def test_without_truth_unexplained_objects_are_listed(result: FrameResult) -> None:
     few = changed_config(
         result.config, ["detector.conf_threshold=0.6"]

@@ -161,6 +161,16 @@ def test_a_hint_has_the_promised_effect(talk: Talk, hinted: Hinted) -> None:
     assert tried["f1"]["after"] > tried["f1"]["before"]
 
 
+def test_a_remark_tells_the_reason_of_its_row(talk: Talk) -> None:
+    """The rows of an overview have none before."""
+    sight = talk.of("missed")[0]["sights"][0]
+    frame, pick = sight["frame"], sight["pick"]
+    talk.say(type="remarks", rows=[{"frame": frame, "pick": pick}])
+    remark = talk.until("remark", lambda one: (one["frame"], one["pick"]) == (frame, pick))
+    answer = talk.asked("answer", type="ask", time=int(sight["stamp"]), set=[], pick=pick)
+    assert remark["text"] == answer["reason"] == sight["text"]
+
+
 def test_without_a_hint_a_sentence_names_the_tried_changes(hinted: Hinted) -> None:
     sentences = []
     for _, _, message in hinted:

@@ -87,9 +87,14 @@ class Finding:
         return self.number.rpartition(", ")[0] if self.what == "anomaly" else ""
 
 
-def find_findings(explainer: FrameExplainer) -> list[Finding]:
-    """Return the findings of a frame with their reasons, see ``findings_of``."""
-    return [_explained(finding, explainer) for finding in findings_of(explainer.traces)]
+def find_findings(explainer: FrameExplainer, *, restore: bool = True) -> list[Finding]:
+    """Return the findings of a frame with their reasons, see ``findings_of``.
+
+    Args:
+        explainer: explainer of the frame.
+        restore: whether missed objects of the ground truth get a reason. It takes several runs of the stages.
+    """
+    return [_explained(finding, explainer, restore=restore) for finding in findings_of(explainer.traces)]
 
 
 def findings_of(traces: FrameIndex) -> list[Finding]:
@@ -132,11 +137,13 @@ def finding_of(frame: Frame, what: str, answer: Answer) -> Finding:
     return _with_answer(frame, finding, answer)
 
 
-def _explained(finding: Finding, explainer: FrameExplainer) -> Finding:
+def _explained(finding: Finding, explainer: FrameExplainer, *, restore: bool) -> Finding:
     """Add the answer about its subject to a finding."""
     if finding.selection is None:
         return finding
-    return _with_answer(explainer.traces.result.frame, finding, explainer.about(finding.selection))
+    answer = explainer.about(finding.selection, restore=restore)
+    explained = _with_answer(explainer.traces.result.frame, finding, answer)
+    return explained if restore or finding.what != "missed" else replace(explained, reason="", text="")
 
 
 def _with_answer(frame: Frame, finding: Finding, answer: Answer) -> Finding:

@@ -377,7 +377,7 @@ class PageConnection:
         try:
             remark = row_remark(self._source.remark(row["frame"], row["pick"]))
         except UserError:  # The list has changed meanwhile.
-            remark = {"remark": "", "chip": ""}
+            remark = {"remark": "", "chip": "", "text": ""}
         time.sleep(min(time.monotonic() - start, 1.0))
         return remark
 

@@ -52,13 +52,14 @@ def answer_tree(answer: Answer) -> dict[str, Any]:
 
 
 def row_remark(answer: Answer) -> RowRemark:
-    """Return the sentence about the hints of an answer with hints, and the same in two words for a row."""
+    """Return the remark on a row: its sentence about hints, the same in two words, and the reason."""
     chips: dict[Chip, object] = {
         "hint": answer.hints,
         "cannot tell": answer.likely,
         "tried in vain": answer.tried,
     }
-    return {"remark": answer.remark, "chip": next((chip for chip, known in chips.items() if known), "")}
+    chip: Chip = next((chip for chip, known in chips.items() if known), "")
+    return {"remark": answer.remark, "chip": chip, "text": answer.verdict.kind.value}
 
 
 def note_entry(note: Note) -> NoteEntry:

@@ -186,9 +186,13 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self._overview, self._done = None, 0
 
     def observe_single(self, result: FrameResult) -> None:
-        """List the findings of a frame of the overview. Then wait while a question is being answered."""
+        """List the findings of a frame of the overview. Then wait while a question is being answered.
+
+        Missed objects get no reason yet: it would take several times as long as the frame itself. The remark
+        on a row has it, and the run in order.
+        """
         frame = result.frame
-        self.findings.add_overview(frame.index, find_findings(self.explainer(result)))
+        self.findings.add_overview(frame.index, find_findings(self.explainer(result), restore=False))
         self._picture(frame)
         self._done += 1
         self.news.tell()

@@ -80,13 +80,13 @@ export function notes(message) {
 }
 
 /**
- * Show in the row of an object whether a change helps.
+ * Show in the row of an object its reason, and whether a change helps.
  * @param {Omit<Remark, "type">} row
  */
-export function explain({ frame, pick, remark, chip }, tried = false) {
+export function explain({ frame, pick, remark, chip, text }, tried = false) {
   for (const { sights } of entries.values()) {
     const one = sights.find((other) => other.frame === frame && other.pick === pick && other.tried === tried);
-    if (one) Object.assign(one, { remark: remark || " ", chip });
+    if (one) Object.assign(one, { remark: remark || " ", chip, text: text || one.text });
   }
   draw();
 }

@@ -212,6 +212,7 @@ export interface Hints {
   set: string[];
   remark: string;
   chip: "" | "hint" | "cannot tell" | "tried in vain";
+  text: string;
   type: "hints";
   row_pick: string;
   hints: HintResult[];
@@ -350,6 +351,7 @@ export interface Remark {
   pick: string;
   remark: string;
   chip: "" | "hint" | "cannot tell" | "tried in vain";
+  text: string;
   type: "remark";
 }
 
