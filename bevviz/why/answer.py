@@ -76,6 +76,14 @@ class Answer:
         return (stages_of(self.hints[0].settings),)
 
     @property
+    def lost_in(self) -> tuple[str, ...]:
+        """Stages that may have lost it: that of the reason, then those whose ideal result brings it back."""
+        if self.verdict.reported:
+            return ()
+        alone = (stages[0] for stages in self.restored_by if len(stages) == 1)
+        return tuple(dict.fromkeys([stage_of(self.verdict.kind, self.evidence), *alone]))
+
+    @property
     def text(self) -> str:
         """The sentence."""
         return self.verdict.text

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from bevviz.config import Config, parameters, plugin_of, preset_differences, values
+from bevviz.config.value_types import CLUSTERING, GROUND
 from bevviz.errors import UserError
 from bevviz.model.reasons import Reason, ReasonKind, facts_of
 from bevviz.model.results import DetectionState, FrameResult
@@ -107,6 +108,19 @@ def stage_changes(stage: str, config: Config, factors: Sequence[float] = STEPS) 
         if any(present[key] != value for key, value in change.items()):
             yield change
     yield from stepped_numbers(stage, config, factors)
+
+
+def other_methods(stages: Iterable[str], config: Config) -> tuple[str, ...]:
+    """Return the other built-in methods of some stages, as settings ``key=value``."""
+    fusion = parameters()["fusion.method"].choices
+    built_in = {"ground": GROUND.ours, "clustering": CLUSTERING.ours, "fusion": fusion}
+    present = values(config)
+    return tuple(
+        f"{stage}.method={method}"
+        for stage in dict.fromkeys(stages)
+        for method in built_in.get(stage, ())
+        if method != present[f"{stage}.method"]
+    )
 
 
 def stepped_numbers(stage: str, config: Config, factors: Sequence[float]) -> Iterator[Change]:

@@ -228,6 +228,7 @@ class PageConnection:
 
     async def _ask(self, message: types.Ask) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer question came."""
+        from bevviz.why.changes import other_methods
         from bevviz.workbench.page_messages import answer_tree, other_answers, row_remark
 
         number = self._asked = message["id"]
@@ -276,9 +277,9 @@ class PageConnection:
             )
             if hints is not None:
                 row, changes = str(answer.selection or selection), answer_tree(hints)["hints"]
-                await self._send(
-                    {"type": "hints", **head, "row_pick": row, "hints": changes, **row_remark(hints)}
-                )
+                methods = other_methods(hints.lost_in, result.config)
+                remark = {"methods": methods, **row_remark(hints)}
+                await self._send({"type": "hints", **head, "row_pick": row, "hints": changes, **remark})
 
         async def follow_robot() -> None:
             robot = await asyncio.to_thread(self._followed, number, result, answer)

@@ -233,11 +233,12 @@ class Absent(Reply):
 
 
 class Hints(Reply, RowRemark):
-    """Hints of an answer."""
+    """Hints of an answer. ``methods`` are settings of other methods of the stages that may have lost it."""
 
     type: Literal["hints"]
     row_pick: str
     hints: list[HintResult]
+    methods: Sequence[str]
 
 
 class Remark(Row, RowRemark):

@@ -231,10 +231,16 @@ function hints(message) {
   if (!message.hints.length) {
     $("hints").textContent = message.remark;
     const own = $("steps").querySelector(".label");
-    $("steps").replaceChildren(...(own ? [own] : labelStep(false)), ...(askedTried ? [] : list.nextSteps(message.frame, message.row_pick)),
+    $("steps").replaceChildren(...(own ? [own] : labelStep(false)), ...message.methods.map(otherMethod),
+      ...(askedTried ? [] : list.nextSteps(message.frame, message.row_pick)),
       list.offered("hand it on", "a report of this frame and answer, to be run again elsewhere", () => $("report").click()));
   }
   list.explain({ ...message, pick: message.row_pick }, askedTried);
+}
+
+/** @param {string} setting names another method of the stage that may have lost the object */
+function otherMethod(setting) {
+  return list.offered(`try another stage: ${setting}`, "runs this frame with it, and says what is fixed and broken", () => change([setting]));
 }
 
 /**

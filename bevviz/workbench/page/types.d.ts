@@ -205,7 +205,7 @@ export interface HintResult {
   beside: number | null;
 }
 
-/** Hints of an answer. */
+/** Hints of an answer. ``methods`` are settings of other methods of the stages that may have lost it. */
 export interface Hints {
   id: number;
   frame: number;
@@ -216,6 +216,7 @@ export interface Hints {
   type: "hints";
   row_pick: string;
   hints: HintResult[];
+  methods: string[];
 }
 
 export interface Hold {
