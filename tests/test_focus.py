@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import bevviz
 from bevviz.model.frame import F32
 from bevviz.recording.focus import ABOVE, FROM_ABOVE, IMAGE_WIDTH, SPACE, Focus
 from bevviz.why import Selection
+from bevviz.why.log import cameras_of
 from bevviz.workbench.page_overlay import PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support.recordings import Recording
@@ -62,6 +64,22 @@ def test_a_click_is_where_the_view_has_gone(source: RecordedDrive, overlay: Page
     assert np.linalg.norm(behind[:2]) > np.linalg.norm(place[:2])
     ahead = source.position(overlay, stamp, FROM_ABOVE, (10, 0, 0))
     assert ahead == pytest.approx((place[0] + 10, place[1], place[2]), abs=1e-3)
+
+
+def test_the_camera_that_shows_most_of_it_comes_first(source: RecordedDrive) -> None:
+    result = source.look(FRAME)
+    answer = source.explainer(result).about(Selection(object=0))
+    (camera,) = result.frame.cameras
+    assert camera.camera_from_points is not None
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.camera_from_points
+    nearer = camera.camera_from_points.copy()
+    nearer[2, 3] -= 2.0
+    cameras = (
+        replace(camera, name="behind", camera_from_points=turned),
+        camera,
+        replace(camera, name="nearer", camera_from_points=nearer),
+    )
+    assert cameras_of(replace(result.frame, cameras=cameras), answer) == ["nearer", camera.name]
 
 
 def test_each_answer_has_poses_of_its_own_time(

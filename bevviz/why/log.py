@@ -227,6 +227,16 @@ def _image_layers(camera: Camera, answers: Sequence[Answer]) -> Iterator[Layer]:
         yield from name_layers(path, under(boxes[:1]), name, name, order, _SUBJECT, camera.name)
 
 
+def cameras_of(frame: Frame, answer: Answer) -> list[str]:
+    """Return the names of the cameras that show an answer's subject, the one with the largest box first."""
+    areas = {
+        camera.name: float(np.prod(box[2:] - box[:2]))
+        for camera in frame.cameras
+        if camera.image is not None and (box := _image_box(camera, answer)) is not None
+    }
+    return sorted(areas, key=lambda name: -areas[name])
+
+
 def _image_box(camera: Camera, answer: Answer) -> F32 | None:
     """Return the (4,) box of an answer's subject in a camera's image. None: it is not there."""
     subject = answer.subject

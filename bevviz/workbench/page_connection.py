@@ -229,6 +229,7 @@ class PageConnection:
     async def _ask(self, message: types.Ask) -> None:
         """Answer a question and mark the object. Then send hints, unless a newer question came."""
         from bevviz.why.changes import other_methods
+        from bevviz.why.log import cameras_of
         from bevviz.workbench.page_messages import answer_tree, other_answers, row_remark
 
         number = self._asked = message["id"]
@@ -259,9 +260,10 @@ class PageConnection:
             answer, *others = workbench.ask(frame, settings, selection)
             pick = str(workbench.identity(frame, settings, selection, answer, identity))
             followed = {"pick": pick, "found": found, "labelled": answer.label >= 0}
-            beside = {"beside": list(other_answers(others))}
-            tree = {"type": "answer", **head, **answer_tree(answer), **followed, **beside}
-            return selection, self._source.look(frame, settings), answer, tree
+            result = self._source.look(frame, settings)
+            more = {"beside": [*other_answers(others)], "cameras": cameras_of(result.frame, answer)}
+            tree = {"type": "answer", **head, **answer_tree(answer), **followed, **more}
+            return selection, result, answer, tree
 
         answered = await self._in_turn(number, work, settings)
         if isinstance(answered, dict):

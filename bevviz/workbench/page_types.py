@@ -205,7 +205,7 @@ class Reply(TypedDict):
 @json_form
 @dataclass(frozen=True)
 class AnswerMessage(AnswerResult):
-    """An answer."""
+    """An answer. ``cameras`` show its subject, the one with the largest part of it first."""
 
     type: Literal["answer"]
     id: int
@@ -215,6 +215,7 @@ class AnswerMessage(AnswerResult):
     found: str
     beside: Sequence[OtherObject]
     labelled: bool
+    cameras: Sequence[str]
 
 
 class Nothing(Reply):

@@ -28,6 +28,7 @@ Kind = Literal["page", "live"]  # page of a drive, page of a running robot
 
 PAGE = Path(__file__).parent / "page"
 FILES = frozenset(path.name for path in PAGE.iterdir() if path.suffix in (".js", ".css"))
+WIDGET = "\nvar ViewerWidget = class"  # in the script of Rerun 0.41
 VIEWER = ("widget.js", "widget.css", "re_viewer_bg.wasm")
 KINDS = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm"}
 POLICY = (
@@ -99,10 +100,12 @@ class Site:
         return _file(PAGE, FILES, name, "no-cache")
 
     async def viewer(self, request: Request) -> Response:
-        """Return a file of Rerun's web viewer."""
-        return _file(
-            self._viewer, VIEWER, request.path_params["name"], "private, max-age=31536000, immutable"
-        )
+        """Return a file of Rerun's web viewer. The script also exports its widget, which holds the viewer."""
+        name, cache = request.path_params["name"], "private, max-age=31536000, immutable"
+        if name == "widget.js" and WIDGET in (text := (self._viewer / name).read_text()):
+            text += "export { ViewerWidget };\n"
+            return Response(text, media_type=KINDS[".js"], headers={"Cache-Control": cache})
+        return _file(self._viewer, VIEWER, name, cache)
 
     async def config(self, request: Request) -> Response:
         """Return the configuration with the tried settings as a YAML file."""

@@ -4,6 +4,7 @@ import { connect, isConnected, on, send, want, withPieces } from "./connection.j
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
 import * as label from "./label.js";
+import * as layout from "./layout.js";
 import { $, addFrames, asked, beforeAfter, element, frameTimes, neighbour, remember, seconds, shownFrame, spanText, state, stated } from "./page_state.js";
 import * as parameters from "./parameters.js";
 import * as playback from "./playback.js";
@@ -159,6 +160,7 @@ function answer(message) {
     return element("li", "", "", button);
   }));
   $("beside-title").hidden = !message.beside.length;
+  layout.show(message.cameras);
   label.close();
   $("steps").replaceChildren(...(message.labelled || message.pick.includes('"place"') ? labelStep(message.labelled) : []));
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";

@@ -32,6 +32,35 @@ export function keepCompiled(url) {
   WebAssembly.compileStreaming = () => module;
 }
 
+// --- layout -------------------------------------------------------------------------------------
+
+/**
+ * @template M
+ * @typedef {{ model: M, el: HTMLElement }} Parts
+ */
+/** @typedef {Record<string, Record<string, any>>} Blueprint archetypes by entity path */
+/** @typedef {{ blueprint: Blueprint, recording: string }} ReadBlueprint */
+/** @typedef {{ get_blueprint: () => Promise<ReadBlueprint>, set_blueprint: (blueprint: Blueprint, target: object) => Promise<unknown> }} Viewer */
+/** @type {Viewer | null} */
+export let viewer = null; // whose layout can be read and set, in a form that Rerun calls experimental
+
+/**
+ * Render the widget. Its own function does the same, but keeps the viewer to itself.
+ * @template M
+ * @param {{ default: { render: (parts: Parts<M>) => void }, ViewerWidget?: new (model: M, el: HTMLElement) => { viewer: Viewer } }} script
+ * @param {Parts<M>} parts
+ */
+export function render({ default: widget, ViewerWidget }, parts) {
+  if (!isPatched || !ViewerWidget) {
+    widget.render(parts);
+    return;
+  }
+  const container = document.createElement("div");
+  parts.el.classList.add("rerun_notebook");
+  parts.el.append(container);
+  viewer = new ViewerWidget(parts.model, container).viewer;
+}
+
 // --- drawing ------------------------------------------------------------------------------------
 
 // The viewer redraws a 3D view or an image all the time, although nothing changes. Without a graphics card that takes

@@ -21,7 +21,7 @@ export interface AddNote {
   span?: Span | null;
 }
 
-/** An answer. */
+/** An answer. ``cameras`` show its subject, the one with the largest part of it first. */
 export interface AnswerMessage {
   kind: string;
   name: string;
@@ -52,6 +52,7 @@ export interface AnswerMessage {
   found: string;
   beside: OtherObject[];
   labelled: boolean;
+  cameras: string[];
 }
 
 /** A question about a pick, or about a click in the viewer. */

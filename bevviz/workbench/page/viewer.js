@@ -1,21 +1,22 @@
 // Rerun's viewer, as its notebook widget. The widget wraps the viewer of its version; this page acts as the notebook.
 
 import { $, asked, element, shownFrame, state } from "./page_state.js";
-import { keepCompiled, nextPicture, wake } from "./rerun_patches.js";
+import { keepCompiled, nextPicture, render, wake } from "./rerun_patches.js";
 
 /** @typedef {{ entity: string, instance: number | null, position: number[] | null, view: string }} Click */
 /** @typedef {{ type: "rrd" } | { type: "time_ctrl", timeline: string, timestamp_nanos: string | null, play: boolean }} Command */
 /** @typedef {(message: Command, buffers?: DataView[]) => void} Listener */
 /** @typedef {{ get: (name: string) => unknown, on: (name: string, listener: Listener) => void, send: (message: string) => void }} Model */
-/** @typedef {{ render: (parts: { model: Model, el: HTMLElement }) => void }} Widget */
+/** @typedef {import("./rerun_patches.js").Parts<Model>} Parts */
+/** @typedef {{ render: (parts: Parts) => void }} Widget */
 /** @typedef {{ type: string, timeline?: string, time?: number, items: Record<string, any>[] }} ViewerEvent */
 
 const version = $("viewer").dataset.version;
 export const kind = $("viewer").dataset.kind; // page (of a drive) or live (of a robot)
 const hasGraphics = Boolean(document.createElement("canvas").getContext("webgl2"));
 if (hasGraphics) keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
-/** @type {Widget} */
-const widget = hasGraphics ? (await import(`/viewer/${version}/widget.js`)).default : cameraOnly();
+/** @type {{ default: Widget }} */
+const script = hasGraphics ? await import(`/viewer/${version}/widget.js`) : { default: cameraOnly() };
 
 // Results of the run and results with other values are on two timelines of the same recording.
 const OPENED = "stamp";
@@ -36,7 +37,7 @@ const settings = {
 const callbacks = { settled: () => {}, clicked: () => {}, shown: () => {}, sought: () => {}, moved: () => {} }; // for its events
 /** @type {Promise<void>} */
 export const viewerReady = new Promise((ready) => {
-  widget.render({
+  render(script, {
     model: {
       get: (name) => settings[name],
       on: (name, listener) => { listeners[name] = listener; },
