@@ -21,7 +21,8 @@ from bevviz.config.sections import Quantity
 from bevviz.live.encoder import is_cloud, sample_rows, thin_cloud
 from bevviz.model.frame import F32, Scene
 from bevviz.recording import blueprints
-from bevviz.recording.cloud import ColoredPoints, quantity_annotations, quantity_ids
+from bevviz.recording.cloud import COMPONENTS, quantity_annotations, quantity_ids
+from bevviz.recording.components import Components
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 XYZ: F32 = np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
@@ -82,13 +83,18 @@ def test_thinned_points_keep_their_colours() -> None:
         "ring": np.arange(256, 356, dtype=np.uint16),
         "time": np.array([3], np.uint8),
     }
-    cloud = ColoredPoints(rr.Points3D(points), ids)
+    cloud = Components(rr.Points3D, {"positions": points}, ids, COMPONENTS)
     assert is_cloud(cloud, 10)
     thinned = {b.component_descriptor().component: b.as_arrow_array() for b in thin_cloud(cloud, 10, 1)}
     rows = sample_rows(100, 10, 1)
     assert thinned["ColorBy:ring"].to_pylist() == (rows + 256).tolist()
     assert thinned["ColorBy:time"].to_pylist() == [3]
     assert thinned["Points3D:positions"].to_pylist() == points[rows].tolist()
+
+
+def test_a_name_with_half_a_character_is_logged() -> None:
+    page = Components(rr.TextDocument, {"text": ["car \ud800"]}, {"says": ["\udcff", "car"]})
+    assert [b.as_arrow_array().to_pylist() for b in page.as_component_batches()] == [["car ?"], ["?", "car"]]
 
 
 def columns(path: Path, entity: str) -> dict[str, int]:

@@ -24,7 +24,7 @@ from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
 from bevviz.recording.addresses import RowCache
-from bevviz.recording.cloud import ColoredPoints
+from bevviz.recording.components import Components, described
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.support.contexts import Closable
 
@@ -265,7 +265,8 @@ def sample_rows(count: int, points: int, seed: int) -> I64:
 
 def is_cloud(logged: rr.AsComponents, points: int) -> bool:
     """Return whether an archetype is a cloud with more than ``points`` points."""
-    return isinstance(logged, rr.Points3D | rr.Points2D | ColoredPoints) and _count(logged) > points
+    kind = logged.archetype if isinstance(logged, Components) else type(logged)
+    return kind in (rr.Points3D, rr.Points2D) and _count(logged) > points
 
 
 def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.DescribedComponentBatch]:
@@ -275,20 +276,10 @@ def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.Descri
     thinned = []
     for batch in cloud.as_component_batches():
         values = batch.as_arrow_array()
-        kept = _Values(values.take(rows) if len(values) == count else values)
-        thinned.append(rr.DescribedComponentBatch(kept, batch.component_descriptor()))
+        kept = values.take(rows) if len(values) == count else values
+        thinned.append(described(kept, batch.component_descriptor()))
     return thinned
 
 
 def _count(cloud: rr.AsComponents) -> int:
     return max((len(batch.as_arrow_array()) for batch in cloud.as_component_batches()), default=0)
-
-
-class _Values:
-    """Arrow array in the form of a Rerun component."""
-
-    def __init__(self, values: pa.Array) -> None:
-        self._values = values
-
-    def as_arrow_array(self) -> pa.Array:
-        return self._values

@@ -16,6 +16,7 @@ from bevviz.model.frame import F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks
 from bevviz.recording import entities
 from bevviz.recording.addresses import Rows
+from bevviz.recording.components import Components
 from bevviz.recording.entities import TRACK_COLORS, ClassId
 from bevviz.recording.labels import choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, callouts, draw
@@ -175,7 +176,7 @@ def log_speeds(to: Writer, tracks: Tracks, rows: Mapping[int, int]) -> None:
     )
     speeds = np.full(TRACK_LANES, np.nan)
     speeds[list(rows)] = tracks.speed[list(rows.values())]
-    to.write(entities.TRACK_SPEEDS, rr.Scalars(speeds))
+    to.write(entities.TRACK_SPEEDS, Components(rr.Scalars, {"scalars": speeds}))
 
 
 class TrackLanes:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from bevviz.model.results import Clusters, ClusterState, FrameResult, Tracks
 from bevviz.recording import entities, retention
 from bevviz.recording.addresses import Rows
 from bevviz.recording.boxes import track_class_ids, track_ids_of_clusters
+from bevviz.recording.components import Components
 from bevviz.recording.entities import ClassId
 from bevviz.recording.layers import Layer, Style, draw
 from bevviz.recording.primitives import point_classes, rounded, transform
@@ -44,13 +44,14 @@ def log_cloud(to: Writer, result: FrameResult, quantities: Sequence[Quantity]) -
     frame = result.frame
     log_cloud_poses(to, frame)
     heights = height_ids(result) if "height" in quantities else np.zeros(len(frame.points), np.uint8)
-    fields = {entities.POINTS.path(cloud.name): cloud.fields for cloud in frame.clouds}
+    cloud_fields = {entities.POINTS.path(cloud.name): cloud.fields for cloud in frame.clouds}
     start = 0
     for path, points, class_ids in raw_clouds(result):
         end = start + len(points)
-        cloud_fields = fields[path] if len(frame.clouds) > 1 else frame.fields
-        ids_by_quantity = quantity_ids(quantities, points, heights[start:end], cloud_fields)
-        to.put(path, ColoredPoints(rr.Points3D(points, class_ids=class_ids), ids_by_quantity))
+        further = cloud_fields[path] if len(frame.clouds) > 1 else frame.fields
+        ids_by_quantity = quantity_ids(quantities, points, heights[start:end], further)
+        fields = {"positions": points, "class_ids": class_ids}
+        to.put(path, Components(rr.Points3D, fields, ids_by_quantity, COMPONENTS))
         to.note_rows(path, Rows("point", range(start, end)))
         start = end
 
@@ -101,7 +102,7 @@ def log_obstacles(to: Writer, frame: Frame, obstacles: F32) -> None:
 
 
 def _log_class(to: Writer, path: str, points: F32, class_id: ClassId) -> None:
-    draw(to, Layer(path, points, Style(width=1.5), class_ids=class_id))
+    draw(to, Layer(path, points, Style(width=1.5), class_ids=[class_id]))
 
 
 def round_voxels(points: F32, voxel_size: float) -> F32:
@@ -144,21 +145,6 @@ HEIGHT_RANGE = 4.0  # metres above the ground, end of the colour scale
 _ABSENT = 3  # class id of a missing field
 _HEIGHT, _DISTANCE, _INTENSITY, _TIME, _RING = 16, 80, 144, 176, 256  # first class id of each scale
 _STEPS, _DEPTHS, _SHARES, _RINGS = 64, entities.DEPTH_BINS, 32, 256  # ids of each scale, powers of two
-
-
-class ColoredPoints(rr.AsComponents):
-    """Points with class ids by further quantities."""
-
-    def __init__(self, points: rr.Points3D, ids_by_quantity: Mapping[Quantity, ClassIds]) -> None:
-        self._points, self._ids_by_quantity = points, ids_by_quantity
-
-    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
-        """Return the components of the points and of the further class ids."""
-        batches = self._points.as_component_batches()
-        if self._ids_by_quantity:
-            columns: dict[str, Any] = {name: pa.array(ids) for name, ids in self._ids_by_quantity.items()}
-            batches += rr.DynamicArchetype(COMPONENTS, components=columns).as_component_batches()
-        return batches
 
 
 @np.errstate(over="ignore", invalid="ignore")  # fields may hold any value

@@ -14,6 +14,7 @@ from bevviz.model.counts import OPINIONS, count_results
 from bevviz.model.frame import Frame
 from bevviz.model.results import Anomaly, FrameResult
 from bevviz.recording import entities
+from bevviz.recording.components import Components
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import SERIES_COLORS, Color
 
@@ -118,4 +119,5 @@ def log_anomalies(to: Writer, result: FrameResult, started: Sequence[Anomaly]) -
     )
     to.static_once(entities.ANOMALY_COUNTS, lambda: rr.SeriesLines(names=list(KINDS)))
     count = Counter(anomaly.kind for anomaly in result.anomalies)
-    to.write(entities.ANOMALY_COUNTS, rr.Scalars([float(count[kind]) for kind in KINDS]))
+    counts = [float(count[kind]) for kind in KINDS]
+    to.write(entities.ANOMALY_COUNTS, Components(rr.Scalars, {"scalars": counts}))

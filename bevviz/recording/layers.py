@@ -19,6 +19,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.recording import entities
 from bevviz.recording.addresses import Rows
+from bevviz.recording.components import Components
 from bevviz.recording.primitives import CORNER, strips
 from bevviz.recording.projection import edges
 from bevviz.recording.writer import Writer
@@ -111,9 +112,9 @@ def draw(to: Writer, *layers: Layer, put: Callable[..., None] | None = None) -> 
 def _draw(to: Writer, layer: Layer, put: Callable[..., None]) -> None:
     if layer.says is not None and len(layer.items) == 1 and not isinstance(layer.items, Boxes3D):
         layer = _doubled(layer)
-    archetype, shapes = _shapes(layer.items)
+    archetype, fields = _shapes(layer.items)
     columns = {"labels": layer.labels, "colors": layer.colors, "class_ids": layer.class_ids}
-    fields = {name: column for name, column in columns.items() if column is not None}
+    fields |= {name: column for name, column in columns.items() if column is not None}
     if layer.widths is not None:
         fields["radii"] = rr.Radius.ui_points(layer.widths)
     values = dict(layer.values) if layer.says is None else {"says": layer.says, **layer.values}
@@ -125,7 +126,7 @@ def _draw(to: Writer, layer: Layer, put: Callable[..., None]) -> None:
         put(layer.path, layer.frame)
     if layer.rows is not None:
         to.note_rows(layer.path, layer.rows)
-    put(layer.path, archetype(**shapes, **fields), *([rr.AnyValues(**values)] if values else []))
+    put(layer.path, Components(archetype, fields, values))
 
 
 def _shapes(items: Items) -> tuple[Any, dict[str, Any]]:
@@ -133,10 +134,12 @@ def _shapes(items: Items) -> tuple[Any, dict[str, Any]]:
     if isinstance(items, Boxes3D):
         quaternions = np.zeros((len(items), 4), np.float32)
         quaternions[:, 2], quaternions[:, 3] = np.sin(items.yaw / 2), np.cos(items.yaw / 2)
-        return rr.Boxes3D, {"centers": items.center, "sizes": items.size, "quaternions": quaternions}
+        return rr.Boxes3D, {"half_sizes": items.size / 2, "centers": items.center, "quaternions": quaternions}
     if isinstance(items, np.ndarray) and items.ndim == 2:
         if items.shape[1] == 4:
-            return rr.Boxes2D, {"array": items + CORNER, "array_format": rr.Box2DFormat.XYXY}
+            corners = items + CORNER
+            centers = (corners[:, :2] + corners[:, 2:]) / 2
+            return rr.Boxes2D, {"half_sizes": corners[:, 2:] - centers, "centers": centers}
         return (rr.Points2D if items.shape[1] == 2 else rr.Points3D), {"positions": items}
     points = items.reshape(-1, items.shape[2]) if isinstance(items, np.ndarray) else np.concatenate(items)
     lines = strips(points.astype(np.float32, copy=False), np.array([len(line) for line in items]))

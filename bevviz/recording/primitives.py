@@ -15,6 +15,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Image
 from bevviz.model.results import ClusterState, DetectionState, Explanation
 from bevviz.recording import entities
+from bevviz.recording.components import Components
 from bevviz.recording.entities import ClassId
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import CONTEXT, FAINT, GROUND, UNNAMED, turbo
@@ -23,12 +24,10 @@ from bevviz.support.numba_kernel import kernel
 CORNER = 0.5  # pixels: Rerun counts from the corner of the first pixel, bevviz from its centre
 
 
-def transform(world_from_entity: F64) -> rr.Transform3D:
+def transform(world_from_entity: F64) -> Components:
     """Convert a (4, 4) pose to a Rerun transform."""
-    return rr.Transform3D(
-        translation=world_from_entity[:3, 3],
-        quaternion=rr.Quaternion(xyzw=geometry.quaternion(world_from_entity)),
-    )
+    translation, quaternion = world_from_entity[:3, 3], geometry.quaternion(world_from_entity)
+    return Components(rr.Transform3D, {"translation": translation, "quaternion": quaternion})
 
 
 def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
@@ -70,9 +69,9 @@ def texts_by_row(
     }
 
 
-def document(text: str) -> rr.TextDocument:
+def document(text: str) -> Components:
     """Return a Markdown page."""
-    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    return Components(rr.TextDocument, {"text": [text], "media_type": ["text/markdown"]})
 
 
 def encode_image(image: Image, quality: int) -> rr.EncodedImage:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bevviz.config import Config, LoggingConfig
 from bevviz.model.frame import F32, I64, Frame
 from bevviz.recording import entities
+from bevviz.recording.components import Components
 from bevviz.recording.writer import Writer
 
 CLUSTER_STEPS = 4  # rounding steps per voxel for points of clusters, if not everything is kept
@@ -201,7 +202,8 @@ class RawCloudLog:
         for frame_clouds in selected:
             to.set_time(*frame_clouds.clock)
             for path, points, class_ids in frame_clouds.clouds:
-                to.write(path, rr.Points3D(points, class_ids=class_ids))
+                fields = {"positions": points, "class_ids": class_ids}
+                to.write(path, Components(rr.Points3D, fields))
         to.set_time(*clock)
         shown = {path for path, _, _ in clouds} if selected else set()
         for path in sorted(self._shown - shown):

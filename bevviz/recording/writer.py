@@ -12,6 +12,7 @@ import rerun as rr
 from bevviz.model.frame import F64, I64, Codec, VideoClip
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows, Rows
+from bevviz.recording.components import Components
 from bevviz.support.contexts import Closable
 
 STAMPS = (entities.STAMP, entities.TRIED, entities.RECEIVED)  # in nanoseconds; the others are sequences
@@ -196,7 +197,7 @@ class Writer(Closable):
         if self._wait > 0:
             self._scalars[path].append((self._clock, value))
         else:
-            self.write(path, rr.Scalars(value))
+            self.write(path, Components(rr.Scalars, {"scalars": [value]}))
 
     def samples(self, path: str, stamps: I64, received: I64, values: F64) -> None:
         """Log (N, D) numbers for a plot, each row at its own time between the frames."""
