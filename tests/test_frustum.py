@@ -353,7 +353,8 @@ def test_a_cars_heading_and_place(distance: float, bearing: float, yaw: float, l
     points = car(x, y, yaw, length)[:, :2].astype(np.float64)
     L, W, _, spread, narrow, _ = CLASS_SIZES["car"][:6]
     normals, edge = np.zeros((2, 2)), np.full(2, NO_EDGE)
-    box, _, _ = fit(points, normals, edge, np.array([L, spread, W, narrow]), 10.0, np.nan)
+    sizes = np.array([[L, W, np.nan, spread, narrow, np.nan]])
+    box, _, _ = fit(points, normals, edge, sizes, np.zeros(1), 10.0, np.nan)
     turned = (box[4] - yaw + math.pi / 2) % math.pi - math.pi / 2
     looked_at = abs(math.remainder(yaw - bearing, math.pi))
     both = math.radians(15) < looked_at < math.radians(75)

@@ -245,12 +245,14 @@ def iou(a: FloatArray, b: FloatArray) -> F32:
 
     A box that is empty or NaN has zero overlap.
     """
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    inter = np.prod(np.clip(high - low, 0, None), axis=2)
-    area_a = np.prod(np.clip(a[:, 2:] - a[:, :2], 0, None), axis=1)
-    area_b = np.prod(np.clip(b[:, 2:] - b[:, :2], 0, None), axis=1)
-    union = area_a[:, None] + area_b[None, :] - inter
+    (ax0, ay0, ax1, ay1), (bx0, by0, bx1, by1) = a.T[:, :, None], b.T
+    inter = np.maximum(np.minimum(ax1, bx1) - np.maximum(ax0, bx0), 0)
+    inter *= np.maximum(np.minimum(ay1, by1) - np.maximum(ay0, by0), 0)
+    area_a, area_b = (
+        np.maximum(x1 - x0, 0) * np.maximum(y1 - y0, 0)
+        for x0, y0, x1, y1 in ((ax0, ay0, ax1, ay1), (bx0, by0, bx1, by1))
+    )
+    union = area_a + area_b - inter
     ratio = np.zeros(inter.shape, np.float32)
     np.divide(inter, union, out=ratio, where=union > 0, casting="same_kind")
     return ratio

@@ -119,12 +119,6 @@ def claim_clusters(
     return new_clusters, claims, splits
 
 
-def _is_same_object(detections: Detections, a: int, b: int) -> bool:
-    """Return whether two boxes show one object under two names."""
-    overlap = geometry.iou(detections.xyxy[[a]], detections.xyxy[[b]])[0, 0]
-    return detections.names[a] != detections.names[b] and bool(overlap >= SAME_OBJECT_IOU)
-
-
 @dataclass(frozen=True, slots=True)
 class _Candidate:
     """Points that a detection may claim."""
@@ -196,7 +190,7 @@ class _FrameClaims:
             takers = view.taker[candidate.rows]
             # A better detection has some of the points. Search again among the remaining points.
             if (taker := takers.max(initial=-1)) >= 0:
-                if not _is_same_object(detections, int(taker), d):
+                if not view.is_same_object(int(taker), d):
                     waiting[d] = view.best(d)
                 continue
             part = self._earlier_part(candidate.rows)
@@ -284,24 +278,57 @@ class _CameraFrustums:
         # (D, 2) sigma of the left and right edge for each metre of distance
         self._edge = np.where(self._cut[:, [0, 2]], NO_EDGE, np.maximum(with_sigma, 1e-6)[:, None])
         self._boxes = detections.xyxy.astype(np.float64)
+        kept = np.flatnonzero(detections.kept)
         self._beside_masks = {
             d: barred
-            for d in np.flatnonzero(detections.kept).tolist()
+            for d in kept.tolist()
             if (barred := _points_beside_mask(uv, self._seen, detections, d, work.config, work.fewest))
             is not None
         }
         unknown = (np.nan,) * 6
-        self._sizes = [  # (M, 6) sizes of each detection's class
-            np.array(work.sizes.get(name.lower()) or unknown, np.float64).reshape(-1, 6)
-            for name in detections.names
-        ]
-        self._lengths = [float(size[0, 0]) for size in self._sizes]
-        self._overlap: list[list[float]] = geometry.iou(detections.xyxy, detections.xyxy).tolist()
+        self._sizes = {  # (M, 6) sizes of each kept detection's class
+            d: np.array(work.sizes.get(detections.names[d].lower()) or unknown, np.float64).reshape(-1, 6)
+            for d in kept.tolist()
+        }
+        self._overlap = np.zeros((len(detections), len(detections)), np.float32)
+        self._overlap[np.ix_(kept, kept)] = geometry.iou(detections.xyxy[kept], detections.xyxy[kept])
+
+    def is_same_object(self, a: int, b: int) -> bool:
+        """Return whether two boxes show one object under two names."""
+        names = self._detections.names
+        return names[a] != names[b] and bool(self._overlap[a, b] >= SAME_OBJECT_IOU)
 
     def best(self, d: int) -> _Candidate:
         """Return the best rated candidate among the free points in a detection's frustum, for any size."""
-        candidates = [self._best_of_size(d, size) for size in self._sizes[d].tolist()]
-        return max(candidates, key=lambda candidate: candidate.fit)
+        config = self._work.config
+        sizes = [
+            (
+                math.hypot(length + REACH_SPREAD * long_spread, width + REACH_SPREAD * wide_spread),
+                height,
+                math.hypot(tall_spread, TALL_SHARE * height),
+            )
+            for length, width, height, long_spread, wide_spread, tall_spread in self._sizes[d].tolist()
+        ]
+        rows, rating, depth = choose_candidate(
+            self._work.points,
+            self._place,
+            self._uv,
+            self._allowed(d, self._seen),
+            self.taker,
+            self._boxes[d],
+            config.max_gap,
+            max(self._tall[d], self._wide[d]),
+            self._tall[d],
+            np.array(sizes),
+            self._lowest(d),
+            self._work.ground,
+            self._eye,
+            self._drop[d],
+            self._footing[d],
+            self._work.fewest,
+            config.min_iou,
+        )
+        return _Candidate(rating, rows, depth)
 
     def divided(self, candidates: dict[int, _Candidate]) -> dict[int, _Candidate]:
         """Divide points that two detections of similar size want, and return the new candidates.
@@ -329,9 +356,10 @@ class _CameraFrustums:
         Returns:
             Whether both detections keep enough points.
         """
-        long, other = self._lengths[d], self._lengths[e]  # NaN, that is unlike any other, without a size
-        is_similar = long <= min(SIMILAR * other, SHORT) and other <= min(SIMILAR * long, SHORT)
-        if not is_similar or not 0 < self._overlap[d][e] < SAME_OBJECT_IOU:
+        if not 0 < self._overlap[d, e] < SAME_OBJECT_IOU:
+            return False
+        long, other = self._sizes[d][0, 0], self._sizes[e][0, 0]  # NaN, unlike any other, without a size
+        if not (long <= min(SIMILAR * other, SHORT) and other <= min(SIMILAR * long, SHORT)):
             return False
         shared = np.intersect1d(rows_d, rows_e)
         if len(shared) < self._work.fewest:
@@ -359,32 +387,6 @@ class _CameraFrustums:
         middle, half = (low + high) / 2, (high - low) / 2
         off = np.abs(self._uv[rows] - middle) / half
         return np.asarray(np.log(np.maximum(1 - off, 0.01) / half).sum(axis=1), np.float64)
-
-    def _best_of_size(self, d: int, size: Sequence[float]) -> _Candidate:
-        """Return the best rated candidate for one size of a detection's class."""
-        config, (length, width, height, *spread) = self._work.config, size
-        rows, rating, depth = choose_candidate(
-            self._work.points,
-            self._place,
-            self._uv,
-            self._allowed(d, self._seen),
-            self.taker,
-            self._boxes[d],
-            config.max_gap,
-            math.hypot(length + REACH_SPREAD * spread[0], width + REACH_SPREAD * spread[1]),
-            max(self._tall[d], self._wide[d]),
-            self._tall[d],
-            height,
-            math.hypot(spread[2], TALL_SHARE * height),
-            self._lowest(d),
-            self._work.ground,
-            self._eye,
-            self._drop[d],
-            self._footing[d],
-            self._work.fewest,
-            config.min_iou,
-        )
-        return _Candidate(rating, rows, depth)
 
     def _allowed(self, d: int, rows: I64) -> I64:
         """Drop the points of the box that the detection's mask does not cover."""
@@ -452,23 +454,15 @@ class _CameraFrustums:
         and with the height of the image box at this distance.
         """
         longest = max(self._wide[d], self._tall[d]) * depth
-        edge = self._edge[d] * depth
         sizes, bounds = self._sizes[d], np.zeros(len(self._sizes[d]))
         if len(sizes) > 1:
             bounds += [self._size_cost(d, size, depth) + k * RARER for k, size in enumerate(sizes)]
-        best, least = None, np.inf
-        for number in np.argsort(bounds, kind="stable").tolist():
-            if bounds[number] >= least:  # The cost of a fit is never negative.
-                break
-            size = sizes[number]
-            prior = size[[0, 3, 1, 4]]
-            flat, facing, cost = fit_from(
-                self._work.points, rows, self._place, self._normals[d], edge, prior, longest, about
-            )
-            if bounds[number] + cost < least:
-                best, least = _FittedBox(flat, facing, size), bounds[number] + cost
-        assert best is not None
-        return best
+            order = np.argsort(bounds, kind="stable")
+            sizes, bounds = sizes[order], bounds[order]
+        edge = self._edge[d] * depth
+        points, rays = self._work.points, self._normals[d]
+        flat, facing, number = fit_from(points, rows, self._place, rays, edge, sizes, bounds, longest, about)
+        return _FittedBox(flat, facing, sizes[number])
 
     def _size_cost(self, d: int, size: F64, depth: float) -> float:
         """Return the cost of one size of the class, from its spreads and from the height of the image box."""

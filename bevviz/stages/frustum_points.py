@@ -31,11 +31,9 @@ def choose_candidate(
     taker: I32,
     box: F64,
     gap: float,
-    reach: float,
     ratio: float,
     tall: float,
-    height: float,
-    sigma: float,
+    sizes: F64,
     lowest: float,
     ground: F32,
     eye: float,
@@ -44,7 +42,7 @@ def choose_candidate(
     fewest: int,
     least: float,
 ) -> tuple[I64, float, float]:
-    """Choose the best candidate in the frustum of an image box.
+    """Choose the best candidate in the frustum of an image box, for any size of the class.
 
     Args:
         points: (P, 3).
@@ -54,11 +52,10 @@ def choose_candidate(
         taker: (P,) -1 for a free point.
         box: (4,) the image box.
         gap: metres; points this near are connected.
-        reach: metres, largest depth of the object. NaN: its depth is at most its size.
         ratio: size of the object for each metre of distance.
         tall: height of the object for each metre of distance.
-        height: metres, height of the class, NaN if unknown.
-        sigma: metres, sigma of that height.
+        sizes: (M, 3) metres: largest depth of an object of each size, its height, and sigma of that height.
+            NaN: the height is unknown, and the depth is at most the size.
         lowest: sigmas; a lower height costs no more than this.
         ground: (P,) z of the ground below each point, empty if it is unknown.
         eye: z of the camera.
@@ -122,7 +119,9 @@ def choose_candidate(
     start = np.zeros(bodies + 1, np.int64)
     body = np.full(n, -1, np.int64)
     for i in range(n):
-        for p in range(max(at[i, 0] - 2, 0), min(at[i, 0] + 3, columns)):
+        if inside[i]:
+            body[i] = grid[at[i, 0], at[i, 1]]
+        for p in range(max(at[i, 0] - 2, 0), 0 if inside[i] else min(at[i, 0] + 3, columns)):
             for q in range(max(at[i, 1] - 2, 0), min(at[i, 1] + 3, rows)):
                 if grid[p, q] >= 0 and (body[i] < 0 or (p == at[i, 0] and q == at[i, 1])):
                     body[i] = grid[p, q]
@@ -138,58 +137,67 @@ def choose_candidate(
 
     area = (box[2] - box[0]) * (box[3] - box[1])
     best, best_first, best_last, best_far = 0.0, 0, 0, 0.0
-    for k in range(bodies):
-        first = start[k]
-        while first < start[k + 1]:
-            begin = far[by_body[first]]
-            deep = ratio * begin if np.isnan(reach) else reach
-            u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
-            count = 0
-            below = 0.0
-            last = first
-            while last < start[k + 1] and far[by_body[last]] <= begin + deep:
-                i = by_body[last]
-                if inside[i]:
-                    count += 1
-                    below += ground[near[i]] if len(ground) else 0.0
-                    u, v = uv[near[i], 0], uv[near[i], 1]
-                    u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-                last += 1
-            if count >= fewest:
-                covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
-                    min(v1, box[3]) - max(v0, box[1]), 0.0
-                )
-                overlap = covered / area if area > 0 else 0.0
-                front = far[by_body[first + (last - 1 - first) // DEPTH_STEPS]]
-                rating = overlap * count / (last - first)
-                if not np.isnan(height):
-                    z = max((tall * front - height) / sigma, -lowest)
-                    rating /= 1 + z * z / STUDENT_FREEDOM
-                if len(ground) and footing < np.inf:
-                    z = (eye + drop * front - below / count) / math.hypot(FOOTING, footing * front)
-                    rating /= 1 + min(z * z, HIDDEN_FOOT**2) / STUDENT_FREEDOM
-                if overlap >= least and rating > best:
-                    best, best_first, best_last, best_far = rating, first, last, front
-            if last == start[k + 1]:
-                break
-            while first < start[k + 1] and far[by_body[first]] < begin + deep / DEPTH_STEPS:
-                first += 1
+    for reach, height, sigma in sizes:
+        for k in range(bodies):
+            first = start[k]
+            while first < start[k + 1]:
+                begin = far[by_body[first]]
+                deep = ratio * begin if np.isnan(reach) else reach
+                u0, v0, u1, v1 = np.inf, np.inf, -np.inf, -np.inf
+                count = 0
+                below = 0.0
+                last = first
+                while last < start[k + 1] and far[by_body[last]] <= begin + deep:
+                    i = by_body[last]
+                    if inside[i]:
+                        count += 1
+                        below += ground[near[i]] if len(ground) else 0.0
+                        u, v = uv[near[i], 0], uv[near[i], 1]
+                        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+                    last += 1
+                if count >= fewest:
+                    covered = max(min(u1, box[2]) - max(u0, box[0]), 0.0) * max(
+                        min(v1, box[3]) - max(v0, box[1]), 0.0
+                    )
+                    overlap = covered / area if area > 0 else 0.0
+                    front = far[by_body[first + (last - 1 - first) // DEPTH_STEPS]]
+                    rating = overlap * count / (last - first)
+                    if not np.isnan(height):
+                        z = max((tall * front - height) / sigma, -lowest)
+                        rating /= 1 + z * z / STUDENT_FREEDOM
+                    if len(ground) and footing < np.inf:
+                        z = (eye + drop * front - below / count) / math.hypot(FOOTING, footing * front)
+                        rating /= 1 + min(z * z, HIDDEN_FOOT**2) / STUDENT_FREEDOM
+                    if overlap >= least and rating > best:
+                        best, best_first, best_last, best_far = rating, first, last, front
+                if last == start[k + 1]:
+                    break
+                while first < start[k + 1] and far[by_body[first]] < begin + deep / DEPTH_STEPS:
+                    first += 1
     chosen = by_body[best_first:best_last]
     return near[chosen[inside[chosen]]], best, best_far
 
 
 @kernel
 def fit_from(
-    points: F32, rows: I64, place: F64, normals: F64, edge: F64, prior: F64, longest: float, about: float
-) -> tuple[F64, I64, float]:
+    points: F32,
+    rows: I64,
+    place: F64,
+    normals: F64,
+    edge: F64,
+    sizes: F64,
+    bounds: F64,
+    longest: float,
+    about: float,
+) -> tuple[F64, I64, int]:
     """Fit a box with ``box_fit.fit`` to points seen from a place."""
     xy = np.empty((len(rows), 2))
     for k, i in enumerate(rows):
         xy[k, 0], xy[k, 1] = points[i, 0] - place[0], points[i, 1] - place[1]
-    flat, facing, cost = fit(xy, normals, edge, prior, longest, about)
+    flat, facing, number = fit(xy, normals, edge, sizes, bounds, longest, about)
     flat[0] += place[0]
     flat[1] += place[1]
-    return flat, facing, cost
+    return flat, facing, number
 
 
 @kernel

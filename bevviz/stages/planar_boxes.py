@@ -9,7 +9,6 @@ import numpy as np
 
 from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.results import Clusters, Objects
-from bevviz.stages.box_fit import MAX_SPREAD
 from bevviz.stages.frustum_points import fit_from
 
 LONG = 1.2  # metres, least length of a class whose hidden sides matter
@@ -35,12 +34,11 @@ def whole_boxes(
         if stated is None or stated[0] < LONG:
             continue
         rows = np.flatnonzero(clusters.labels == cluster)
-        fits, normals = [], _outline(points[rows])
-        for mode in np.reshape(stated, (-1, 6)):
-            prior, longest = mode[[0, 3, 1, 4]], mode[0] + MAX_SPREAD * mode[3]
-            flat, _, cost = fit_from(points, rows, PLACE, normals, EDGES, prior, longest, np.nan)
-            fits.append((cost + float(np.log(mode[3:]).sum()), flat))
-        _, flat = min(fits, key=lambda fit: fit[0])
+        modes = np.reshape(stated, (-1, 6))
+        bounds = np.log(modes[:, 3:]).sum(axis=1)
+        order = np.argsort(bounds, kind="stable")
+        normals, free = _outline(points[rows]), np.nan
+        flat, _, _ = fit_from(points, rows, PLACE, normals, EDGES, modes[order], bounds[order], free, free)
         center[row, :2], size[row, :2], yaw[row] = flat[:2], flat[2:4], flat[4]
     return replace(objects, boxes=Boxes3D(center, np.asarray(size, np.float32), np.asarray(yaw, np.float32)))
 
