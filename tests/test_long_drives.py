@@ -259,7 +259,7 @@ def test_a_drive_run_by_another_command_shows_its_list(
     tmp_path: Path,
     command: str,
 ) -> None:
-    """The list is that of the workbench's own run. A part of the drive keeps none."""
+    """The list is that of the workbench's own run, which adds the reasons. A part of the drive keeps none."""
     monkeypatch.setattr(recorded_drive, "FIRST", 0.0)
     monkeypatch.setattr(recorded_drive, "LEAST", FRAMES + 1)
     provider = drives[0].session.stages.provider
@@ -273,7 +273,14 @@ def test_a_drive_run_by_another_command_shows_its_list(
     evaluated._load_list()
     assert len(evaluated.frame_times()) == FRAMES
     evaluated.recording.close()
-    assert groups(evaluated.findings) == whole_list(RecordedDrive(drives[0], drives[1].frames), set()) != []
+    stored, passes = table.load(), set[str]()
+    assert stored is not None and stored.explained == (command == "batch")
+    own = RecordedDrive(drives[0], drives[1].frames, table=None if stored.explained else table)
+    assert groups(evaluated.findings) == whole_list(own, passes) != []
+    replaced = table.load()
+    assert passes == {"run"} and replaced is not None and replaced.explained
+    reasons = [frame.text for group in replaced.groups for frame in group.frames if group.what == "missed"]
+    assert reasons and all(reasons)
 
 
 def test_a_list_belongs_to_one_drive_and_configuration(bag: Path, store: None, tmp_path: Path) -> None:

@@ -211,11 +211,14 @@ class FindingList:
             groups = sorted(self._groups.values(), key=lambda group: group.number)
             return [(group.what, group.name, list(group.frames)) for group in groups]
 
-    def restore(self, groups: Iterable[tuple[str, str, list[FindingFrame]]]) -> None:
-        """Add whole groups of an earlier run."""
+    def restore(self, groups: Iterable[tuple[str, str, list[FindingFrame]]], *, stay: bool = True) -> None:
+        """Add whole groups of an earlier run. Those that do not stay are removed as an overview is."""
         with self._lock:
             for kind, name, frames in groups:
-                self._new(kind, name).frames += frames
+                group = self._new(kind, name)
+                group.frames += frames
+                if not stay:
+                    self._overview.setdefault(frames[0].frame // CELL, []).append(group)
 
     def replace(self, kinds: Sequence[str]) -> None:
         """Remove all findings of these kinds, before new ones are added."""

@@ -141,27 +141,36 @@ def _explained(finding: Finding, explainer: FrameExplainer, *, restore: bool) ->
     """Add the answer about its subject to a finding."""
     if finding.selection is None:
         return finding
-    answer = explainer.about(finding.selection, restore=restore)
-    explained = _with_answer(explainer.traces.result.frame, finding, answer)
-    return explained if restore or finding.what != "missed" else replace(explained, reason="", text="")
+    frame = explainer.traces.result.frame
+    if finding.what == "missed" and not restore:
+        assert finding.shape is not None
+        x, y, z = finding.shape.center[0].tolist()
+        return _at(frame, finding, (x, y, z))
+    return _with_answer(frame, finding, explainer.about(finding.selection))
 
 
 def _with_answer(frame: Frame, finding: Finding, answer: Answer) -> Finding:
-    position, in_way = None, False
-    if answer.center is not None:
-        in_way = answer.center[0] > 0 and abs(answer.center[1]) <= WAY
-        x, y, z = geometry.apply(frame.pose, np.asarray(answer.center, np.float32)[None])[0].tolist()
-        position = x, y, z
     verdict = answer.verdict
-    return replace(
+    explained = replace(
         finding,
         distance=answer.distance,
-        position=position,
-        in_way=in_way,
         reason=verdict.kind.value,
         text=verdict.text,
         points=answer.points,
     )
+    return explained if answer.center is None else _at(frame, explained, answer.center)
+
+
+def _at(frame: Frame, finding: Finding, center: Position) -> Finding:
+    """Return a finding with its position in the fixed frame.
+
+    Args:
+        frame: frame of the finding.
+        finding: the finding.
+        center: its centre in the frame of the points.
+    """
+    x, y, z = geometry.apply(frame.pose, np.asarray(center, np.float32)[None])[0].tolist()
+    return replace(finding, position=(x, y, z), in_way=center[0] > 0 and abs(center[1]) <= WAY)
 
 
 def _judged(traces: FrameIndex) -> Iterator[Finding]:

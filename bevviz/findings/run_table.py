@@ -42,10 +42,12 @@ class StoredRun:
     Attributes:
         groups: the findings.
         frames: stamp and number of each frame.
+        explained: whether missed objects have a reason.
     """
 
     groups: list[StoredGroup]
     frames: list[tuple[int, int]]
+    explained: bool = True
 
 
 UNRELATED = {"live", "logging", "store"}  # sections that change no finding
@@ -80,7 +82,9 @@ class RunTable:
 
 
 class ListKeeper(Observer[FrameResult]):
-    """Observer that keeps the list of a run over a whole drive, as the workbench would make it.
+    """Observer that keeps the list of a run over a whole drive for the workbench.
+
+    The reasons of missed objects would take most of the time of a run. The workbench finds them.
 
     Args:
         table: place of the list.
@@ -92,11 +96,14 @@ class ListKeeper(Observer[FrameResult]):
         self._table, self._session, self._scans = table, session, scans
         self._list = FindingList()
         self._frames: list[tuple[int, int]] = []
+        self._explained = True
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
         explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names)
-        self.add(result.frame, find_findings(explainer))
+        findings = find_findings(explainer, restore=False)
+        self._explained &= all(finding.what != "missed" for finding in findings)
+        self.add(result.frame, findings)
 
     def add(self, frame: Frame, findings: Iterable[Finding]) -> None:
         """List the findings of a frame."""
@@ -107,7 +114,7 @@ class ListKeeper(Observer[FrameResult]):
         """Keep the list."""
         if len(self._frames) == self._scans:
             groups = [StoredGroup(*group) for group in self._list.content()]
-            self._table.save(StoredRun(groups, sorted(self._frames)))
+            self._table.save(StoredRun(groups, sorted(self._frames), self._explained))
 
 
 def list_keeper(source: BagSource, session: Session, config: Config | None = None) -> ListKeeper | None:

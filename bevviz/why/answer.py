@@ -243,15 +243,9 @@ class FrameExplainer:
         order = sorted(answers, key=lambda pair: _place_rank(*pair))
         return _once_by_label([answer for answer, _ in order])
 
-    def about(self, selection: Selection, *, restore: bool = True) -> Answer:
-        """Explain the one subject of a selection that selects a row.
-
-        Args:
-            selection: the subject.
-            restore: whether the stages run again for the cause of a missed object. Without these runs, the
-                reason of a missed object is only the one that fixed rules find.
-        """
-        return self._answer(select_subjects(self.traces, selection)[0], restore=restore)
+    def about(self, selection: Selection) -> Answer:
+        """Explain the one subject of a selection that selects a row."""
+        return self._answer(select_subjects(self.traces, selection)[0])
 
     def missed(self) -> list[Answer]:
         """Explain the objects that should have been reported and were not, the nearest first."""
@@ -315,7 +309,7 @@ class FrameExplainer:
         verdict = make_verdict(subject, verdict.reason, verdict.reported, restored_by, blamed)
         return replace(answer, verdict=verdict, likely=())
 
-    def _answer(self, subject: Subject, *, restore: bool = True) -> Answer:
+    def _answer(self, subject: Subject) -> Answer:
         """Return the answer about one subject, from the cache if it is known."""
         if subject.asked is None and subject.key in self._answers:
             return self._answers[subject.key]
@@ -324,8 +318,7 @@ class FrameExplainer:
         evidence = collect_evidence(subject, self.traces)
         reason, reported = find_reason(subject, evidence, self.traces)
         restored_by: tuple[StageSet, ...] = ()
-        is_restored = subject.kind == "truth" and restore
-        if is_restored:
+        if subject.kind == "truth":
             restored_by = self._runs.restored_by(subject, stage_of(reason.kind, evidence))
             reason, reported = find_reason(subject, evidence, self.traces, restored_by)
         likely = () if reported else likely_reasons(subject, evidence, self.traces, reason.kind)
@@ -334,10 +327,7 @@ class FrameExplainer:
         steps = tuple(steps_of(subject, evidence, self.traces))
         answer = Answer(subject, verdict, steps, (), evidence.fate, evidence.distance, evidence.raw, evidence)
         answer = replace(answer, likely=likely, near=self.traces.must(subject))
-        is_whole = is_restored or subject.kind != "truth"
-        if (
-            is_whole and subject.asked is None and not subject.is_place
-        ):  # The number of possible places has no limit.
+        if subject.asked is None and not subject.is_place:  # The number of possible places has no limit.
             self._answers[subject.key] = answer
         return answer
 

@@ -77,7 +77,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         recording = getattr(drive.frames, "recording", None)
         self.single_frames = bool(getattr(recording, "single_frames", False))
         self._first, self._table, self._opened = first, table, opened
-        self._is_listed = False  # whether the list is that of an earlier run
+        self._is_listed = False  # whether the list is the complete one of an earlier run
         self.recording = DriveRecording(drive.scene, drive.config, self.again.total)
         self._thumbnails = Thumbnails(len(self.again.scans))
         self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
@@ -140,14 +140,14 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     def _run(self) -> None:
         try:
-            self._load_list()
+            is_known = self._load_list()
             first = self.look(self._first)
             self.first = self._stamp_of(0)
             explainer = self.explainer(first)
             self.show(first, find_findings(explainer))
             self._go.wait(FIRST)
             self._opened(explainer)
-            if self.again.total >= LEAST and not self._is_listed:
+            if self.again.total >= LEAST and not is_known:
                 self._make_overview()
             run(self.again, self.drive.new_session(), [self], stop=self._stop)
             if not (self._stop.is_set() or self._is_listed):
@@ -160,17 +160,24 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self.over = True
         self.news.tell()
 
-    def _load_list(self) -> None:
-        """List the findings of an earlier run, if they are kept. The run is still needed for the rest."""
+    def _load_list(self) -> bool:
+        """List the findings of an earlier run. Return whether they are kept.
+
+        The run is still needed for the rest. It replaces a list without the reasons of missed objects.
+        """
         stored = None if self._table is None else self._table.load()
-        if stored is not None:
-            self.findings.restore((group.what, group.name, group.frames) for group in stored.groups)
-            with self._lock:
-                self._stamps = {number: stamp for stamp, number in stored.frames}
-                self._times = sorted((stamp, number) for stamp, number in stored.frames)
+        if stored is None:
+            return False
+        groups = ((group.what, group.name, group.frames) for group in stored.groups)
+        self.findings.restore(groups, stay=stored.explained)
+        with self._lock:
+            self._stamps = {number: stamp for stamp, number in stored.frames}
+            self._times = sorted((stamp, number) for stamp, number in stored.frames)
+        if stored.explained:
             self._reached = max(self._stamps.values(), default=0)
             self._is_listed = True
-            self.news.tell()
+        self.news.tell()
+        return True
 
     def _save_list(self) -> None:
         """Keep the findings of the whole run."""
