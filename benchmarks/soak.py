@@ -15,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from bevviz.config.reloading import ReloadableConfig
 from bevviz.extras.demo.drive import BASE, CAMERA_FRAME, LIDAR_FRAME, MAP, PERIOD, START, SyntheticSource
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.run_outputs import Outputs
-from bevviz.live.runtime import Live, Status
+from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
 from bevviz.live.source_wrappers import warm_up
 from bevviz.live.status import Notes
@@ -130,6 +131,16 @@ def _transform(parent: str, child: str, pose: F64) -> tuple[str, str, list[float
     return parent, child, [*pose[:3, 3].tolist(), *quaternion(pose).tolist()]
 
 
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Numbers of a run at a time."""
+
+    frames: int
+    cpu: float  # percent of one core
+    memory: float  # MB
+    drops: Mapping[str, int]
+
+
 class Soak:
     """Collects what a run says of itself, and prints a line every minute.
 
@@ -141,18 +152,20 @@ class Soak:
     def __init__(self, live: Live, seconds: float) -> None:
         self._live, self._seconds = live, seconds
         self._start = time.monotonic()
-        self._looks: list[tuple[float, Status]] = []
+        self._looks: list[tuple[float, Snapshot]] = []
         self._lines = self._row = 0  # lines printed, and looks at the last of them
         self._before = self._at_line = np.zeros_like(live.health.histogram)  # latencies of the warm-up
         print("|  min | p50, ms | p90, ms | p99, ms | most, ms | frames/s | dropped | CPU, % | memory, MB |")
         print("| ---: | ------: | ------: | ------: | -------: | -------: | ------: | -----: | ---------: |")
 
-    def look(self, status: Status) -> None:
+    def look(self) -> None:
         now = time.monotonic() - self._start
         if now < WARM:
             self._before = self._at_line = self._live.health.histogram.copy()
             return
-        self._looks.append((now, status))
+        live = self._live
+        snapshot = Snapshot(live.frames, live.health.cpu, live.health.memory, live.drops)
+        self._looks.append((now, snapshot))
         if now - WARM >= MINUTE * (self._lines + 1):
             self._lines += 1
             self._line(self._looks[self._row :])
@@ -161,11 +174,11 @@ class Soak:
         if now >= self._seconds:
             self._live.stop()
 
-    def _line(self, looks: Sequence[tuple[float, Status]]) -> None:
+    def _line(self, looks: Sequence[tuple[float, Snapshot]]) -> None:
         (before, first), (now, last) = looks[0], looks[-1]
         rate = (last.frames - first.frames) / (now - before)
         dropped = sum(last.drops.values()) - sum(first.drops.values())
-        cpu = np.mean([status.cpu for _, status in looks])
+        cpu = np.mean([snapshot.cpu for _, snapshot in looks])
         p50, p90, p99, most = self._latencies(self._at_line)
         print(
             f"| {(now - WARM) / 60:4.0f} | {p50:7d} | {p90:7d} | {p99:7d} | {most:8d} | {rate:8.2f} "
@@ -184,7 +197,7 @@ class Soak:
             print("too short: nothing is left after the warm-up")
             return 1
         p50, p90, p99, most = self._latencies(self._before)
-        memory = np.array([status.memory for _, status in self._looks])
+        memory = np.array([snapshot.memory for _, snapshot in self._looks])
         filled = self._live.config.live.flight_time + WARM
         full = np.array([now > filled for now, _ in self._looks])
         growth = memory[full][-10:].mean() / memory[full][:10].mean() if full.sum() >= 20 else float("nan")

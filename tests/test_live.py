@@ -36,7 +36,7 @@ from bevviz.live.indexing import INDEX, Indexer, add_index, remove_leftovers
 from bevviz.live.outputs import RETRY, Program, Viewer
 from bevviz.live.run_outputs import Outputs
 from bevviz.live.runtime import Live
-from bevviz.live.source_wrappers import ThinnedSource, thin
+from bevviz.live.source_wrappers import thin, thinned
 from bevviz.live.status import Notes
 from bevviz.model.frame import Frame, Scene, UserMark
 from bevviz.model.results import (
@@ -218,7 +218,7 @@ def test_a_slow_pipeline_takes_the_newest_frame(run: Run, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Session, "perceive", slow)
     outcome = run(total=40, rate=40, save=Path("out.rrd"))
-    drops = outcome.live.status.drops
+    drops = outcome.live.drops
     logged = numbers(Path("out.rrd"))
     assert drops["incoming"] > 20
     assert len(logged) + sum(drops.values()) == 40
@@ -253,7 +253,7 @@ def test_a_slow_log_drops_results_and_holds_nobody_up(
     source = Published(frames, drive.scene, 40)
     outcome = run(["live.log_queue=3"], source=source, on_result=publish, save=Path("out.rrd"))
     assert seen == list(range(40)), "nobody else waits for the log"
-    logged, drops = numbers(Path("out.rrd")), outcome.live.status.drops
+    logged, drops = numbers(Path("out.rrd")), outcome.live.drops
     assert logged[-3:] == [37, 38, 39] and 3 <= len(logged) <= 4
     assert drops["logging"] == sum(drops.values()) == 40 - len(logged)
 
@@ -425,7 +425,7 @@ def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
     outcome = run(total=30, save=Path("out.rrd"))
     add_index(Path("out.rrd"))
     recording = Recording(Path("out.rrd"))
-    assert numbers(Path("out.rrd")) == list(range(30)) and sum(outcome.live.status.drops.values()) == 0
+    assert numbers(Path("out.rrd")) == list(range(30)) and sum(outcome.live.drops.values()) == 0
     p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
     p99 = [v[0] for v in recording.column("/health/latency_ms/p99", "Scalars:scalars")]
     assert all(0 < a <= b for a, b in zip(p50, p99, strict=True))
@@ -447,7 +447,7 @@ def test_thinning_reduces_frames_and_data(frames: list[Frame], drive: SyntheticS
 
     def left(setting: str) -> list[Frame]:
         config = load(settings=[setting])
-        return list(ThinnedSource(Scans(frames, drive.scene, rate=1e6, total=40), lambda: config, clock))
+        return list(thinned(Scans(frames, drive.scene, rate=1e6, total=40), lambda: config, clock))
 
     assert [frame.index for frame in left("live.every=3")] == list(range(0, 40, 3))
     slower = [frame.index for frame in left("live.max_rate=5")]
@@ -1009,7 +1009,7 @@ def test_viewers_that_hang_or_die_slow_nothing_down(run: Run) -> None:
     def during(live: Live) -> None:
         until(lambda: live.frames > 5)
         end(viewers[0], signal.SIGSTOP)
-        until(lambda: live.status.drops["remote"] > 0)  # frames come, nobody waits
+        until(lambda: live.drops["remote"] > 0)  # frames come, nobody waits
         end(viewers[0])
         until(lambda: any("is gone" in line for line in said))
         time.sleep(RETRY + 1)

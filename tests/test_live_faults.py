@@ -18,7 +18,8 @@ from tests.support.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.live.publish import BEV, FUSED, OBSTACLES, TOPICS, TRANSFORMS, RosTopics
+from bevviz.extras.ros_node.topics import RosTopics
+from bevviz.live.publish import BEV, FUSED, OBSTACLES, TOPICS, TRANSFORMS
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.source import LiveSource
 

@@ -227,7 +227,7 @@ def test_a_message_stays_until_another_one_takes_its_place() -> None:
     kept = latched.before(1000)
     assert [(m.sent, m.received) for m in kept] == [(2, 997), (5, 998), (6, 999)]
     assert latched.size == sum(len(m.data) for m in kept)
-    assert children(messages[1].data) == (b"odom", b"b") and children(b"\0\1\0\0\5") == ()
+    assert children(messages[1].data) == ("odom", "b") and children(b"\0\1\0\0\5") == ()
 
 
 def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

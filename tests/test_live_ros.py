@@ -20,13 +20,12 @@ import pytest
 from mcap.reader import make_reader
 
 from bevviz.cli import main
-from bevviz.config import Config, load, parameters
+from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.extras.demo.drive import LIDAR_TOPIC
 from bevviz.messages.clouds import decode_cloud
 from bevviz.messages.definitions import typestore
 from bevviz.messages.detections import decode_detections_2d, decode_detections_3d
-from bevviz.messages.encode import encode_camera_info
 from bevviz.messages.images import decode_image
 from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.results import CameraResult, Detections, FrameResult, Objects
@@ -43,6 +42,7 @@ from tests.support.waiting import PATIENCE, until
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
+from bevviz.extras.ros_node.topics import RosTopics
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
 from bevviz.live.node import Node, middlewares
@@ -56,10 +56,8 @@ from bevviz.live.publish import (
     SPEED,
     TRACKS,
     Publisher,
-    RosTopics,
 )
 from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
-from bevviz.live.requests import RosRequests
 from bevviz.live.source import LiveSource
 
 TYPES = drive_of(Play()).types
@@ -185,54 +183,6 @@ def test_incompatible_publisher_is_told(robot: str) -> None:
 
 
 # --- types without a wheel ---------------------------------------------------------------------
-
-
-@pytest.fixture
-def pair() -> Iterator[tuple[Node, Node]]:
-    """Two participants."""
-    with Node(name="one") as one, Node(name="two") as two:
-        one.start()
-        two.start()
-        yield one, two
-
-
-def test_generated_types_match_compiled_ones(pair: tuple[Node, Node]) -> None:
-    from sensor_msgs.msg import CameraInfo
-
-    kind = "sensor_msgs/msg/CameraInfo"
-    made = typesupport._from_definition(kind)
-    compiled: list[Any] = []
-    raw: list[bytes] = []
-    one, two = (session.node for session in pair)
-    one.create_subscription(CameraInfo, "/made", compiled.append, 10)
-    one.create_subscription(made, "/compiled", raw.append, 10, raw=True)
-    from_made, from_compiled = (
-        two.create_publisher(made, "/made", 10),
-        two.create_publisher(CameraInfo, "/compiled", 10),
-    )
-    until(lambda: from_made.get_subscription_count() and from_compiled.get_subscription_count(), "a match")
-
-    camera = kept_drives.frame(0).cameras[0]
-    assert camera.image is not None and camera.intrinsics is not None
-    sent = encode_camera_info(camera.image, camera.intrinsics)
-    from_made.publish(bytes(typestore().serialize_cdr(sent, kind)))
-    until(lambda: compiled, "a message of the made type")
-    message = compiled[0]
-    assert (message.width, message.header.frame_id) == (640, camera.image.frame_id)
-    np.testing.assert_array_equal(message.k, sent.k)
-
-    from_compiled.publish(message)
-    until(lambda: raw, "a message of the compiled type")
-    back: Any = typestore().deserialize_cdr(raw[0], kind)
-    assert back.header == sent.header and back.roi == sent.roi
-    np.testing.assert_array_equal(back.p, sent.p)
-
-    hashes = {
-        bytes(info.topic_type_hash.value)
-        for topic in ("/made", "/compiled")
-        for info in [*one.get_publishers_info_by_topic(topic), *one.get_subscriptions_info_by_topic(topic)]
-    }
-    assert len(hashes) == 1, "type hashes differ"
 
 
 @pytest.mark.parametrize(
@@ -512,89 +462,3 @@ def test_another_middleware_is_refused_and_not_aborted(
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
     said = error_of(capsys, "info", "--live")
     assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp is not installed for this Python" in said
-
-
-def test_parameters_set_the_configuration() -> None:
-    from rclpy.parameter import Parameter
-    from std_srvs.srv import Trigger
-
-    config = load(preset="reference")
-    ordered: list[str] = []
-
-    def change(settings: list[str]) -> None:
-        nonlocal config
-        config = load(settings=settings, preset="reference")
-        ordered.extend(settings)
-
-    full = False
-
-    def save() -> Path:
-        if full:
-            raise UserError("no space left in /tmp")
-        return Path("/tmp/robot.rrd")
-
-    with Node() as session:
-        node = session.node
-        orders = RosRequests(node, config, change, save)
-
-        def set_to(name: str, value: Any) -> Any:
-            return node.set_parameters([Parameter(name, value=value)])[0]
-
-        assert node.get_parameter("range_x").value == 10.0
-        assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
-        assert set_to("max_cluster_size", 500).successful
-        assert config.clustering.max_cluster_points == 500
-        orders.show(config)
-        assert set_to("max_cluster_size", 0).successful
-        assert config.clustering.max_cluster_points is None
-        assert ordered == [
-            "bev.range_x=25",
-            "clustering.max_cluster_points=500",
-            "clustering.max_cluster_points=null",
-        ]
-        refused = set_to("voxel_size", -1.0)
-        assert not refused.successful and "voxel_size out of range" in refused.reason
-        (allowed,) = node.describe_parameter("clustering.eps").floating_point_range
-        assert 0 == allowed.from_value < allowed.to_value < 1000
-        assert node.get_parameter("voxel_size").value == 0.05
-
-        orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
-        assert node.get_parameter("voxel_size").value == 0.2
-        assert len(ordered) == 3, "what is shown is no order"
-
-        del ordered[:]
-        settings = {
-            "clustering.eps": "60 cm",
-            "live.max_rate": 5,
-            "live.triggers": ["tf", "stage"],
-            "source.lidar_topics": "[/points]",
-            "sync.motion_compensation": True,
-        }
-        assert all(set_to(name, value).successful for name, value in settings.items())
-        assert ordered == [
-            "clustering.eps=60 cm",
-            "live.max_rate=5",
-            'live.triggers=["tf", "stage"]',
-            "source.lidar_topics=[/points]",
-            "sync.motion_compensation=true",
-        ]
-        orders.show(load(settings=["live.max_rate=5"], preset="reference"))
-        assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
-        assert not set_to("live.triggers", ["typhoon"]).successful
-        assert {name for name in parameters() if not node.has_parameter(name)} == set()
-
-        answer = orders._trigger(Trigger.Request(), Trigger.Response())
-        assert (answer.success, answer.message) == (True, "/tmp/robot.rrd")
-        full = True
-        answer = orders._trigger(Trigger.Request(), Trigger.Response())
-        assert (answer.success, answer.message) == (False, "no space left in /tmp")
-
-
-def test_parameters_of_the_command_line() -> None:
-    ordered: list[str] = []
-    arguments = ["-p", "range_y:=12.5", "-r", "__node:=eye", "-r", "__ns:=/robot1"]
-    with Node(arguments) as session:
-        RosRequests(session.node, Config(), ordered.extend)
-        assert session.node.get_fully_qualified_name() == "/robot1/eye"
-        assert session.resolve("points") == "/robot1/points"
-    assert ordered == ["bev.range_y=12.5"]

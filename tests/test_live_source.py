@@ -31,7 +31,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.live import graph_info as info
 from bevviz.live import typesupport
-from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests
+from bevviz.live.graph import PublishedTopic, Subscriptions
 from bevviz.live.input_problems import remedy
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.source import LiveSource
@@ -330,7 +330,7 @@ def test_images_that_wait_are_taken_with_the_first() -> None:
     node: Any = SimpleNamespace(
         input=SimpleNamespace(create_subscription=lambda *given, **options: graph.subscribe(*given))
     )
-    subscriptions = Subscriptions(node, TypeRequests(node), lambda topic, data, info: taken.append(data))
+    subscriptions = Subscriptions(node, (), lambda topic, data, info: taken.append(data))
     for kind in ("Image", "PointCloud2"):
         assert subscriptions.listen(PublishedTopic(f"/{kind}", f"sensor_msgs/msg/{kind}", ())) is None
     for subscription in graph.subscriptions:

@@ -22,11 +22,12 @@ from tests.support.waiting import until
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.extras.ros_node.diagnostics import TYPE, Diagnostics
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.run_outputs import Outputs
 from bevviz.live.runtime import Live
 from bevviz.live.source import LiveSource
-from bevviz.live.status import TYPE, Diagnostics, Notes
+from bevviz.live.status import Notes
 from bevviz.live.typesupport import message_type
 from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
 from tests.support.live_sessions import run_beside

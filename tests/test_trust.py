@@ -23,7 +23,7 @@ from bevviz.config.project import named_code, read_project_layers
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.config.trust import RECEIVED, grant_trust, trust_records
 from bevviz.errors import UserError
-from bevviz.live.requests import RosRequests
+from bevviz.extras.ros_node.parameters import RosRequests
 from bevviz.recording.source_lookup import Origin, RecordingSource
 from bevviz.stages.user_stages import load_user_stage
 from bevviz.why.changes import with_changes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -30,11 +30,11 @@ from bevviz.support import progress
 if TYPE_CHECKING:
     from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
+    from bevviz.live.companions import Companion
     from bevviz.live.problems import CurrentProblems
-    from bevviz.live.publish import ResultSink
     from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
-    from bevviz.live.runtime import Live, Status
+    from bevviz.live.runtime import Live
     from bevviz.live.source import LiveSource
     from bevviz.live.source_wrappers import RobotFrames
     from bevviz.live.status import Notes
@@ -55,10 +55,6 @@ class LiveRun:
 
     model: str | None = model_option()
     observe: bool = flag("no pipeline: show only what the robot itself publishes")
-    publish: bool = flag("publish the results, as the nodes of the tutorial do")
-    diagnostics: bool = flag(
-        "publish how bevviz does and what is worth a look on /diagnostics; --publish does it, too"
-    )
     robot: str | None = option(
         "TOPIC",
         "compare our objects with the robot's (default: its fused Detection3DArray), frame by frame",
@@ -130,8 +126,6 @@ def _live(options: LiveOptions) -> int:
     _files(output.save)
     if output.split is not None and not output.save:
         raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
-    if chosen.observe and chosen.publish:
-        raise UserError("--observe makes no results that --publish could send: leave one of them out")
     if chosen.observe and chosen.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = ReloadableConfig(config.file, values, config.preset, config.project_layers)
@@ -140,11 +134,11 @@ def _live(options: LiveOptions) -> int:
     if not chosen.observe:
         loader.load(settings.config)
     notes = Notes(say)
-    with ExitStack() as open_sinks:
+    with ExitStack() as stack:
         watches = extensions(options)
-        requested = [watch.open_sink(given, observe=chosen.observe) for watch, given in watches]
-        sinks = [open_sinks.enter_context(sink) for sink in requested if sink is not None]
-        return _run(settings, options, notes, loader, sinks)
+        requested = [watch.open(given, observe=chosen.observe) for watch, given in watches]
+        companions = [stack.enter_context(companion) for companion in requested if companion is not None]
+        return _run(settings, options, notes, loader, companions)
 
 
 def _run(
@@ -152,7 +146,7 @@ def _run(
     options: LiveOptions,
     notes: Notes,
     loader: StageLoader,
-    sinks: Sequence[ResultSink],
+    companions: Sequence[Companion],
 ) -> int:
     """Run beside a robot."""
     from bevviz.live.raw_recorder import RawRecorder
@@ -162,7 +156,7 @@ def _run(
     with LiveSource(
         settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.run.observe
     ) as robot:
-        return _watch_robot(robot, settings, options, notes, loader, raw, sinks)
+        return _watch_robot(robot, settings, options, notes, loader, raw, companions)
 
 
 def _check_outputs(options: LiveOutputs) -> None:
@@ -189,15 +183,11 @@ def _watch_robot(
     notes: Notes,
     loader: StageLoader,
     raw: RawRecorder,
-    watching_sinks: Sequence[ResultSink],
+    companions: Sequence[Companion],
 ) -> int:
-    """Wait for the robot, then run. Publish results and take requests as the options say."""
-    from bevviz.live.publish import Publisher, RosTopics
-    from bevviz.live.requests import Control, RosRequests, answer_sigusr1
+    """Wait for the robot, then run."""
+    from bevviz.live.requests import Control, answer_sigusr1
     from bevviz.live.source_wrappers import warm_up
-    from bevviz.live.status import Diagnostics
-
-    chosen = options.run
 
     def refuse(path: Path | None = None) -> Path:
         raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
@@ -206,16 +196,9 @@ def _watch_robot(
         Control(refuse, notes.warn) as control,
         answer_sigusr1(lambda: notes.warn("there is nothing to save yet")),
     ):
-
-        def take(more: list[str]) -> None:
-            settings.take(more)
-            if orders is not None:
-                orders.config = settings.config
-
-        orders: RosRequests | None = None
-        orders = RosRequests(source.node, settings.config, take, refuse)
-        orders.config = settings.config
-        if not chosen.observe:  # Warm up while waiting for the robot.
+        for companion in companions:
+            companion.join(source.node, settings, refuse)
+        if not options.run.observe:  # Warm up while waiting for the robot.
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
         reported_missing = ""
@@ -227,38 +210,8 @@ def _watch_robot(
                     say(f"waiting: {reported_missing}")
         if ended.is_set():
             return 1
-        sinks: list[ResultSink] = [RosTopics(source.node, notes.warn)] if chosen.publish else []
-        sinks += watching_sinks
-        publisher = Publisher(settings.config, sinks) if sinks else None
-        diagnostics: Diagnostics | None = None
-        if chosen.publish or chosen.diagnostics:
-            try:
-                diagnostics = Diagnostics(source.node)
-            except UserError as error:
-                notes.warn(f"/diagnostics is not published: {error}")
-
-        def on_result(result: FrameResult) -> None:
-            if publisher is not None:
-                publisher.publish(result)
-            if diagnostics is not None:
-                diagnostics.observe(result)
-
-        def follow(live: Live, orders: RosRequests = orders) -> Callable[[Config], None]:
-            control.save = orders.save = live.save
-            orders.change = live.update
-            if diagnostics is not None:
-                diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.problems.current))
-
-            def show(config: Config) -> None:
-                orders.show(config)
-                if publisher is not None:
-                    publisher.configure(config)
-
-            return show
-
-        callback = on_result if publisher is not None or diagnostics is not None else None
         problems = source.problems
-        return _watch(source, settings, options, notes, loader, callback, follow, control, raw, problems)
+        return _watch(source, settings, options, notes, loader, companions, control, raw, problems)
 
 
 def _watch(
@@ -267,15 +220,28 @@ def _watch(
     options: LiveOptions,
     notes: Notes,
     loader: StageLoader,
-    on_result: Callable[[FrameResult], None] | None,
-    follow: Callable[[Live], Callable[[Config], None]],
+    companions: Sequence[Companion],
     control: Control | None = None,
     raw: RawRecorder | None = None,
     problems: CurrentProblems | None = None,
 ) -> int:
     """Run until the source ends or the user ends it."""
+    from bevviz.live.publish import Publisher
     from bevviz.live.run_outputs import Outputs
     from bevviz.live.runtime import Live
+
+    takers = [companion for companion in companions if companion.takes_results]
+    publisher = Publisher(settings.config, takers)
+
+    def publish(result: FrameResult) -> None:
+        publisher.publish(result)
+        for companion in takers:
+            companion.observe(result)
+
+    def show_change(config: Config) -> None:
+        publisher.configure(config)
+        for companion in companions:
+            companion.show(config)
 
     output = options.output
     show_window = output.viewer
@@ -291,14 +257,18 @@ def _watch(
         outputs,
         notes,
         observe=options.run.observe,
-        on_result=on_result,
+        on_result=publish if takers else None,
         loader=loader,
         control=control,
         raw=raw,
         robot=options.run.robot,
         problems=problems,
     )
-    live.on_change = follow(live)
+    if control is not None:
+        control.save = live.save
+    live.on_change = show_change
+    for companion in companions:
+        companion.begin(live)
     for url in live.outputs.urls:
         say(f"viewer at {url}", always=True)
     if no_output and not show_window:
@@ -310,9 +280,10 @@ def _watch(
         progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
 
-        def show(status: Status) -> None:
-            bar.set_postfix_str(f"{1e3 * status.p50:.0f} ms, {sum(status.drops.values())} dropped", False)
-            bar.update(status.frames - bar.n)
+        def show() -> None:
+            median = 1e3 * live.health.percentile(50)
+            bar.set_postfix_str(f"{median:.0f} ms, {sum(live.drops.values())} dropped", False)
+            bar.update(live.frames - bar.n)
 
         live.run(show)
     if (comparison := live.against) is not None:
@@ -330,7 +301,7 @@ def _watch(
         f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "") for paths in live.outputs.saved
     ]
     target = f" in {', '.join(targets)}" if targets else ""
-    drops = [f"{count} ({place})" for place, count in live.status.drops.items() if count]
+    drops = [f"{count} ({place})" for place, count in live.drops.items() if count]
     say(f"{live.frames} frames{target}, {' + '.join(drops) or 'none'} dropped")
     return 0 if live.frames else 1
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from bevviz.errors import UserError
-from bevviz.live.node import Node
+from bevviz.live.node import INPUT, Node
 from bevviz.live.typesupport import message_type
 from bevviz.messages.decoders import reads_bytes
-from bevviz.messages.definitions import learn, store_of
+from bevviz.messages.definitions import store_of
 from bevviz.messages.topics import CLOUDS
 
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # rmw's node name for a publisher that is discovered before its node
@@ -24,7 +24,6 @@ STREAM_DEPTH = 100  # small messages that come in bursts
 FIRST = 1.0  # seconds after subscribing in which lost messages are expected and not counted
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 MERGED = 1000  # messages that one of two subscriptions may be behind the other
-PATIENCE = 3.0  # seconds until a missing answer is reported and the request is repeated
 PACKET_DEPTH = 512  # LiDAR packets, about 1000 a second: those that arrive while a scan is decoded
 
 
@@ -60,8 +59,7 @@ def published_topics(session: Node, rank: Callable[[str, str], int]) -> dict[str
     """
     topics = {}
     for name, _ in session.input.get_topic_names_and_types():
-        publishers = session.input.get_publishers_info_by_topic(name)
-        foreign = [p for p in publishers if not session.owns(p)]
+        foreign = foreign_publishers(session.node, name)
         if foreign:
             kind = min({p.topic_type for p in foreign}, key=lambda kind: (rank(name, kind), kind))
             of_kind = tuple(p for p in foreign if p.topic_type == kind)
@@ -140,9 +138,9 @@ def open_publisher(node: Any, kind: str, topic: str, *, shared: bool = False) ->
 
 
 def foreign_publishers(node: Any, name: str) -> list[Any]:
-    """Return rclpy's TopicEndpointInfo of the publishers of a topic that belong to other nodes."""
-    me = (node.get_name(), node.get_namespace())
-    return [p for p in node.get_publishers_info_by_topic(name) if (p.node_name, p.node_namespace) != me]
+    """Return rclpy's TopicEndpointInfo of the publishers of a topic that are not of the two nodes here."""
+    own = {(f"{node.get_name()}{suffix}", node.get_namespace()) for suffix in ("", INPUT)}
+    return [p for p in node.get_publishers_info_by_topic(name) if (p.node_name, p.node_namespace) not in own]
 
 
 def _who_publishes(name: str, others: Sequence[Any], kind: str) -> str:
@@ -163,6 +161,16 @@ def rename_advice(topic: str) -> str:
 Receive = Callable[[PublishedTopic, bytes, dict[str, Any]], None]  # topic, message, rclpy's message info
 
 
+class TypeRequests(Protocol):
+    """Client that asks publishing nodes for unknown types, of an extension in ``bevviz.message_types``."""
+
+    def ask(self, topic: PublishedTopic) -> str | None:
+        """Ask a publisher of a topic for its type. Return why that fails, or None while an answer may come.
+
+        ``definitions.store_of`` knows the type after an answer.
+        """
+
+
 @dataclass(slots=True)
 class _Subscription:
     """Subscription with its type and quality of service."""
@@ -177,7 +185,7 @@ class Subscriptions:
 
     Args:
         node: the nodes of bevviz.
-        requests: asks publishers for the definitions of unknown types.
+        requests: clients that ask publishers for the definitions of unknown types. The first one does.
         receive: called with each message.
         on_loss: called with topic and number of messages that the middleware has lost. None: not watched.
     """
@@ -185,7 +193,7 @@ class Subscriptions:
     def __init__(
         self,
         node: Node,
-        requests: TypeRequests,
+        requests: Sequence[TypeRequests],
         receive: Receive,
         on_loss: Callable[[str, int], None] | None = None,
     ) -> None:
@@ -215,7 +223,7 @@ class Subscriptions:
             if decoded and not reads_bytes(topic.type):
                 store_of(topic.type)
         except UserError as error:
-            why = self._requests.ask(topic)
+            why = next((client.ask(topic) for client in self._requests), "nothing here asks its publisher")
             return f"{error}; {why}" if why is not None else ""
         qos = matched_qos(topic.publishers, topic.type.rpartition("/")[2])
         former = self._by_topic.get(topic.name)
@@ -337,81 +345,3 @@ def _first_of_two(
         receive(data, info)
 
     return take
-
-
-# --- definitions of unknown types --------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _Question:
-    """Request to one node for the definition of one type."""
-
-    client: Any
-    since: float
-    sent: float = 0.0
-    future: Any = None
-    why: str = ""  # reason why there is no answer
-
-
-class TypeRequests:
-    """Client that asks publishing nodes for unknown types. Only the receiving thread may use it."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._met: dict[str, float] = {}  # type without a node to ask -> time it was first met
-        self._questions: dict[tuple[str, str], _Question] = {}  # by type and node
-
-    def ask(self, topic: PublishedTopic) -> str | None:
-        """Ask a publisher of a topic for its type. Return why that fails, or None while an answer may come.
-
-        ``definitions.store_of`` knows the type after an answer.
-        """
-        now = time.monotonic()
-        publisher = next((p for p in topic.publishers if _can_say(p)), None)
-        if publisher is None:  # no node can answer, or it is not discovered yet
-            waited = now - self._met.setdefault(topic.type, now)
-            return "its publishers do not say what it is made of, either" if waited > PATIENCE else None
-        whom = full_name(publisher)
-        question = self._questions.get((topic.type, whom))
-        if question is None:
-            from type_description_interfaces.srv import GetTypeDescription
-
-            client = self._node.input.create_client(GetTypeDescription, f"{whom}/get_type_description")
-            question = self._questions[topic.type, whom] = _Question(client, now)
-        if question.why:
-            return f"{whom}, which publishes it, was asked: {question.why}"
-        if now - question.sent > PATIENCE and question.client.service_is_ready():
-            self._send(question, topic.type, str(publisher.topic_type_hash))
-        if now - question.since > PATIENCE:
-            return f"{whom}, which publishes it, was asked and does not answer"
-        return None
-
-    def _send(self, question: _Question, name: str, digest: str) -> None:
-        from type_description_interfaces.srv import GetTypeDescription
-
-        def answered(future: Any) -> None:
-            response = future.result()
-            question.why = str(response.failure_reason) if not response.successful else ""
-            try:
-                if response.successful:
-                    sources = {s.type_name: (s.encoding, s.raw_file_contents) for s in response.type_sources}
-                    learn(name, sources, digest)
-            except UserError as error:
-                question.why = str(error)
-
-        if question.future is not None:
-            question.client.remove_pending_request(question.future)
-        request = GetTypeDescription.Request(type_name=name, type_hash=digest, include_type_sources=True)
-        question.sent = time.monotonic()
-        question.future = question.client.call_async(request)
-        question.future.add_done_callback(answered)
-
-
-def _can_say(publisher: Any) -> bool:
-    """Return whether the node of an rclpy TopicEndpointInfo can be asked.
-
-    Older releases give no type hash.
-    """
-    return publisher.node_name != UNKNOWN and str(getattr(publisher, "topic_type_hash", "")).startswith(
-        "RIHS"
-    )

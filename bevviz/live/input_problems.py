@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 from statistics import median
 
@@ -59,11 +59,9 @@ class InputProblems:
         self._config, self._node, self._inputs, self._subscriptions = config, node, inputs, subscriptions
         self._watch, self._problems = watch, problems
         self.apart: frozenset[str] = frozenset()
-        self._doubted: set[str] = set()  # topics whose clock was doubtful at the last look
         self._counts: dict[tuple[str, str], tuple[int, float]] = {}  # count, and when it last rose
         self._resets = self._frames = 0  # as of the last look
         self._driver = ""  # the same
-        self._blind: Counter[str] = Counter()  # clouds without a point in a row, by topic
         self._waits: deque[float] = deque(maxlen=WAITS)  # seconds from the receipt of a cloud to its frame
         self._begun = time.monotonic()
 
@@ -71,15 +69,14 @@ class InputProblems:
         """Check a frame when it is complete."""
         self._waits.append(1e-9 * (time.time_ns() - frame.received))
         for cloud in frame.clouds:
-            empty = not len(cloud.xyz)
-            self._blind[cloud.topic] = self._blind[cloud.topic] + 1 if empty else 0
             why = (
                 f"all {cloud.dropped:,} points are NaN, infinite or (0, 0, 0)"
                 if cloud.dropped
                 else "0 points"
             )
-            text = f"LiDAR {cloud.topic} sees nothing: {why}" if self._blind[cloud.topic] >= BLIND else ""
-            self._problems.set("blind", cloud.topic, text, f"LiDAR {cloud.topic} sees points again")
+            text = "" if len(cloud.xyz) else f"LiDAR {cloud.topic} sees nothing: {why}"
+            over = f"LiDAR {cloud.topic} sees points again"
+            self._problems.set("blind", cloud.topic, text, over, begins=BLIND)
 
     def look(
         self,
@@ -173,12 +170,10 @@ class InputProblems:
         report, doubts = sync.report, dict[str, str]()
         for text in report.clocks.doubts(report.clocked):
             doubts[text.partition(": ")[0]] = text
-        told = doubts.keys() & self._doubted
         for topic in report.clocked:
-            text = doubts[topic] if topic in told else ""
             over = f"{topic}: its clock agrees with the others again"
-            self._problems.set("clock", topic, text, over, quiet=True)
-        self._doubted = set(doubts)
+            self._problems.set("clock", topic, doubts.get(topic, ""), over, quiet=True, begins=2)
+        told = {p.finding.subject for p in self._problems.current if p.finding.kind == "clock"}
         clocks = report.clocks
         right = clocks.reference(report.clocked)
         wrong = {topic for topic in told if clocks.wrong(topic, right)}  # not only late

@@ -28,6 +28,7 @@ MEETING = (
     "run in an environment that has that middleware"
 )
 
+INPUT = "_input"  # end of the name of the node that receives
 LAST_DOMAIN = 232  # the ports of higher ones would lie beyond 65535
 
 # The wheels set it after they have restarted the interpreter with their library path. A child process of
@@ -69,7 +70,7 @@ class Node(Closable):
             rclpy.init(args=ros_args, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             self.node: Any = rclpy.create_node(name, context=self._context)
             self.input: Any = rclpy.create_node(
-                f"{self.node.get_name()}_input",
+                f"{self.node.get_name()}{INPUT}",
                 namespace=self.node.get_namespace(),
                 context=self._context,
                 use_global_arguments=False,
@@ -107,11 +108,6 @@ class Node(Closable):
     def resolve(self, topic: str) -> str:
         """Return the name on the graph of a topic that the user states: with namespace, remapped."""
         return str(self.node.resolve_topic_name(topic))
-
-    def owns(self, endpoint: Any) -> bool:
-        """Return whether an rclpy TopicEndpointInfo belongs to one of these two nodes."""
-        node_name = (endpoint.node_name, endpoint.node_namespace)
-        return any(node_name == (node.get_name(), node.get_namespace()) for node in (self.node, self.input))
 
     @property
     def is_alone(self) -> bool:

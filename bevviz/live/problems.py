@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -60,6 +61,7 @@ class CurrentProblems:
         self._lock = threading.Lock()
         self._problems: dict[tuple[str, str], Problem] = {}
         self._past: dict[tuple[str, str], PastProblem] = {}
+        self._rows: Counter[tuple[str, str]] = Counter()  # calls in a row with a sentence; negative: without
         self._events: set[str] = set()
 
     def set(
@@ -71,6 +73,8 @@ class CurrentProblems:
         remedy: Remedy | str | None = None,
         *,
         quiet: bool = False,
+        begins: int = 1,
+        ends: int = 1,
     ) -> None:
         """Set the problem of this kind and subject.
 
@@ -83,12 +87,19 @@ class CurrentProblems:
             over: sentence for its end. Empty: ``text`` is told to be over.
             remedy: what would end it.
             quiet: whether a changed sentence needs no further line.
+            begins: calls in a row with a sentence from which on the problem holds.
+            ends: calls in a row without one after which it is over.
         """
         remedy = Remedy(remedy) if isinstance(remedy, str) else remedy
         finding = InputFinding(kind, subject, text, remedy)
         key, now = (kind, subject), time.time()
         with self._lock:
-            before = self._problems.pop(key, None)
+            row = self._rows[key]
+            self._rows[key] = row = max(1, row + 1) if text else min(-1, row - 1)
+            before = self._problems.get(key)
+            if (before is None and row < begins) or (before is not None and 0 < -row < ends):
+                return
+            self._problems.pop(key, None)
             if text:
                 since = now if before is None else before.since
                 self._problems[key] = Problem(finding, since, over or f"over: {text}")

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence, Set
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from bevviz.config import Config
-from bevviz.errors import UserError
-from bevviz.live.graph import UNKNOWN, foreign_publishers, full_name, open_publisher, rename_advice
-from bevviz.live.node import add_timer
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
@@ -36,7 +31,6 @@ FUSED = "/detection/fused_3d"
 TRACKS = "/detection/tracks_3d"
 MARKERS = "/visualization/tracks"
 TRANSFORMS = "/tf"
-LOOK = 0.5  # seconds between two looks for other publishers of our topics
 SPEED = "speed_m_s"  # class of a track's second result; the score of that result is the speed
 TOPICS = {
     BEV: "sensor_msgs/msg/Image",
@@ -58,80 +52,6 @@ class ResultSink(Protocol):
 
     def send(self, topic: str, data: bytes, stamp: int) -> None:
         """Send a message in CDR with its stamp in nanoseconds."""
-
-
-class ClosableSink(ResultSink, AbstractContextManager[Any], Protocol):
-    """Receiver of results that is closed at the end of a run."""
-
-
-class Watch(Protocol):
-    """Program beside a live run that shows the results, registered in the group ``bevviz.watches``."""
-
-    OPTIONS: type  # dataclass of the options of ``bevviz live`` by which a user asks for it
-
-    def open_sink(self, options: Any, *, observe: bool) -> ClosableSink | None:
-        """Return what takes the results. None: the options do not ask for it.
-
-        Args:
-            options: values of ``OPTIONS``.
-            observe: whether the run makes no results.
-
-        Raises:
-            UserError: it cannot be started.
-        """
-
-
-class RosTopics:
-    """Publishers of a ROS node. A topic that another node publishes is left to that node.
-
-    If another node begins to publish a topic later, ours ends there, and does not begin again: a robot that
-    loses its detector must not be steered by ours.
-
-    Args:
-        node: an rclpy node, whose remaps apply.
-        tell: called with one sentence for each topic that is not published.
-    """
-
-    def __init__(self, node: Any, tell: Callable[[str], None] = lambda text: None) -> None:
-        self._node, self._tell = node, tell
-        self._lock = threading.Lock()  # guards ``_publishers``, from which the timer removes
-        self._publishers: dict[str, Any] = {}
-        for topic, kind in TOPICS.items():
-            if topic == TRANSFORMS:  # The robot publishes its own.
-                continue
-            try:
-                self._publishers[topic] = open_publisher(node, kind, topic)
-            except UserError as error:
-                tell(f"{topic} is not published: {error}")
-        add_timer(node, LOOK, self._give_way)
-
-    @property
-    def topics(self) -> Set[str]:
-        """Topics that are published."""
-        return self._publishers.keys()
-
-    def wants(self, topic: str) -> bool:
-        """Return whether anybody receives a topic."""
-        with self._lock:
-            publisher = self._publishers.get(topic)
-            return publisher is not None and publisher.get_subscription_count() > 0
-
-    def send(self, topic: str, data: bytes, stamp: int) -> None:
-        """Publish a message, unless another node publishes the topic by now."""
-        with self._lock:
-            if (publisher := self._publishers.get(topic)) is not None:
-                publisher.publish(data)
-
-    def _give_way(self) -> None:
-        """End each topic that another node publishes by now."""
-        for topic in list(self._publishers):
-            name = self._node.resolve_topic_name(topic)
-            others = [p for p in foreign_publishers(self._node, name) if p.node_name != UNKNOWN]
-            if others:
-                with self._lock:
-                    self._node.destroy_publisher(self._publishers.pop(topic))
-                who = f"{full_name(others[0])} publishes {name} now"
-                self._tell(f"{topic} is not published any more: {who}; {rename_advice(topic)}")
 
 
 class Publisher:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -25,9 +24,9 @@ from rosbags.interfaces import (
 
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
-from bevviz.live.graph import UNKNOWN, PublishedTopic, Subscriptions, TypeRequests, full_name
+from bevviz.live.graph import TRANSFORMS, UNKNOWN, PublishedTopic, Subscriptions, TypeRequests, full_name
 from bevviz.live.node import Node
-from bevviz.messages.definitions import store_of
+from bevviz.messages.definitions import deserialize_cdr, store_of, typestore
 from bevviz.messages.foreign_boxes import holds_boxes
 
 MEGABYTE = 1_000_000
@@ -63,7 +62,7 @@ class LatchedMessages:
     """
 
     def __init__(self) -> None:
-        self._last: dict[tuple[str, tuple[bytes, ...]], RawMessage] = {}
+        self._last: dict[tuple[str, tuple[str, ...]], RawMessage] = {}
         self.size = 0
 
     def add(self, message: RawMessage) -> None:
@@ -197,28 +196,12 @@ class RawRecorder:
             self._sink = None
 
 
-def children(data: bytes) -> tuple[bytes, ...]:
+def children(data: bytes) -> tuple[str, ...]:
     """Return the child frames of a serialised tf2_msgs/TFMessage, or none if it cannot be read."""
-    with suppress(struct.error, IndexError):
-        return tuple(_children(data))
+    with suppress(Exception):  # rosbags' generated code raises any exception, depending on the bytes
+        message = deserialize_cdr(typestore(), data, TRANSFORMS)
+        return tuple(transform.child_frame_id for transform in message.transforms)
     return ()
-
-
-def _children(data: bytes) -> Iterator[bytes]:
-    """Yield the child frames of a serialised tf2_msgs/TFMessage."""
-    order = "<" if data[1] & 1 else ">"
-    length = struct.Struct(order + "I")
-    (count,) = length.unpack_from(data, 4)
-    at = 8
-    for _ in range(count):
-        at += 8  # the stamp
-        (size,) = length.unpack_from(data, at)
-        at += 4 + size
-        at += -at % 4
-        (size,) = length.unpack_from(data, at)
-        yield data[at + 4 : at + 3 + size]
-        at += 4 + size
-        at += (4 - at) % 8 + 56  # numbers are aligned relative to the end of the four-byte header
 
 
 class RawTopics:
@@ -233,7 +216,7 @@ class RawTopics:
         requests: asks publishers for unknown types.
     """
 
-    def __init__(self, node: Node, recorder: RawRecorder, requests: TypeRequests) -> None:
+    def __init__(self, node: Node, recorder: RawRecorder, requests: Sequence[TypeRequests]) -> None:
         self._recorder = recorder
         self._connections: dict[str, Connection] = {}
         self._further = Subscriptions(node, requests, self._receive)

@@ -21,20 +21,14 @@ class ResultProblems:
 
     def __init__(self, problems: CurrentProblems) -> None:
         self._problems = problems
-        self._lasted: dict[tuple[str, str], int] = {}  # frames in a row; negative: without it
+        self._known: set[tuple[str, str]] = set()  # kind and subject of each problem so far
 
     def observe(self, result: FrameResult) -> None:
         """Check the result of a frame."""
         found = dict(self._found(result))
-        for key in [*self._lasted, *(found.keys() - self._lasted.keys())]:
-            lasted = self._lasted.get(key, 0)
-            self._lasted[key] = lasted = max(1, lasted + 1) if key in found else min(-1, lasted - 1)
-            kind, subject = key
-            if lasted >= LASTING:
-                self._problems.set(kind, subject, found[key])
-            elif lasted <= -OVER:
-                self._problems.set(kind, subject, "")
-                del self._lasted[key]
+        self._known |= found.keys()
+        for key in self._known:
+            self._problems.set(*key, found.get(key, ""), begins=LASTING, ends=OVER)
 
     def _found(self, result: FrameResult) -> Iterator[tuple[tuple[str, str], str]]:
         """Yield kind and subject with the sentence of each problem in a frame."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.result_problems import ResultProblems
 from bevviz.live.robot_comparison import RobotComparison
 from bevviz.live.run_outputs import Outputs, RunOutputs
-from bevviz.live.source_wrappers import RobotFrames, ThinnedSource, warm_up
+from bevviz.live.source_wrappers import RobotFrames, thinned, warm_up
 from bevviz.live.status import Health, Notes
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
@@ -44,18 +44,6 @@ LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 PAUSE = 1.0  # seconds without a frame after which the states of the topics are shown without one
 GLANCE = 0.2  # seconds between two looks at them then
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-@dataclass(frozen=True, slots=True)
-class Status:
-    """Statistics of a run. ``drops`` counts dropped frames by cause, without those thinned on purpose."""
-
-    frames: int
-    p50: float  # seconds from arrival to logged, over the recent frames
-    p99: float
-    cpu: float  # percent of one core
-    memory: float  # MB
-    drops: Mapping[str, int]
 
 
 class Live:
@@ -97,7 +85,6 @@ class Live:
         self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
         self.frames = 0  # frames logged so far
         self._source = source
-        self._thinned = ThinnedSource(source, lambda: self.config)
         self.problems = problems or CurrentProblems(notes.warn)
         self._results = ResultProblems(self.problems)
         self._on_result = on_result
@@ -133,12 +120,6 @@ class Live:
         return self.session.config
 
     @property
-    def status(self) -> Status:
-        """Current statistics."""
-        p50, p99 = (self.health.percentile(percent) for percent in (50, 99))
-        return Status(self.frames, p50, p99, self.health.cpu, self.health.memory, self._drops())
-
-    @property
     def silence(self) -> str:
         """One sentence with the silent topics if no frame comes. Empty: frames come, or none has come yet."""
         if not self.frames or time.monotonic() - self._logged < PAUSE:
@@ -154,9 +135,31 @@ class Live:
         return [*map(str, past.values()), *map(str, findings)]
 
     @property
+    def drops(self) -> dict[str, int]:
+        """Dropped frames and messages by cause, without those thinned on purpose."""
+        return {"source": self._source.dropped, **self._dropping.dropped, **self.outputs.dropped}
+
+    # --- the frames, as the input of ``run`` ---------------------------------------------------
+
+    @property
     def scene(self) -> Scene:
         """Names of the sensors."""
         return self._source.scene
+
+    @property
+    def total(self) -> int | None:
+        """Number of frames, if known."""
+        return self._source.total
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Suspicious data so far, one sentence each."""
+        return self._source.warnings
+
+    def __iter__(self) -> Iterator[Frame]:
+        return thinned(self._source, lambda: self.config)
+
+    # --- outputs and requests ------------------------------------------------------------------
 
     def attach(self, output: Output, watcher: Callable[[FrameResult], None]) -> None:
         """Add an output before the run. It is closed at the end of the run.
@@ -171,15 +174,14 @@ class Live:
     @property
     def numbers(self) -> dict[str, float]:
         """Statistics by name, for a monitor."""
-        status = self.status
         numbers = {
-            "frames": float(status.frames),
-            "latency p50, ms": 1e3 * status.p50,
-            "latency p99, ms": 1e3 * status.p99,
-            "CPU, percent of a core": status.cpu,
-            "memory, MB": status.memory,
+            "frames": float(self.frames),
+            "latency p50, ms": 1e3 * self.health.percentile(50),
+            "latency p99, ms": 1e3 * self.health.percentile(99),
+            "CPU, percent of a core": self.health.cpu,
+            "memory, MB": self.health.memory,
         }
-        numbers |= {f"dropped: {where}": float(count) for where, count in status.drops.items()}
+        numbers |= {f"dropped: {where}": float(count) for where, count in self.drops.items()}
         numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, lag in self.outputs.lags.items()}
         return numbers | {path.rpartition("/")[2]: n for path, n in self.flight.scalars.items()}
 
@@ -197,7 +199,7 @@ class Live:
 
     # --- the run -------------------------------------------------------------------------------
 
-    def run(self, on_tick: Callable[[Status], None] = lambda status: None) -> None:
+    def run(self, on_tick: Callable[[], None] = lambda: None) -> None:
         """Run until the end and close everything. Call it from the main thread.
 
         Raises:
@@ -217,7 +219,7 @@ class Live:
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
                 self._check()
-                on_tick(self.status)
+                on_tick()
 
         observers: list[Observer[FrameResult]] = [LoggingObserver(self), self.checks]
         if self._on_result is not None:
@@ -233,7 +235,7 @@ class Live:
             stack.callback(_handle, dict.fromkeys(ENDING[2:], signal.SIG_IGN))
             try:
                 drops, stop = self._dropping, self._over
-                run(self._thinned, self.session, observers, dropping=drops, stop=stop, tick=tick)
+                run(self, self.session, observers, dropping=drops, stop=stop, tick=tick)
             except UserError:
                 raise
             except Exception as error:
@@ -256,7 +258,7 @@ class Live:
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
-        drops = {entities.DROPS.path(where): float(count) for where, count in self._drops().items()}
+        drops = {entities.DROPS.path(where): float(count) for where, count in self.drops.items()}
         health = self.health.scalars() | drops | self.outputs.scalars
         result = self._with_marks(result)
         late, states = self._source.overtaken(), self._topic_states()
@@ -306,10 +308,6 @@ class Live:
     def _topic_states(self) -> dict[str, str]:
         """Return the states of the topics, by entity path."""
         return {entities.TOPIC_STATE.path(topic): state for topic, state in self._source.states.items()}
-
-    def _drops(self) -> dict[str, int]:
-        """Return the dropped frames and messages, by cause."""
-        return {"source": self._source.dropped, **self._dropping.dropped, **self.outputs.dropped}
 
     # --- changes -------------------------------------------------------------------------------
 

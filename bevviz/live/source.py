@@ -11,7 +11,7 @@ from typing import Any
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.live.graph import PublishedTopic, Subscriptions, TypeRequests, published_topics
+from bevviz.live.graph import PublishedTopic, Subscriptions, published_topics
 from bevviz.live.input_problems import InputProblems
 from bevviz.live.inputs import SILENCE, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
@@ -24,6 +24,7 @@ from bevviz.messages.roles import MARK, Roles
 from bevviz.model.frame import Frame, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.pipeline.run import MAX_BURST
 from bevviz.support.contexts import Closable
+from bevviz.support.extensions import load_all
 from bevviz.support.queues import NewestQueue
 from bevviz.sync.buffers import MARKS
 from bevviz.sync.synchronizer import OVERTAKEN
@@ -87,7 +88,7 @@ class LiveSource(Closable):
         self.middleware = self._node.middleware
         self._inputs = Inputs(config, self._node.resolve, self.problems, results=results)
         self.frame_ids = self._inputs.frame_ids  # topic -> frame id of its first message
-        requests = TypeRequests(self._node)
+        requests = [types.TypeRequests(self._node) for types in load_all("message_types", self.problems.tell)]
         self._subscriptions = Subscriptions(
             self._node, requests, self._locked(self._receive), self._locked(self._count_lost)
         )

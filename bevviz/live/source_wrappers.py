@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from typing import Any, Protocol
@@ -48,49 +48,25 @@ class RobotFrames(Items[Frame], Protocol):
         """End the iteration. Any thread may call it."""
 
 
-class ThinnedSource:
-    """Source that leaves out frames and points as the configuration asks.
+def thinned(
+    frames: Iterable[Frame], config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
+) -> Iterator[Frame]:
+    """Yield the frames and points that the configuration asks for.
 
     Args:
-        source: source of the frames.
+        frames: frames of the robot.
         config: returns the current configuration.
         clock: returns seconds, for tests.
     """
-
-    def __init__(
-        self, source: RobotFrames, config: Callable[[], Config], clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._source, self._config, self._clock = source, config, clock
-
-    @property
-    def scene(self) -> Scene:
-        """Names of the sensors."""
-        return self._source.scene
-
-    @property
-    def total(self) -> int | None:
-        """Number of frames of the source, if known."""
-        return self._source.total
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Warnings of the source."""
-        return self._source.warnings
-
-    def stop(self) -> None:
-        """End the iteration of the source."""
-        self._source.stop()
-
-    def __iter__(self) -> Iterator[Frame]:
-        earliest = 0.0
-        for number, frame in enumerate(self._source):
-            live, now = self._config().live, self._clock()
-            if number % live.every or now < earliest:
-                continue
-            if live.max_rate is not None:
-                # A frame that comes a little early keeps its turn. A pause permits no burst afterwards.
-                earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
-            yield thin(frame, live.points)
+    earliest = 0.0
+    for number, frame in enumerate(frames):
+        live, now = config().live, clock()
+        if number % live.every or now < earliest:
+            continue
+        if live.max_rate is not None:
+            # A frame that comes a little early keeps its turn. A pause permits no burst afterwards.
+            earliest = max(earliest + 1 / live.max_rate, now - 0.5 / live.max_rate)
+        yield thin(frame, live.points)
 
 
 def thin(frame: Frame, points: int | None) -> Frame:

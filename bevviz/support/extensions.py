@@ -17,6 +17,7 @@ Kind: TypeAlias = Literal[
     "decoders",
     "exports",
     "files",
+    "message_types",
     "questions",
     "rescuers",
     "simulators",

@@ -102,14 +102,14 @@ class RunningRobot(GrowingDrive):
 
     def progress(self) -> RunProgress:
         """Return the progress of the run for the page."""
-        status = self.live.status
-        drops = ", ".join(f"{count} {where}" for where, count in status.drops.items() if count)
+        live = self.live
+        drops = ", ".join(f"{count} {where}" for where, count in live.drops.items() if count)
         return {
-            "done": status.frames,
+            "done": live.frames,
             "total": None,
             "over": True,
             "error": self.live.silence,
-            "warnings": [f"{1e3 * status.p50:.0f} ms", f"dropped: {drops or 'none'}"],
+            "warnings": [f"{1e3 * live.health.percentile(50):.0f} ms", f"dropped: {drops or 'none'}"],
             "problems": [
                 {"text": str(problem), "seconds": max(0, round(time.time() - problem.since))}
                 for problem in self.live.problems.current

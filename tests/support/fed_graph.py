@@ -18,6 +18,7 @@ import pytest
 
 from bevviz.config import load
 from bevviz.extras.demo.drive import LIDAR_TOPIC
+from bevviz.extras.fast_dds import requests
 from bevviz.live import graph, graph_info, input_problems, inputs, problems, raw_recorder, source
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.runtime import Live
@@ -38,6 +39,7 @@ TIMED = (
     inputs,
     problems,
     raw_recorder,
+    requests,
     source,
 )  # modules whose clock is that of the graph
 
@@ -198,9 +200,6 @@ class _Joined:
     def close(self) -> None:
         self._graph.timers.clear()
         self._graph.subscriptions.clear()
-
-    def owns(self, endpoint: Endpoint) -> bool:
-        return endpoint.node_name == self._name
 
     @property
     def is_alone(self) -> bool:

@@ -15,7 +15,7 @@ from bevviz.model.frame import Frame, LateBoxes, Scene, UserMark
 if TYPE_CHECKING:
     from bevviz.cli.live import LiveOptions
     from bevviz.config.reloading import ReloadableConfig
-    from bevviz.live.publish import ResultSink
+    from bevviz.live.companions import Companion
     from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -96,7 +96,6 @@ def main() -> int:
     from bevviz.cli import live
     from bevviz.cli import main as run_command
     from bevviz.extras.demo.drive import SyntheticSource
-    from bevviz.live.publish import Publisher
 
     count, *arguments = sys.argv[1:]
 
@@ -105,14 +104,12 @@ def main() -> int:
         options: LiveOptions,
         notes: Notes,
         loader: StageLoader,
-        sinks: Sequence[ResultSink],
+        companions: Sequence[Companion],
     ) -> int:
         simulated = SyntheticSource(int(count))
         source = Replay(list(simulated), simulated.scene)
-        publisher = Publisher(settings.config, sinks)
-        return live._watch(
-            source, settings, options, notes, loader, publisher.publish, lambda _: publisher.configure
-        )
+        without_graph = [companion for companion in companions if companion.takes_results]
+        return live._watch(source, settings, options, notes, loader, without_graph)
 
     live._run = run
     return run_command(arguments)

@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from bevviz.errors import UserError
+from bevviz.live.companions import Companion
 from bevviz.live.publish import TOPICS
 from bevviz.messages.definitions import definition
 from bevviz.recording.ports import check_port
@@ -39,7 +40,7 @@ _MESSAGE = struct.Struct("<BIQ")  # operation, subscription, stamp in nanosecond
 _MESSAGE_DATA = 1  # operation of a binary message with the data of a topic
 
 
-class FoxgloveServer(Closable):
+class FoxgloveServer(Companion):
     """Server of the topics of ``--publish``, and of the pose of the robot, as ROS 2 messages.
 
     It listens on this machine alone, and takes nothing from its clients. The protocol has no password. A

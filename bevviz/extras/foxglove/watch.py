@@ -44,7 +44,7 @@ class FoxgloveOptions:
 OPTIONS = FoxgloveOptions
 
 
-def open_sink(options: FoxgloveOptions, *, observe: bool) -> FoxgloveServer | None:
+def open(options: FoxgloveOptions, *, observe: bool) -> FoxgloveServer | None:
     """Start the server, if it is requested.
 
     Raises:

@@ -1,0 +1,1 @@
+"""Face of a live run on the robot's graph: result topics, /diagnostics, parameters and a service."""
