@@ -426,6 +426,8 @@ def test_a_steady_run_logs_every_frame_with_its_health(run: Run) -> None:
     add_index(Path("out.rrd"))
     recording = Recording(Path("out.rrd"))
     assert numbers(Path("out.rrd")) == list(range(30)) and sum(outcome.live.drops.values()) == 0
+    with pytest.raises(RuntimeError, match="after shutdown"):
+        outcome.live.session._sensors.worker.submit(print)
     p50 = [v[0] for v in recording.column("/health/latency_ms/p50", "Scalars:scalars")]
     p99 = [v[0] for v in recording.column("/health/latency_ms/p99", "Scalars:scalars")]
     assert all(0 < a <= b for a, b in zip(p50, p99, strict=True))

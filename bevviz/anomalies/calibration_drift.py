@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -70,13 +70,13 @@ class _Pair:
 class PlacementWatch:
     """Detector of cameras that are not where their transform says.
 
-    A check takes longer than all other rules together, so that a thread works on it until the next frame.
+    A check takes longer than all other rules together, so that ``worker`` works on it until the next frame.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, worker: Executor) -> None:
         self._frames = 0
         self._pairs: dict[tuple[str, str], _Pair] = defaultdict(_Pair)
-        self._worker = ThreadPoolExecutor(1, "placement")
+        self._worker = worker
         # Stamp of the frame, names of camera and LiDAR, and the scores.
         self._check: tuple[int, str, str, Future[F64 | None]] | None = None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from bevviz.anomalies.calibration_drift import PlacementWatch
 from bevviz.anomalies.mounting_changes import MountingWatch, ScanShape
@@ -18,29 +19,38 @@ from bevviz.anomalies.sensor_faults import (
 )
 from bevviz.model.frame import Cloud, Frame
 from bevviz.model.results import Anomaly, FrameResult
+from bevviz.support.contexts import Closable
 
 GAP = 1.0  # seconds between two frames, after which the past tells nothing
 
 
-class SensorWatch:
+class SensorWatch(Closable):
     """Detector of faults of cameras, LiDARs and their mountings in consecutive frames.
 
     Runs with other configurations on the same frames may share it: the same frame twice is one frame.
+
+    Attributes:
+        worker: a thread for ``update``, or for what ``update`` leaves to it. It takes one task after another.
     """
 
     def __init__(self) -> None:
+        self.worker = ThreadPoolExecutor(1, "sensors")
         self._start: int | None = None
         self._stamp = 0
         self._last: tuple[int, int] | None = None  # number and stamp of the last frame
         self._found: list[Anomaly] = []  # its faults
         self.clear()
 
+    def close(self) -> None:
+        """End the thread."""
+        self.worker.shutdown(cancel_futures=True)
+
     def clear(self) -> None:
         """Forget all sensors, for a drive that starts again or has a gap."""
         self._images: dict[str, ImageWatch] = {}
         self._scans: dict[str, ScanWatch] = {}
         self._mountings: dict[str, MountingWatch] = {}
-        self._placement = PlacementWatch()
+        self._placement = PlacementWatch(self.worker)
         self._shape: ScanShape | None = None
         self._scan_change = UsualChange(LEAST_SCAN_CHANGE)
         self._still_scans, self._still_since, self._scan_stamp = 0, 0, 0

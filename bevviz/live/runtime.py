@@ -6,14 +6,14 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks import InputChecks
+from bevviz.compare.robot_comparison import RobotComparison
 from bevviz.config import Config
 from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
@@ -26,7 +26,6 @@ from bevviz.live.publish import PublishingObserver
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.requests import Control, answer_sigusr1
 from bevviz.live.result_problems import ResultProblems
-from bevviz.live.robot_comparison import RobotComparison
 from bevviz.live.run_outputs import Outputs, RunOutputs
 from bevviz.live.source_wrappers import RobotFrames, thinned, warm_up
 from bevviz.live.status import Health, Notes
@@ -227,6 +226,7 @@ class Live:
         return_freed_memory()
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
+            stack.enter_context(self.session)
             stack.enter_context(self.outputs)
             if self._control is None:
                 stack.enter_context(Control(self.save, self.notes.warn))
@@ -355,13 +355,9 @@ class LiveSession(Session):
 
     estimates_motion = False
 
-    def __init__(self, config: Config, loader: StageLoader | None = None) -> None:
-        self._sensors, self._worker = SensorWatch(), ThreadPoolExecutor(1, "sensors")
-        super().__init__(config, loader=loader, sensors=self._sensors)
-
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
-        sensors = self._worker.submit(self._sensors.update, result)
+        sensors = self._sensors.worker.submit(self._sensors.update, result)
         explained = add_explanations(result)
         sensors.result()
         return self.add_anomalies(explained)

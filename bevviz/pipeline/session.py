@@ -20,9 +20,10 @@ from bevviz.pipeline.stage_log import Memo, StageLog
 from bevviz.stages.fusion import clusters_in_view
 from bevviz.stages.odometry import Odometry, place
 from bevviz.stages.tracking import Tracker
+from bevviz.support.contexts import Closable
 
 
-class Session:
+class Session(Closable):
     """Processor of the frames of one drive, in order.
 
     ``perceive`` and ``finish`` may run in two threads, each in the order of the frames. ``configure`` may be
@@ -57,7 +58,12 @@ class Session:
         self._in_force = config, self.loader.load(config, detect)  # Both are read and replaced together.
         self._odometry = odometry or Odometry()
         self._tracker = Tracker()
-        self._anomalies = AnomalyDetector(sensors)
+        self._sensors = sensors or SensorWatch()
+        self._anomalies = AnomalyDetector(self._sensors)
+
+    def close(self) -> None:
+        """End the thread that watches the sensors."""
+        self._sensors.close()
 
     @property
     def config(self) -> Config:
