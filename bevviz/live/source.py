@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +14,12 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic, Subscriptions, published_topics
 from bevviz.live.input_problems import InputProblems
-from bevviz.live.inputs import SILENCE, STALL, Inputs, TopicWatch
+from bevviz.live.inputs import KINDS, SILENCE, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer
 from bevviz.live.problems import CurrentProblems
 from bevviz.live.raw_recorder import RawRecorder, RawTopics
+from bevviz.live.typesupport import message_type
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_message
 from bevviz.messages.roles import MARK, Roles
@@ -88,6 +90,9 @@ class LiveSource(Closable):
         self.middleware = self._node.middleware
         self._inputs = Inputs(config, self._node.resolve, self.problems, results=results)
         self.frame_ids = self._inputs.frame_ids  # topic -> frame id of its first message
+        for kind in KINDS:  # To import them takes 0.1 s, in which the receiving thread would receive nothing.
+            with suppress(UserError):
+                message_type(kind)
         requests = [types.TypeRequests(self._node) for types in load_all("message_types", self.problems.tell)]
         self._subscriptions = Subscriptions(
             self._node, requests, self._locked(self._receive), self._locked(self._count_lost)

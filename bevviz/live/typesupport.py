@@ -25,6 +25,9 @@ def message_type(name: str) -> Any:
     message_class = getattr(module, short, None)
     if message_class is None:
         raise UserError(f"the installed {package} has no message {short}")
+    from rclpy.type_support import check_for_type_support
+
+    check_for_type_support(message_class)  # loads the C library now, rather than at the first subscription
     return message_class
 
 
