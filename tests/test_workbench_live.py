@@ -19,18 +19,26 @@ from urllib.parse import urlsplit
 import pytest
 
 import bevviz
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder
+from bevviz.live.run_outputs import Outputs
+from bevviz.live.runtime import Live
+from bevviz.live.status import Notes
 from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.why import Selection
 from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
-from bevviz.workbench.running_robot import KEPT, RunningRobot
+from bevviz.workbench.running_robot import KEPT, RunningRobot, robot_session
+from bevviz.workbench.server import LivePage
 from bevviz.workbench.session import WorkbenchSession
-from tests.support.live_sessions import live_bench
+from tests.support import kept_drives
+from tests.support.live_sessions import live_bench, run_beside
+from tests.support.replay import Replay
 from tests.support.ros_graphs import own_graph, playing
 from tests.support.ros_player import Play
 from tests.support.waiting import PATIENCE, until
+from tests.support.workbench_pages import chromium, opened
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 HELD = 4
@@ -301,6 +309,30 @@ def test_a_page_lists_the_current_problems(bench: RunningRobot) -> None:
     (silent, clock) = bench.live.summary[:2]
     assert re.fullmatch(r"no message on /camera .* \(\d\d:\d\d:\d\d to \d\d:\d\d:\d\d\)", silent)
     assert re.fullmatch(r"its clock is ahead.* \(since \d\d:\d\d:\d\d\)", clock)
+
+
+@pytest.mark.long
+def test_a_browser_shows_begin_and_end_of_a_problem(
+    results: list[FrameResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = Replay([result.frame for result in results], kept_drives.scene())
+    live = Live(source, ReloadableConfig(None, ["detector.model=demo"]), Outputs(), Notes(lambda line: None))
+    server = LivePage(robot_session(live), None)
+
+    def look() -> None:
+        with chromium() as browser, opened(browser, server.address) as page:
+            rows = page.locator("#problems li", has_text="/camera")  # replayed frames may have others
+            assert not rows.count()
+            live.problems.set("silent", "/camera", "no message on /camera for 1.5 s", "/camera is back")
+            until(rows.count, "the problem")
+            text = rows.inner_text()
+            assert re.fullmatch(r"no message on /camera for 1\.5 s \(for \d+ s\)", text)
+            live.problems.set("silent", "/camera", "")
+            until(lambda: not rows.count(), "its end")
+
+    with server:
+        run_beside(live, look)
 
 
 def test_a_held_frame_can_be_asked_with_other_values(bench: RunningRobot, results: list[FrameResult]) -> None:
