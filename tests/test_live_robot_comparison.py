@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bevviz.compare.robot_comparison import WAITING, RobotComparison
 from bevviz.config import load
 from bevviz.evaluate.differences import Change
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.extras.demo.sensors import Lidar, PinholeCamera
-from bevviz.live.robot_comparison import WAITING, RobotComparison
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult, Objects
 

@@ -42,8 +42,8 @@ class OurFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedFrame:
-    """Differences in one frame."""
+class TimedDifferences:
+    """Differences in one frame, with its time of receipt and its pose."""
 
     differences: FrameDifferences
     received: int
@@ -86,7 +86,7 @@ class RobotComparison:
 
     def compare(
         self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes2D | LabelledBoxes3D]] = ()
-    ) -> list[ComparedFrame]:
+    ) -> list[TimedDifferences]:
         """Take in a frame.
 
         Args:
@@ -152,7 +152,7 @@ class RobotComparison:
         except UserError as error:
             self.topic, self.problem = "", str(error)
 
-    def _compare(self, ours: OurFrame, theirs: SideResult) -> ComparedFrame:
+    def _compare(self, ours: OurFrame, theirs: SideResult) -> TimedDifferences:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
@@ -171,7 +171,7 @@ class RobotComparison:
                 words = ", ".join(f"{_words(d)} {frame_differences.position_of(d)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
-        return ComparedFrame(frame_differences, ours.received, ours.world_from_points)
+        return TimedDifferences(frame_differences, ours.received, ours.world_from_points)
 
     def _differs(self, difference: Difference) -> bool:
         """Return whether a difference is large enough to count."""

@@ -18,8 +18,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.compare.log import DifferenceLogger
+from bevviz.compare.robot_comparison import RobotComparison, TimedDifferences
 from bevviz.config import Config
-from bevviz.live.robot_comparison import ComparedFrame, RobotComparison
 from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
@@ -168,7 +168,7 @@ class Encoder:
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
-        compared: Sequence[ComparedFrame] = (),
+        compared: Sequence[TimedDifferences] = (),
     ) -> Packet:
         """Encode one frame, with changes of the configuration or scene since the last. See ``FrameLogger``.
 
@@ -224,7 +224,7 @@ class Encoder:
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
-    def _log_differences(self, compared: Sequence[ComparedFrame], whole: bool) -> None:
+    def _log_differences(self, compared: Sequence[TimedDifferences], whole: bool) -> None:
         """Log differences from the robot's results."""
         if self._against is None or not (compared or self._differences):
             return
