@@ -160,7 +160,7 @@ FORGED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda made: forge(json.dumps({**about(made), "provenance": 5}), config_yaml(Config())),
         "another version",
     ),
-    "fingerprints that are no archive": (
+    "fingerprints that are an archive": (
         lambda made: forge(json.dumps(about(made)), config_yaml(Config()), ["00 cloud"], ZIP),
         "cannot be read as a report",
     ),

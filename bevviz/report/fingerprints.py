@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import io
+import json
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -83,29 +84,33 @@ def compare(stored: tuple[StageDigest, ...], current: tuple[StageDigest, ...]) -
 
 
 def pack(stages: tuple[StageDigest, ...]) -> tuple[list[str], U8]:
-    """Pack fingerprints for a recording: lines of text and a block of arrays. Rerun compresses the block."""
-    block: dict[str, NDArray[Any]] = {}
-    for stage in stages:
-        block |= {f"whole/{stage.name}/{name}": array for name, array in stage.whole.items()}
-        block |= {f"large/{stage.name}/{name}": np.array(large) for name, large in stage.large.items()}
-    buffer = io.BytesIO()
-    np.savez(buffer, **block)  # type: ignore[arg-type]  # no key is the name of an option
-    return [f"{stage.fingerprint} {stage.name}" for stage in stages], np.frombuffer(
-        buffer.getvalue(), np.uint8
-    )
+    """Pack fingerprints for a recording: lines of text and a block of bytes. Rerun compresses the block.
+
+    The block is a line of JSON, which lists the arrays, and the bytes of the arrays.
+    """
+    listed = [
+        (stage.name, name, array.dtype.str, array.shape)
+        for stage in stages
+        for name, array in stage.whole.items()
+    ]
+    large = [(stage.name, name, *large) for stage in stages for name, large in stage.large.items()]
+    content = [array.tobytes() for stage in stages for array in stage.whole.values()]
+    block = b"\n".join([json.dumps({"whole": listed, "large": large}).encode(), b"".join(content)])
+    return [f"{stage.fingerprint} {stage.name}" for stage in stages], np.frombuffer(block, np.uint8)
 
 
 def unpack(lines: list[str], block: U8) -> tuple[StageDigest, ...]:
     """Return the fingerprints that ``pack`` packed."""
     whole: dict[str, dict[str, NDArray[Any]]] = defaultdict(dict)
     large: dict[str, dict[str, LargeArray]] = defaultdict(dict)
-    with np.load(io.BytesIO(block.tobytes()), allow_pickle=False) as archive:
-        for key in archive.files:
-            kind, stage, name = key.split("/", 2)
-            if kind == "large":
-                large[stage][name] = LargeArray(*archive[key].tolist())
-            else:
-                whole[stage][name] = archive[key]
+    head, _, content = bytearray(block).partition(b"\n")
+    listed, start = json.loads(head), 0
+    for stage, name, *values in listed["large"]:
+        large[stage][name] = LargeArray(*values)
+    for stage, name, kind, shape in listed["whole"]:
+        end = start + np.dtype(kind).itemsize * math.prod(shape)
+        whole[stage][name] = np.frombuffer(content[start:end], kind).reshape(shape)
+        start = end
     split = [line.partition(" ")[::2] for line in lines]
     return tuple(StageDigest(name, fingerprint, whole[name], large[name]) for fingerprint, name in split)
 
