@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -303,3 +304,34 @@ def test_a_list_belongs_to_one_drive_and_configuration(bag: Path, store: None, t
     assert table().load() is None
     table()._store.put(table()._key, zlib.compress(b'{"groups": 3}'))
     assert table().load() is None
+
+
+def test_findings_are_ranked_by_reasons_kind_and_distance() -> None:
+    def frame(**more: Any) -> FindingFrame:
+        return replace(FindingFrame(0, 10**9, 30.0, "truth//0", text="merged"), **more)
+
+    findings = FindingList()
+    lasting = [frame(distance=10.0, in_way=True), frame(stamp=15 * 10**8, distance=9.0)]
+    groups = [
+        ("missed", "second name", [frame(distance=2.0, text="second name")]),
+        ("anomaly", "sync", [frame(distance=float("nan"))]),
+        ("missed", "unknown distance", [frame(distance=float("nan"))]),
+        ("doubtful", "near", [frame(distance=5.0)]),
+        ("fixed", "near", [frame(distance=5.0)]),
+        ("false", "nearer", [frame(distance=4.0)]),
+        ("missed", "lasting", lasting),
+    ]
+    findings.restore(groups)
+    entries, _ = findings.news({})
+    order = [(one["what"], one["name"]) for one in sorted(entries, key=lambda one: one["rank"])]
+    assert order == [
+        ("missed", "lasting"),
+        ("anomaly", "sync"),
+        ("false", "nearer"),
+        ("doubtful", "near"),
+        ("fixed", "near"),
+        ("missed", "second name"),
+        ("missed", "unknown distance"),
+    ]
+    reasons = next(one["reasons"] for one in entries if one["name"] == "lasting")
+    assert reasons == ["in the way of the robot", "nearer than 10 m", "lasts 0.5 s"]

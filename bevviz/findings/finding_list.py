@@ -11,9 +11,10 @@ from itertools import takewhile
 import numpy as np
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from bevviz.findings.frame_findings import Finding, Position
+from bevviz.findings.frame_findings import KINDS, Finding, Position
 from bevviz.model import geometry
 from bevviz.model.frame import F32
+from bevviz.model.reasons import ReasonKind
 
 REACH = 2.5  # metres that an object may have moved since the last frame with this finding
 GAP = 5  # frames without the finding after which a new group begins
@@ -39,6 +40,11 @@ _ANOMALIES = {  # kind -> remark
     "flicker": "Nothing was tried: it lasts several frames, click the object to ask.",
 }
 REMARKS = DIFFERENCES | _ANOMALIES
+SEVERITIES = {**KINDS, "broken": 1.0, "new false": 1.0}  # others: 0
+NEAR = 10.0  # metres
+LONG = 500_000_000  # nanoseconds until it is seen again
+_EVERYTHING = ("sensor", "sync", "tf", "stage")  # anomalies that concern all objects
+_UNKNOWN = 99.0  # metres: a finding without a distance comes after the others
 
 
 class Sight(TypedDict):
@@ -55,11 +61,16 @@ class Sight(TypedDict):
 
 
 class Entry(TypedDict):
-    """A group of findings as the page gets it, with the frames that the page does not have yet."""
+    """A group of findings as the page gets it, with the frames that the page does not have yet.
+
+    Lists are in the order of ``rank``. ``reasons`` say why it comes early.
+    """
 
     number: int
     what: str
     name: str
+    reasons: list[str]
+    rank: tuple[float, ...]
     sights: list[Sight]
 
 
@@ -113,6 +124,32 @@ class FindingGroup:
     position: Position | None = None  # position in the last frame
     box: F32 | None = None
     subject: str = ""  # of an anomaly
+
+    @property
+    def reasons(self) -> list[str]:
+        """Reasons to look at it first. Each counts once."""
+        if self.what == "anomaly":
+            return ["concerns everything that the sensors see"] * (self.name in _EVERYTHING)
+        if all(one.text == ReasonKind.SECOND_NAME for one in self.frames):
+            return []
+        stamps = [one.stamp for one in self.frames]
+        lasts = max(stamps) - min(stamps)
+        reasons = ["in the way of the robot"] * any(one.in_way for one in self.frames)
+        reasons += [f"nearer than {NEAR:g} m"] * (self.distance <= NEAR)
+        return reasons + [f"lasts {lasts / 1e9:.1f} s"] * (lasts >= LONG)
+
+    @property
+    def distance(self) -> float:
+        """Metres to it in its nearest frame."""
+        return min((one.distance for one in self.frames if not math.isnan(one.distance)), default=_UNKNOWN)
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Key of the order of lists: number of reasons, severity of its kind, distance and time."""
+        most = 3 if self.what == "anomaly" else 1
+        severity = SEVERITIES.get(self.what, 0.0)
+        first = self.frames[0].stamp if self.frames else 0
+        return -most * len(self.reasons), -severity, self.distance, first / 1e9
 
 
 class FindingList:
@@ -256,6 +293,8 @@ class FindingList:
                     "number": group.number,
                     "what": group.what,
                     "name": group.name,
+                    "reasons": group.reasons,
+                    "rank": group.rank,
                     "sights": [frame.sight for frame in group.frames[sent_counts.get(group.number, 0) :]],
                 }
                 for group in changed_groups

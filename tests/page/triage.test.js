@@ -2,27 +2,15 @@ import "./browser.js";
 import assert from "node:assert/strict";
 import test from "node:test";
 import { state } from "../../bevviz/workbench/page/page_state.js";
-import { csv, matches, severity, similar, sorted } from "../../bevviz/workbench/page/triage.js";
+import { csv, matches, similar, sorted } from "../../bevviz/workbench/page/triage.js";
 
 const sight = (more = {}) => ({
   frame: 0, stamp: "1000000000", distance: 30, pick: "truth//0", tried: false, text: "merged", remark: "", in_way: false, ...more,
 });
 const finding = (key, more = {}, ...sights) => (
-  { key, what: "missed", name: "car", best: 0, handled: null, sights: sights.length ? sights : [sight()], ...more });
+  { key, what: "missed", name: "car", reasons: ["nearer than 10 m"], rank: [-1, -1, 30, 1], best: 0, handled: null, sights: sights.length ? sights : [sight()], ...more });
 const keys = (rows) => rows.map(({ key }) => key);
 const ALL = { words: "", class: "", reason: "", within: "" };
-
-test("each reason that makes a finding severe counts once", () => {
-  const near = finding(1, {}, sight({ distance: 10, in_way: true }), sight({ stamp: "1500000000", distance: 9, in_way: true }));
-  assert.deepEqual(severity(near), ["in the way of the robot", "nearer than 10 m", "lasts 0.5 s"]);
-  assert.deepEqual(severity(finding(2)), []);
-  assert.deepEqual(severity(finding(3, { what: "note" }, sight({ distance: 1 }))), []);
-  assert.equal(severity(finding(4, { what: "anomaly", name: "sync" })).length, 1);
-});
-
-test("a second name is not severe", () => {
-  assert.deepEqual(severity(finding(1, {}, sight({ distance: 2, text: "second name" }))), []);
-});
 
 test("similar cases have the same reason, and the same kind, class and distance before others", () => {
   const own = finding("own");
@@ -34,20 +22,17 @@ test("similar cases have the same reason, and the same kind, class and distance 
   assert.deepEqual(keys(similar(own, [own, ...others], 9)), ["near", "another kind", "far"]);
 });
 
-test("severe ones come first, handled ones last", () => {
+test("rows are in the order of the server, handled ones last", () => {
   const rows = [
-    finding("handled", { handled: { state: "done" } }, sight({ distance: 1, in_way: true })),
-    finding("far"),
-    finding("unknown distance", {}, sight({ distance: null })),
-    finding("false", { what: "false" }, sight({ distance: 5 })),
-    finding("near", {}, sight({ distance: 5 })),
-    finding("sync", { what: "anomaly", name: "sync" }),
+    finding("handled", { handled: { state: "done" }, rank: [-3, -1, 2, 0] }), finding("later", { rank: [-1, -1, 5, 9] }), finding("note", { rank: [0, 1, 0] }),
+    finding("first", { rank: [-1, -1, 5, 1] }), finding("doubtful", { rank: [-1, -0.5, 1, 0] }),
   ];
-  assert.deepEqual(keys(sorted(rows, false)), ["sync", "near", "false", "far", "unknown distance", "handled"]);
+  assert.deepEqual(keys(sorted(rows, false)), ["first", "later", "doubtful", "note", "handled"]);
 });
 
 test("the group of the severest finding comes first", () => {
-  const rows = [finding(1), finding(2, {}, sight({ text: "ground" })), finding(3, {}, sight({ text: "ground", distance: 2 }))];
+  const rows = [finding(1, { rank: [0, -1, 30, 0] }), finding(2, { rank: [0, -1, 31, 0] }, sight({ text: "ground" })),
+    finding(3, { rank: [-1, -1, 2, 0] }, sight({ text: "ground" }))];
   assert.deepEqual(keys(sorted(rows, true)), [3, 2, 1]);
 });
 

@@ -1,7 +1,7 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
 import { $, at, element, remember, spanText, state, stated } from "./page_state.js";
-import { away, cause, csv, hasCause, KINDS, matches, severity, similar, sorted } from "./triage.js";
+import { away, cause, csv, hasCause, KINDS, level, matches, similar, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most
@@ -60,7 +60,7 @@ export function update(message) {
   for (const number of message.gone) entries.delete(number);
   for (const one of message.entries) {
     const known = entries.get(one.number);
-    if (known) known.sights.push(...one.sights);
+    if (known) Object.assign(known, one, { sights: [...known.sights, ...one.sights] });
     else entries.set(one.number, { key: one.number, best: 0, handled: null, ...one });
   }
   draw();
@@ -72,7 +72,8 @@ export function notes(message) {
   for (const one of message.notes) {
     const key = `${one.stamp} ${one.text}`;
     const sights = [{ frame: null, stamp: one.stamp, distance: null, pick: one.pick, tried: false, text: one.text, remark: "", in_way: false }];
-    entries.set(key, { key, what: "note", name: one.about || (one.end === "0" ? "frame" : "span"), sights, best: 0, handled: null, note: one });
+    const name = one.about || (one.end === "0" ? "frame" : "span");
+    entries.set(key, { key, what: "note", name, reasons: [], rank: [0, 1, Number(one.stamp)], sights, best: 0, handled: null, note: one });
   }
   handled = message.findings;
   $("note-error").textContent = message.error;
@@ -254,8 +255,7 @@ function frames(entry) {
 function drawn(entry) {
   const isChosen = isSubject && entry.key === current;
   const one = entry.sights[isChosen ? Math.min(sight, entry.sights.length - 1) : entry.best];
-  const [reasons, span, { note }] = [severity(entry), spanOf(entry), entry];
-  const filled = entry.what === "anomaly" && reasons.length ? DOTS : reasons.length;
+  const [filled, span, { note, reasons }] = [level(entry), spanOf(entry), entry];
   const dots = element("span", "dots", "●".repeat(filled) + "○".repeat(DOTS - filled));
   dots.title = reasons.join("; ") || "no reason to hurry";
   const [name, away, reason] = [element("span", "name", entry.name), element("span", "away", one.distance === null ? "" : `${one.distance} m`),

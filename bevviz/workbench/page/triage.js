@@ -1,4 +1,4 @@
-// Triage of the findings: severity, filters, groups of one cause, and the table as CSV.
+// Triage of the findings: filters, groups of one cause, and the table as CSV.
 
 import { seconds } from "./page_state.js";
 
@@ -11,6 +11,8 @@ import { seconds } from "./page_state.js";
  * @property {number | string} key number of the finding, or stamp and text of the note
  * @property {string} what
  * @property {string} name
+ * @property {string[]} reasons why it is severe
+ * @property {number[]} rank key of the order, by the server
  * @property {RowSight[]} sights
  * @property {number} best index of the sight that the row shows
  * @property {HandledEntry | null} handled
@@ -20,37 +22,22 @@ import { seconds } from "./page_state.js";
 
 export const KINDS = ["missed", "lost", "contradicted", "unmatched", "doubtful", "broken", "new false", "fixed", "false gone", "new",
   "gone", "unnamed", "false", "anomaly", "note"];
-const RANK = new Map(KINDS.map((kind, row) => [kind, row]));
-RANK.set("unmatched", 0);
-const NEAR = 10; // metres
-const LONG = 0.5e9; // nanoseconds until it is seen again
-const SENSORS = ["sensor", "sync", "tf", "stage"]; // anomalies that concern everything
+const ALIKE = 10; // metres that are as much as another kind or class
 
 export const away = (/** @type {RowSight} */ sight) => sight.distance ?? 99;
 export const hasCause = (/** @type {Finding} */ entry) => entry.what !== "anomaly" && entry.what !== "note";
 export const cause = (/** @type {Finding} */ entry) => (hasCause(entry) ? entry.sights[entry.best].text || "unknown" : entry.what);
 
+export const level = (/** @type {Finding} */ entry) => -entry.rank[0]; // of severity, 0 to 3
 /**
- * Reasons that make a finding severe. Each counts once.
- * @param {Finding} entry
+ * The server's order. What the user has dealt with comes last.
+ * @param {Finding} a
+ * @param {Finding} b
  */
-export function severity(entry) {
-  if (entry.what === "anomaly" && SENSORS.includes(entry.name)) return ["concerns everything that the sensors see"];
-  if (!hasCause(entry) || entry.sights.every((one) => one.text === "second name")) return [];
-  const stamps = entry.sights.map((one) => Number(one.stamp));
-  const lasts = Math.max(...stamps) - Math.min(...stamps);
-  const reasons = [];
-  if (entry.sights.some((one) => one.in_way)) reasons.push("in the way of the robot");
-  if (Math.min(...entry.sights.map(away)) <= NEAR) reasons.push(`nearer than ${NEAR} m`);
-  if (lasts >= LONG) reasons.push(`lasts ${(lasts / 1e9).toFixed(1)} s`);
-  return reasons;
+function order(a, b) {
+  const differing = a.rank.findIndex((value, row) => value !== b.rank[row]);
+  return Number(Boolean(a.handled)) - Number(Boolean(b.handled)) || (differing < 0 ? 0 : a.rank[differing] - b.rank[differing]);
 }
-
-const level = (/** @type {Finding} */ entry) => (entry.what === "anomaly" && severity(entry).length ? 3 : severity(entry).length);
-const rank = (/** @type {Finding} */ entry) => RANK.get(entry.what) ?? KINDS.length;
-const order = (/** @type {Finding} */ a, /** @type {Finding} */ b) => Number(Boolean(a.handled)) - Number(Boolean(b.handled)) || level(b) - level(a)
-  || rank(a) - rank(b) || away(a.sights[a.best]) - away(b.sights[b.best])
-  || Number(a.sights[0].stamp) - Number(b.sights[0].stamp);
 
 /**
  * The findings of other objects that are most like one: of its reason, by kind, class and distance.
@@ -59,13 +46,13 @@ const order = (/** @type {Finding} */ a, /** @type {Finding} */ b) => Number(Boo
  */
 export function similar(own, entries, most = 2) {
   const unlike = (/** @type {Finding} */ entry) => Number(entry.what !== own.what) + Number(entry.name !== own.name)
-    + Math.abs(away(entry.sights[entry.best]) - away(own.sights[own.best])) / NEAR;
+    + Math.abs(away(entry.sights[entry.best]) - away(own.sights[own.best])) / ALIKE;
   const others = entries.filter((entry) => entry !== own && hasCause(entry) && !entry.handled && cause(entry) === cause(own));
   return others.sort((a, b) => unlike(a) - unlike(b)).slice(0, most);
 }
 
 /**
- * Sort by severity. With groups, the group of the severest finding comes first.
+ * Sort in the server's order. With groups, the group of the severest finding comes first.
  * @param {Finding[]} entries
  * @param {boolean} isGrouped
  */
@@ -99,7 +86,7 @@ export function csv(rows) {
   const quoted = (/** @type {unknown} */ value) => (/[",\n]/.test(String(value)) ? `"${String(value).replaceAll('"', '""')}"` : String(value));
   const line = (/** @type {Finding} */ entry) => {
     const one = entry.sights[entry.best];
-    return [level(entry), severity(entry).join("; "), entry.what, entry.name, one.frame ?? "", seconds(one.stamp).replace(" s", ""),
+    return [level(entry), entry.reasons.join("; "), entry.what, entry.name, one.frame ?? "", seconds(one.stamp).replace(" s", ""),
       one.distance ?? "", entry.sights.length, one.text, one.remark, entry.handled?.state ?? "", entry.handled?.text ?? ""];
   };
   return [COLUMNS, ...rows.map(line)].map((values) => values.map(quoted).join(",")).join("\n") + "\n";

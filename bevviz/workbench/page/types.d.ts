@@ -115,11 +115,13 @@ export interface Entries {
   gone: number[];
 }
 
-/** A group of findings as the page gets it, with the frames that the page does not have yet. */
+/** A group of findings as the page gets it, with the frames that the page does not have yet. Lists are in the order of ``rank``. ``reasons`` say why it comes early. */
 export interface Entry {
   number: number;
   what: string;
   name: string;
+  reasons: string[];
+  rank: number[];
   sights: Sight[];
 }
 
