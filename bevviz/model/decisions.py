@@ -171,7 +171,8 @@ def _detections(
         else:
             reason = _fusion_reason(result.fusion, d, config)
             text = _detection(reason, d, result, result.fusion, detections, clusters, config)
-        yield Explanation("detection", result.camera.name, d, reason, f"{scored(detections, d)}: {text}")
+        label = reason.values.get("detection") or scored(detections, d)
+        yield Explanation("detection", result.camera.name, d, reason, f"{label}: {text}")
 
 
 def _fusion_reason(fusion: Fusion, d: int, config: Config) -> Reason:
@@ -265,8 +266,18 @@ def cluster_reason(clusters: Clusters, row: int, config: Config) -> Reason:
 def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
     """Yield the explanation of each cluster for each camera that sees it."""
     compared = [result.camera.name for result in cameras if result.fusion is not None]
-    ranges = clusters.boxes(config.clustering).distance
-    for k, (count, distance) in enumerate(zip(clusters.count, ranges, strict=True)):
+    views = [
+        (
+            result.camera.name,
+            result.fusion,
+            result.detections,
+            [kind_of(Decision(decision)) for decision in result.fusion.cluster_decision.tolist()],
+        )
+        for result in cameras
+        if result.fusion is not None and result.detections is not None
+    ]
+    ranges = clusters.boxes(config.clustering).distance.tolist()
+    for k, (count, distance) in enumerate(zip(clusters.count.tolist(), ranges, strict=True)):
         head, reason = (
             f"cluster {k}: {_points(count)} at {distance:.1f} m",
             cluster_reason(clusters, k, config),
@@ -279,17 +290,16 @@ def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Confi
             yield Explanation("cluster", "", k, reason, text)
             continue
         unseen = True
-        for result in cameras:
-            fusion, detections = result.fusion, result.detections
-            if fusion is None or detections is None or fusion.cluster_decision[k] == Decision.OUT_OF_VIEW:
+        for camera, fusion, detections, kinds in views:
+            if (kind := kinds[k]) is ReasonKind.OUT_OF_VIEW:
                 continue
             unseen = False
-            kind, d = kind_of(Decision(int(fusion.cluster_decision[k]))), int(fusion.cluster_detection[k])
+            d = int(fusion.cluster_detection[k])
             reason = make_reason(kind, config, detection=d, pair=fusion.pair(d, k))
             text = _cluster(reason, fusion, detections, config)
             if kind is not ReasonKind.MATCHED:
-                text = f"in view of {result.camera.name}, {text}"
-            yield Explanation("cluster", result.camera.name, k, reason, f"{head}: {text}")
+                text = f"in view of {camera}, {text}"
+            yield Explanation("cluster", camera, k, reason, f"{head}: {text}")
         if unseen:
             text = f"{head}: out of view of {' and '.join(compared)}"
             yield Explanation("cluster", "", k, Reason(ReasonKind.OUT_OF_VIEW), text)

@@ -247,10 +247,12 @@ FACTS: Mapping[str, ReasonFacts] = {
     ),
 }
 
+_NO_FACTS = ReasonFacts("")
+
 
 def facts_of(kind: str) -> ReasonFacts:
     """Return the facts of a kind of reason. Kinds that no answer has have no facts."""
-    return FACTS.get(kind, ReasonFacts(""))
+    return FACTS.get(kind, _NO_FACTS)
 
 
 @lru_cache(typed=True)  # members of two enumerations are equal numbers

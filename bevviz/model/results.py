@@ -256,6 +256,8 @@ class Fusion:
 
     def pair(self, detection: int, cluster: int) -> Pair | None:
         """Return the evidence of a detection and a cluster, or None if the fusion did not compare them."""
+        if detection < 0 or cluster < 0:  # no detection or no cluster at all
+            return None
         pairs = self.pairs
         rows = np.flatnonzero((pairs.detection == detection) & (pairs.cluster == cluster))
         if len(rows) == 0:

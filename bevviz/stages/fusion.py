@@ -67,7 +67,7 @@ def fuse(
     visible = visible[np.argsort(u[visible])]  # _in_boxes needs this order
     uv, depth, labels = uv[visible], depth[visible], clusters.labels[visible]
     cluster_uv = _boxes_around(uv, labels, len(clusters))
-    inside = _in_boxes(uv, detections.xyxy)
+    inside, counts = _in_boxes(uv, detections)
     if config.method == "centroid":
         pairs, order = _centroid_pairs(
             clusters, detections, cluster_uv, intrinsics, camera_from_points, config
@@ -116,7 +116,7 @@ def fuse(
     return Fusion(
         detection_decision=detection_decision,
         detection_cluster=detection_cluster,
-        detection_points=np.array([len(points) for points in inside], np.int32),
+        detection_points=counts,
         cluster_decision=cluster_decision,
         cluster_detection=cluster_detection,
         pairs=pairs,
@@ -126,7 +126,9 @@ def fuse(
     )
 
 
-def _count_in_masks(uv: F32, inside: list[I64], detections: Detections, config: FusionConfig) -> I32 | None:
+def _count_in_masks(
+    uv: F32, inside: dict[int, I64], detections: Detections, config: FusionConfig
+) -> I32 | None:
     """Count the points of each box that its mask covers, -1 without a mask. Return None without any masks."""
     masks = detections.masks
     if masks is None or not config.masks:
@@ -251,19 +253,34 @@ def _boxes_around(uv: F32, labels: I32, count: int) -> F32:
     return boxes
 
 
-def _in_boxes(uv: F32, xyxy: F32) -> list[I64]:
-    """Return the rows of the points in each box. ``uv`` is sorted by u."""
+def _in_boxes(uv: F32, detections: Detections) -> tuple[dict[int, I64], I32]:
+    """Return the rows of the points in each kept box, and the (D,) number of points in every box.
+
+    ``uv`` is sorted by u.
+    """
+    xyxy, v = detections.xyxy, np.ascontiguousarray(uv[:, 1])
     left = np.searchsorted(uv[:, 0], xyxy[:, 0], "left")
     right = np.searchsorted(uv[:, 0], xyxy[:, 2], "right")
-    v = uv[:, 1]
-    return [
-        i + np.flatnonzero((v[i:j] >= box[1]) & (v[i:j] <= box[3]))
-        for box, i, j in zip(xyxy, left, right, strict=True)
-    ]
+    inside = {
+        d: left[d]
+        + np.flatnonzero((v[left[d] : right[d]] >= xyxy[d, 1]) & (v[left[d] : right[d]] <= xyxy[d, 3]))
+        for d in np.flatnonzero(detections.kept).tolist()
+    }
+    return inside, _count_between(v, left, right, xyxy)
+
+
+@kernel
+def _count_between(v: F32, left: I64, right: I64, xyxy: F32) -> I32:
+    """Return the (D,) number of values from ``left`` to ``right`` between the upper and lower edge."""
+    counts = np.zeros(len(xyxy), np.int32)
+    for d in range(len(xyxy)):
+        for i in range(left[d], right[d]):
+            counts[d] += xyxy[d, 1] <= v[i] <= xyxy[d, 3]
+    return counts
 
 
 def _frustum_pairs(
-    inside: list[I64],
+    inside: dict[int, I64],
     depth: F32,
     labels: I32,
     clusters: Clusters,
@@ -275,7 +292,7 @@ def _frustum_pairs(
     """Pair every kept detection with every kept cluster in its frustum.
 
     Args:
-        inside: points in the box of each detection.
+        inside: points in the box of each kept detection.
         depth: of the points.
         labels: cluster of each point.
         clusters: all clusters.
@@ -287,9 +304,8 @@ def _frustum_pairs(
     Returns:
         The pairs, and for each TAKEN or the rule that forbids it.
     """
-    kept = np.flatnonzero(detections.kept)
-    point = np.concatenate([np.zeros(0, np.int64), *(inside[d] for d in kept)])
-    detection = np.repeat(kept, [len(inside[d]) for d in kept])
+    point = np.concatenate([np.zeros(0, np.int64), *inside.values()])
+    detection = np.repeat(np.fromiter(inside, np.int64), [len(rows) for rows in inside.values()])
     usable = np.append(clusters.kept, False)[labels[point]]  # noise has label -1, the last element
     point, detection = point[usable], detection[usable]
 

@@ -297,9 +297,11 @@ class Tracker:
         alike = (best[hosts, None] == best) | (state.sightings == 0) | (length >= LONG)
         doubles = (share >= SAME_OBJECT) & alike & (hosts[:, None] < np.arange(len(state)))
         ended = np.zeros(len(state), np.bool_)
-        for young in range(len(state)):
+        before = state.doubled.copy()
+        state.doubled[:] = np.clip(before - 1, 0, 2 * config.min_hits)
+        for young in np.flatnonzero(doubles.any(axis=0)).tolist():
             older = np.flatnonzero(doubles[:, young] & shown[hosts] & ~ended[hosts])
-            doubled = state.doubled[young] + (1 if len(older) else -1)
+            doubled = before[young] + (1 if len(older) else -1)
             state.doubled[young] = min(max(doubled, 0), 2 * config.min_hits)
             if len(older) == 0 or doubled < config.min_hits:
                 continue
