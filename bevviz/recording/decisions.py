@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -124,13 +124,13 @@ def _in_doubt(explanations: Sequence[Explanation]) -> Iterator[str]:
 
 def _not_kept(explanations: Sequence[Explanation], detections: Detections) -> Iterator[str]:
     """Yield a line for each detection that suppresses others, and one for all below the threshold."""
-    for row in np.unique(detections.suppressed_by[detections.state == DetectionState.SUPPRESSED]).tolist():
-        names = Counter(
-            detections.names[suppressed]
-            for suppressed in np.flatnonzero(detections.suppressed_by == row).tolist()
-        )
-        [label] = scored([detections.names[row]], [detections.score[row]])
-        yield f"{_counted(names)} suppressed by {label}"
+    suppressed = np.flatnonzero(detections.state == DetectionState.SUPPRESSED)
+    names: dict[int, Counter[str]] = defaultdict(Counter)
+    for row, by in zip(suppressed.tolist(), detections.suppressed_by[suppressed].tolist(), strict=True):
+        names[by][detections.names[row]] += 1
+    for by in sorted(names):
+        [label] = scored([detections.names[by]], [detections.score[by]])
+        yield f"{_counted(names[by])} suppressed by {label}"
     below = [
         explanation for explanation in explanations if explanation.reason.kind is ReasonKind.BELOW_THRESHOLD
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from enum import IntEnum
+from functools import lru_cache
 from typing import Self
 
 from bevviz.model.results import ClusterState, DetectionState
@@ -51,15 +52,18 @@ class Entity(str):
 
     def path(self, *values: str) -> str:
         """Return the path with these values in place of the names in braces."""
-        parts = {
-            name: SPELLINGS.get(name, str)(value) for name, value in zip(self._names, values, strict=True)
-        }
-        return self.format_map(parts)
+        return _path(self, values)
 
     @property
     def row(self) -> str:
         """Row of docs/reference.md, in Markdown."""
         return f"| `{self.translate({123: '<', 125: '>'})}` | {self.types} | {self.content} |"
+
+
+@lru_cache(maxsize=4096)  # each frame asks for some 70 paths
+def _path(entity: Entity, values: tuple[str, ...]) -> str:
+    names = zip(entity._names, values, strict=True)
+    return entity.format_map({name: SPELLINGS.get(name, str)(value) for name, value in names})
 
 
 def table() -> Mapping[str, Entity]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from math import isfinite
 
-import numpy as np
 import rerun as rr
 
 from bevviz.anomalies import KINDS
@@ -72,7 +72,7 @@ def log_health(
         extra_scalars: further scalars, by entity.
     """
     for path, value in (*health(result, last, rates), *extra_scalars.items()):
-        if np.isfinite(value):
+        if isfinite(value):
             if (color := _COLORS.get(path)) is not None:
                 to.static_once(path, partial(rr.SeriesLines, colors=[color], widths=[1.5]))
             to.scalar(path, float(value))

@@ -19,7 +19,6 @@ from bevviz.model.results import (
     CameraResult,
     Decision,
     Detections,
-    DetectionState,
     Explanation,
     FrameResult,
     Masks,
@@ -212,7 +211,7 @@ def _detection_layer(
     colors: Sequence[Color] | None = None,
 ) -> Layer:
     labels = scored((detections.names[row] for row in rows), detections.score[rows])
-    class_ids = [entities.DETECTION_CLASS[DetectionState(state)] for state in detections.state[rows]]
+    class_ids = entities.ClassId.DETECTION + detections.state[rows]
     return Layer(
         path,
         detections.xyxy[rows],

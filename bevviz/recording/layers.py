@@ -122,11 +122,10 @@ def _draw(to: Writer, layer: Layer, put: Callable[..., None]) -> None:
         to.static_once(layer.path, lambda: archetype.from_fields(**style.fields), archetype.__name__, style)
     if isinstance(layer.frame, str):
         _log_image_frame(to, layer.path, layer.frame)
-    elif layer.frame is not None:
-        put(layer.path, layer.frame)
     if layer.rows is not None:
         to.note_rows(layer.path, layer.rows)
-    put(layer.path, Components(archetype, fields, values))
+    pose = [] if layer.frame is None or isinstance(layer.frame, str) else [layer.frame]
+    put(layer.path, *pose, Components(archetype, fields, values))
 
 
 def _shapes(items: Items) -> tuple[Any, dict[str, Any]]:
@@ -141,8 +140,11 @@ def _shapes(items: Items) -> tuple[Any, dict[str, Any]]:
             centers = (corners[:, :2] + corners[:, 2:]) / 2
             return rr.Boxes2D, {"half_sizes": corners[:, 2:] - centers, "centers": centers}
         return (rr.Points2D if items.shape[1] == 2 else rr.Points3D), {"positions": items}
-    points = items.reshape(-1, items.shape[2]) if isinstance(items, np.ndarray) else np.concatenate(items)
-    lines = strips(points.astype(np.float32, copy=False), np.array([len(line) for line in items]))
+    if isinstance(items, np.ndarray):
+        points, lengths = items.reshape(-1, items.shape[2]), np.full(len(items), items.shape[1])
+    else:
+        points, lengths = np.concatenate(items), np.array([len(line) for line in items])
+    lines = strips(points.astype(np.float32, copy=False), lengths)
     return (rr.LineStrips2D if items[0].shape[1] == 2 else rr.LineStrips3D), {"strips": lines}
 
 

@@ -46,7 +46,8 @@ def strips(points: F32, lengths: NDArray[np.integer]) -> pa.Array:
 
 def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
     """Format each name with its score, as in ``person 0.90``."""
-    return [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+    numbers = scores.tolist() if isinstance(scores, np.ndarray) else scores  # Python's are formatted faster
+    return [f"{name} {score:.2f}" for name, score in zip(names, numbers, strict=True)]
 
 
 def explanations_of(
