@@ -24,7 +24,7 @@ from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
 from bevviz.recording.addresses import RowCache
-from bevviz.recording.components import Components, described
+from bevviz.recording.components import Component, Components
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
 from bevviz.support.contexts import Closable
 
@@ -273,11 +273,11 @@ def thin_cloud(cloud: rr.AsComponents, points: int, seed: int) -> list[rr.Descri
     """Return the components of the sampled points of a cloud."""
     count = _count(cloud)
     rows = pa.array(sample_rows(count, points, seed))
-    thinned = []
+    thinned: list[rr.DescribedComponentBatch] = []
     for batch in cloud.as_component_batches():
         values = batch.as_arrow_array()
         kept = values.take(rows) if len(values) == count else values
-        thinned.append(described(kept, batch.component_descriptor()))
+        thinned.append(Component(kept, batch.component_descriptor()))
     return thinned
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -30,40 +30,41 @@ class Components(rr.AsComponents):
         group: str = "",
     ) -> None:
         self.archetype = archetype
-        self._batches = []
+        self._components: list[rr.DescribedComponentBatch] = []
         for name, values in fields.items():
-            descriptor, kind = _field(archetype, name)
-            self._batches.append(described(_arrow(values, kind), descriptor))
+            descriptor, convert = _field(archetype, name)
+            array = values if isinstance(values, pa.Array) else convert(values)
+            self._components.append(Component(array, descriptor))
         for name, values in columns.items():
-            self._batches.append(described(_array(values), _column(name, group)))
+            self._components.append(Component(_array(values), _column(name, group)))
 
     def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
         """Return the components."""
-        return self._batches
+        return self._components
 
 
-def described(values: pa.Array, descriptor: rr.ComponentDescriptor) -> rr.DescribedComponentBatch:
-    """Return an Arrow array as a component."""
-    return rr.DescribedComponentBatch(_Values(values), descriptor)
+class Component(rr.DescribedComponentBatch):
+    """Arrow array with the descriptor of its component."""
 
-
-class _Values:
-    """Arrow array in the form of a Rerun component."""
-
-    __slots__ = ("_values",)
-
-    def __init__(self, values: pa.Array) -> None:
-        self._values = values
+    def __init__(self, values: pa.Array, descriptor: rr.ComponentDescriptor) -> None:
+        self._values, self._descriptor = values, descriptor
 
     def as_arrow_array(self) -> pa.Array:
+        """Return the array."""
         return self._values
 
 
 @cache
-def _field(archetype: Any, name: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
-    """Return descriptor and Arrow type of a field."""
-    [batch] = archetype.from_fields(**{name: []}).as_component_batches()
-    return batch.component_descriptor(), batch.as_arrow_array().type
+def _field(archetype: Any, name: str) -> tuple[rr.ComponentDescriptor, Callable[[Any], pa.Array]]:
+    """Return descriptor of a field, and the converter of its values."""
+    [empty] = archetype.from_fields(**{name: []}).as_component_batches()
+    kind = empty.as_arrow_array().type
+    convert: Callable[[Any], pa.Array] = partial(_array, kind=kind)
+    if pa.types.is_fixed_size_list(kind):
+        convert = partial(_vectors, kind=kind)
+    elif pa.types.is_uint32(kind):  # Only colours are.
+        convert = _colors
+    return empty.component_descriptor(), convert
 
 
 @cache
@@ -72,19 +73,18 @@ def _column(name: str, group: str) -> rr.ComponentDescriptor:
     return descriptor.with_builtin_archetype(group) if group else descriptor
 
 
-def _arrow(values: Any, kind: pa.DataType) -> pa.Array:
-    """Convert the values of a field. A field of 32-bit integers has colours: (N, 3) or (N, 4) bytes."""
-    if isinstance(values, pa.Array):
-        return values
-    if pa.types.is_fixed_size_list(kind):
-        flat = np.ascontiguousarray(values, np.float32).ravel()
-        return pa.FixedSizeListArray.from_arrays(pa.array(flat), type=kind)
-    if pa.types.is_uint32(kind):
-        channels = np.asarray(values, np.uint8)
-        colors = np.full((len(channels), 4), 255, np.uint8)
-        colors[:, : channels.shape[1]] = channels
-        return pa.array(colors.view(">u4").ravel().astype(np.uint32))
-    return _array(values, kind)
+def _vectors(values: Any, kind: pa.DataType) -> pa.Array:
+    """Convert (N, D) or (D,) numbers."""
+    flat = np.ascontiguousarray(values, np.float32).ravel()
+    return pa.FixedSizeListArray.from_arrays(pa.array(flat), type=kind)
+
+
+def _colors(values: Any) -> pa.Array:
+    """Convert (N, 3) or (N, 4) bytes."""
+    channels = np.asarray(values, np.uint8)
+    colors = np.full((len(channels), 4), 255, np.uint8)
+    colors[:, : channels.shape[1]] = channels
+    return pa.array(colors.view(">u4").ravel().astype(np.uint32))
 
 
 def _array(values: Any, kind: pa.DataType | None = None) -> pa.Array:
