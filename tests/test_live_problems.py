@@ -174,7 +174,7 @@ def test_begin_and_end_are_told_soon(
         assert (began <= SOON, ended <= SOON) == (True, True), (began, ended)
         robot.play(2.0)
         assert not session.source.problems.current
-        texts = [str(past) for past in session.source.problems.past.values() if begin in str(past)]
+        texts = [p.history for p in session.source.problems.all.values() if begin in str(p)]
         span = re.compile(r"\(\d\d:\d\d:\d\d to \d\d:\d\d:\d\d")
         assert texts and all(span.search(text) for text in texts)
 

@@ -153,6 +153,6 @@ def test_a_viewer_is_behind_until_it_keeps_up(results: list[FrameResult]) -> Non
             viewer.lag = lag
             outputs.check()
             assert bool(problems.of("web viewer")) == is_behind
-        (past,) = problems.past.values()
-        assert past.finding.text == "the web viewer is 1.5 s behind" and past.times == 1
+        (problem,) = problems.all.values()
+        assert problem.finding.text == "the web viewer is 1.5 s behind" and problem.times == 1
         assert bench.live.numbers["lag of the web viewer, ms"] == 2000.0

@@ -82,7 +82,7 @@ def describe(
             object_network=networks["objects"],
             configured=tuple(stated_lines(config)),
             missing=tuple(missing),
-            warnings=(*(str(past.finding) for past in source.problems.past.values()), *source.warnings),
+            warnings=(*map(str, source.problems.all.values()), *source.warnings),
         )
 
 

@@ -15,31 +15,25 @@ from bevviz.model.input_findings import InputFinding, Remedy
 _VALUES = re.compile(r"(?<![\w/])\d[\d,.]*")  # numbers that are no part of a name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Problem:
-    """Finding that holds now, and the time since which it does, in seconds since 1970."""
+    """Finding that holds, or has held, with its times in seconds since 1970."""
 
-    finding: InputFinding
-    since: float
-    over: str  # sentence for its end
+    finding: InputFinding  # as it was last
+    begin: float  # of the first time
+    since: float  # begin of the last time
+    over: str = ""  # sentence for its end
+    times: int = 0
+    seconds: float = 0.0  # of the times that are over
+    end: float | None = None  # of the last time; None: it holds
+    cases: int = 0  # messages or frames, where they are counted
 
     def __str__(self) -> str:
         return str(self.finding)
 
-
-@dataclass(slots=True)
-class PastProblem:
-    """Times at which a problem held. It may hold still."""
-
-    finding: InputFinding  # as it was last
-    begin: float  # of the first time, seconds since 1970
-    times: int = 0
-    seconds: float = 0.0  # of the times that are over
-    end: float | None = None  # of the last time, seconds since 1970; None: it holds
-    cases: int = 0  # messages or frames, where they are counted
-
-    def __str__(self) -> str:
-        """Return one sentence with begin and end."""
+    @property
+    def history(self) -> str:
+        """One sentence with begin and end."""
         begin = _clock(self.begin)
         span = f"since {begin}" if self.end is None else f"{begin} to {_clock(self.end)}"
         if self.times > 1:
@@ -59,8 +53,7 @@ class CurrentProblems:
     def __init__(self, tell: Callable[[str], None]) -> None:
         self.tell = tell
         self._lock = threading.Lock()
-        self._problems: dict[tuple[str, str], Problem] = {}
-        self._past: dict[tuple[str, str], PastProblem] = {}
+        self._problems: dict[tuple[str, str], Problem] = {}  # of the whole run
         self._rows: Counter[tuple[str, str]] = Counter()  # calls in a row with a sentence; negative: without
         self._events: set[str] = set()
 
@@ -96,31 +89,28 @@ class CurrentProblems:
         with self._lock:
             row = self._rows[key]
             self._rows[key] = row = max(1, row + 1) if text else min(-1, row - 1)
-            before = self._problems.get(key)
-            if (before is None and row < begins) or (before is not None and 0 < -row < ends):
+            problem = self._problems.get(key) or Problem(finding, now, now, end=now)
+            holds, before = problem.end is None, str(problem)
+            if (not holds and row < begins) or (holds and 0 < -row < ends):
                 return
-            self._problems.pop(key, None)
+            self._problems[key] = problem
             if text:
-                since = now if before is None else before.since
-                self._problems[key] = Problem(finding, since, over or f"over: {text}")
-                past = self._past.setdefault(key, PastProblem(finding, now))
-                past.finding, past.end = finding, None
-                past.times += before is None
-            elif before is not None:
-                past = self._past[key]
-                past.end = now
-                past.seconds += now - before.since
+                problem.since = problem.since if holds else now
+                problem.times += not holds
+                problem.finding, problem.over, problem.end = finding, over or f"over: {text}", None
+            else:
+                problem.end = now
+                problem.seconds += now - problem.since
         if not text:
-            if before is not None:
-                self.tell(over or before.over)
-        elif before is None or not (quiet or _without_values(str(finding)) == _without_values(str(before))):
+            self.tell(over or problem.over)
+        elif not holds or not (quiet or _without_values(str(finding)) == _without_values(before)):
             self.tell(str(finding))
 
     def count(self, kind: str, subject: str, cases: int) -> None:
         """Set the number of cases of a problem, if it has ever held."""
         with self._lock:
-            if (past := self._past.get((kind, subject))) is not None:
-                past.cases = cases
+            if (problem := self._problems.get((kind, subject))) is not None:
+                problem.cases = cases
 
     def tell_once(self, text: str) -> None:
         """Tell about an event the first time, and never again. It is no lasting problem."""
@@ -134,7 +124,8 @@ class CurrentProblems:
     def current(self) -> list[Problem]:
         """The problems that hold now, the oldest first."""
         with self._lock:
-            return sorted(self._problems.values(), key=lambda problem: problem.since)
+            problems = [replace(problem) for problem in self._problems.values() if problem.end is None]
+        return sorted(problems, key=lambda problem: problem.since)
 
     @property
     def sentences(self) -> list[str]:
@@ -146,10 +137,10 @@ class CurrentProblems:
         return [problem for problem in self.current if problem.finding.subject == subject]
 
     @property
-    def past(self) -> dict[tuple[str, str], PastProblem]:
-        """All problems of the run by kind and subject, also those that hold, in order of their begin."""
+    def all(self) -> dict[tuple[str, str], Problem]:
+        """All problems of the run by kind and subject, in order of their begin."""
         with self._lock:
-            return {key: replace(past) for key, past in self._past.items()}
+            return {key: replace(problem) for key, problem in self._problems.items()}
 
 
 def _clock(seconds: float) -> str:

@@ -129,9 +129,9 @@ class Live:
     @property
     def summary(self) -> list[str]:
         """Sentences for the end: each problem with begin and end, and what only the whole run tells."""
-        past = self.problems.past
-        findings = [f for f in self.checks.findings if (f.kind, f.subject) not in past]
-        return [*map(str, past.values()), *map(str, findings)]
+        known = self.problems.all
+        findings = [f for f in self.checks.findings if (f.kind, f.subject) not in known]
+        return [*(problem.history for problem in known.values()), *map(str, findings)]
 
     @property
     def drops(self) -> dict[str, int]:

@@ -181,8 +181,8 @@ class LiveSource(Closable):
     def warnings(self) -> Sequence[str]:
         """Sentences about what was counted since the start and is no problem of ``problems``."""
         with self._lock:
-            findings, past = list(self._inputs.sync.report.findings()), self.problems.past
-        return [str(finding) for finding in findings if (finding.kind, finding.subject) not in past]
+            findings, known = list(self._inputs.sync.report.findings()), self.problems.all
+        return [str(finding) for finding in findings if (finding.kind, finding.subject) not in known]
 
     @property
     def received(self) -> Counter[str]:
