@@ -117,43 +117,10 @@ def full_name(publisher: Any) -> str:
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
-def open_publisher(node: Any, kind: str, topic: str, *, shared: bool = False) -> Any:
-    """Return a publisher of serialised messages.
-
-    ``shared``: several nodes may publish the topic, if they do so with this type.
-
-    Raises:
-        UserError: the type is unknown, or another node publishes the topic.
-    """
-    message_class = message_type(kind)
-    name = node.resolve_topic_name(topic)
-    others = foreign_publishers(node, name)
-    clashing = [p for p in others if p.topic_type != kind]
-    if clashing or (others and not shared):
-        raise UserError(f"{_who_publishes(name, clashing or others, kind)}; {rename_advice(topic)}")
-    try:
-        return node.create_publisher(message_class, topic, 10)
-    except Exception as error:  # the middleware refuses a type beside another one
-        raise UserError(f"the middleware refuses {kind} on {name}: {' '.join(str(error).split())}") from None
-
-
 def foreign_publishers(node: Any, name: str) -> list[Any]:
     """Return rclpy's TopicEndpointInfo of the publishers of a topic that are not of the two nodes here."""
     own = {(f"{node.get_name()}{suffix}", node.get_namespace()) for suffix in ("", INPUT)}
     return [p for p in node.get_publishers_info_by_topic(name) if (p.node_name, p.node_namespace) not in own]
-
-
-def _who_publishes(name: str, others: Sequence[Any], kind: str) -> str:
-    """Return the words that name another publisher of a topic, and its type if that is not ours."""
-    other = others[0]
-    if other.topic_type != kind:
-        return f"{full_name(other)} publishes {name} as {other.topic_type}, ours is {kind}"
-    return f"{full_name(other)} publishes {name}, and messages of two sources would mix"
-
-
-def rename_advice(topic: str) -> str:
-    """Return the words that say how our topic gets another name."""
-    return f"--ros-args -r {topic}:=/bevviz{topic} gives ours another name"
 
 
 # --- subscriptions -----------------------------------------------------------------------------

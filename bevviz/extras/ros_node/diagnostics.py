@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from bevviz.live.graph import open_publisher
+from bevviz.extras.ros_node.topics import open_publisher
 from bevviz.live.node import add_timer
 from bevviz.live.problems import Problem
 from bevviz.messages.definitions import typestore

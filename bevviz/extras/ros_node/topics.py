@@ -3,15 +3,49 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 from bevviz.errors import UserError
-from bevviz.live.graph import UNKNOWN, foreign_publishers, full_name, open_publisher, rename_advice
+from bevviz.live.graph import UNKNOWN, foreign_publishers, full_name
 from bevviz.live.node import add_timer
 from bevviz.live.publish import TOPICS, TRANSFORMS
+from bevviz.live.typesupport import message_type
 
 LOOK = 0.5  # seconds between two looks for other publishers of our topics
+
+
+def open_publisher(node: Any, kind: str, topic: str, *, shared: bool = False) -> Any:
+    """Return a publisher of serialised messages.
+
+    ``shared``: several nodes may publish the topic, if they do so with this type.
+
+    Raises:
+        UserError: the type is unknown, or another node publishes the topic.
+    """
+    message_class = message_type(kind)
+    name = node.resolve_topic_name(topic)
+    others = foreign_publishers(node, name)
+    clashing = [p for p in others if p.topic_type != kind]
+    if clashing or (others and not shared):
+        raise UserError(f"{_who_publishes(name, clashing or others, kind)}; {rename_advice(topic)}")
+    try:
+        return node.create_publisher(message_class, topic, 10)
+    except Exception as error:  # the middleware refuses a type beside another one
+        raise UserError(f"the middleware refuses {kind} on {name}: {' '.join(str(error).split())}") from None
+
+
+def _who_publishes(name: str, others: Sequence[Any], kind: str) -> str:
+    """Return the words that name another publisher of a topic, and its type if that is not ours."""
+    other = others[0]
+    if other.topic_type != kind:
+        return f"{full_name(other)} publishes {name} as {other.topic_type}, ours is {kind}"
+    return f"{full_name(other)} publishes {name}, and messages of two sources would mix"
+
+
+def rename_advice(topic: str) -> str:
+    """Return the words that say how our topic gets another name."""
+    return f"--ros-args -r {topic}:=/bevviz{topic} gives ours another name"
 
 
 class RosTopics:
