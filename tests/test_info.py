@@ -17,7 +17,7 @@ from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import WIDTH, BagInfo, describe_bag, render_bag_contents, render_bag_info
 from bevviz.pipeline.stage_loader import StageLoader
-from bevviz.stages.detector import DEMO_MODEL
+from bevviz.support.onnx_files import DEMO_MODEL
 from tests.support import bags
 from tests.support.small_bags import frozen_after
 

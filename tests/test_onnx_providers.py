@@ -12,8 +12,9 @@ import pytest
 from bevviz.config import load
 from bevviz.errors import UserError
 from bevviz.pipeline.bag_info import network_provider
-from bevviz.stages.detector import DEMO_MODEL, providers
+from bevviz.stages.detector import providers
 from bevviz.support import progress
+from bevviz.support.onnx_files import DEMO_MODEL
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from bevviz.messages.roles import find_roles
 from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.sinks import open_recording
 from bevviz.recording.source_lookup import find_source, fingerprint, read_origin
-from bevviz.stages.detector import DEMO_MODEL
+from bevviz.support.onnx_files import DEMO_MODEL
 
 EPS = 0.437
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bevviz.config import load, plugins, stage_files, with_stage_files
+from bevviz.config import load, stage_files, with_stage_files
 from bevviz.config.project import read_project_layers
 from bevviz.errors import UserError
 from bevviz.model.reasons import owner_of
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.recording.provenance import dependencies_of
+from bevviz.support import extensions
 
 MODULE = """
 from pathlib import Path
@@ -54,9 +55,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     project.mkdir()
     (project / "a.boxes").write_text("4")
     (project / "table.txt").write_text("1")
-    plugins.file_stages.cache_clear()
+    extensions.registered.cache_clear()
     yield project
-    plugins.file_stages.cache_clear()
+    extensions.registered.cache_clear()
 
 
 def test_a_file_is_read_by_the_stage_of_its_suffix(folder: Path) -> None:

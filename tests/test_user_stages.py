@@ -39,6 +39,7 @@ from bevviz.model.results import ClusterState, DetectionState, FrameResult
 from bevviz.pipeline.session import Session
 from bevviz.stages import user_stages
 from bevviz.stages.robot_results import detect
+from bevviz.support import extensions
 from tests.support import bags, kept_drives
 from tests.support.modules import forget_modules
 from tests.support.waiting import PATIENCE
@@ -252,7 +253,7 @@ def test_a_registered_name_is_a_stage(here: Path, frame: Frame, monkeypatch: pyt
     (metadata / "entry_points.txt").write_text("[bevviz.stages]\ngrid = mine.stages:cells\n")
     (metadata / "top_level.txt").write_text("mine\n")
     monkeypatch.syspath_prepend(str(here))
-    plugins.registered.cache_clear()
+    extensions.registered.cache_clear()
     try:
         config = configured("clustering.method=grid", "clustering.cell=2.0")
         assert config.clustering.method == "grid"
@@ -263,7 +264,7 @@ def test_a_registered_name_is_a_stage(here: Path, frame: Frame, monkeypatch: pyt
         with pytest.raises(UserError, match=r"polar, plane, grid \(registered\), module:function"):
             configured("ground.method=gird")
     finally:
-        plugins.registered.cache_clear()
+        extensions.registered.cache_clear()
 
 
 # --- parameters --------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def end_to_end(path: Path) -> str:
 
 def samples(folder: Path) -> list[tuple[Path, Case]]:
     """Write the sound models; returns each file with the case that loads it."""
-    from bevviz.stages.detector import DEMO_MODEL
+    from bevviz.support.onnx_files import DEMO_MODEL
     from tests.support.pillar_networks import Reference, autoware, settings_of
 
     found = []

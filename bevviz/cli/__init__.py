@@ -85,6 +85,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     gc.set_threshold(50_000, 10, 10)
     # Products of a cloud and a 3 x 3 matrix are too small for threads, and idle threads of OpenBLAS spin.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Our models need no plugins of pydantic, which would look for them in every installed package.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     if arguments is None:
         interrupts.install()
     try:

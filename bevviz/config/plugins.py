@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, packages_distributions
+from importlib.metadata import EntryPoint, packages_distributions
 from importlib.metadata import version as installed_version
 from inspect import Parameter, signature, unwrap
 from pathlib import Path
@@ -20,8 +20,8 @@ from pydantic import BaseModel
 
 from bevviz.config.module_folder import WORKING_DIRECTORY, ModuleFolder, import_module
 from bevviz.errors import UserError, first_line
+from bevviz.support import extensions
 
-GROUP = "bevviz.stages"  # group of the entry points that packages register
 TOPIC = "topic:"
 PARAMS = "Params"  # name of the pydantic model of the parameters, in the function's module
 POSITIONAL = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
@@ -85,19 +85,18 @@ class Plugin:
         return str(getattr(sys.modules.get(package), "__version__", ""))
 
 
-@cache
 def registered() -> dict[str, str]:
     """Return the ``module:name`` of each name that installed packages registered."""
-    return {point.name: point.value for point in entry_points(group=GROUP) if "." not in point.name}
+    points = extensions.registered("stages")
+    return {name: point.value for name, point in points.items() if "." not in name}
 
 
-@cache
 def file_stages(section: str) -> dict[str, str]:
     """Return the ``module:name`` that reads files, by their suffix, as installed packages registered it.
 
     The entry point ``objects.onnx`` is the stage that reads ``objects.method=FILE.onnx``.
     """
-    points = [(point.name.partition("."), point.value) for point in entry_points(group=GROUP)]
+    points = [(name.partition("."), point.value) for name, point in extensions.registered("stages").items()]
     return {f".{suffix}": value for (name, dot, suffix), value in points if dot and name == section}
 
 
@@ -133,7 +132,7 @@ def load_plugin(name: str, folder: ModuleFolder | None = WORKING_DIRECTORY) -> P
         raise UserError(f"'{name}' is no stage: module '{module_name}' is a part of Python; {STAGE_HINT}")
     module = _import_module(module_name, folder)
     try:
-        target = EntryPoint(name, name, GROUP).load()
+        target = EntryPoint(name, name, "bevviz.stages").load()
     except AttributeError:
         members = {n: v for n, v in vars(module).items() if getattr(v, "__module__", "") == module_name}
         candidates = [n for n, v in members.items() if callable(v) and n != PARAMS and not n.startswith("_")]

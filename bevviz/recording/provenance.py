@@ -19,7 +19,7 @@ from bevviz.config import METHOD_KEYS, Config, plugin_of, stage_files, with_stag
 from bevviz.config.methods import CLASS_LISTS
 from bevviz.config.plugins import TOPIC
 from bevviz.support.files import absolute, file_hash
-from bevviz.support.onnx_files import network_hash
+from bevviz.support.onnx_files import DEMO_MODEL, network_hash
 from bevviz.support.version import __version__
 
 PACKAGES = (  # packages that are not installed are skipped: some libraries have several packages
@@ -119,8 +119,6 @@ def versions() -> Mapping[str, str]:
 
 def model_path(config: Config) -> Path | None:
     """Return the file of the detector; None: there is no detector, or it is a topic or a user's function."""
-    from bevviz.stages.detector import DEMO_MODEL
-
     name = config.detector.model
     if not name or name.startswith(TOPIC) or plugin_of(config, "detector") is not None:
         return None

@@ -35,8 +35,8 @@ from bevviz.report.fingerprints import (
     unpack,
 )
 from bevviz.report.make import replay
-from bevviz.stages.detector import DEMO_MODEL
 from bevviz.support.files import file_hash
+from bevviz.support.onnx_files import DEMO_MODEL
 from bevviz.support.scratch_folder import ScratchFolder
 
 UNREADABLE = "cannot be read as a report"

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from bevviz.support.files import file_hash
 
+DEMO_MODEL = Path(__file__).parents[1] / "data" / "demo_detector.onnx"
+
 
 def with_weights(model: Path) -> list[Path]:
     """Return an ONNX file and the files beside it that hold its weights, by their names in it."""

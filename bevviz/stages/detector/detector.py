@@ -28,9 +28,9 @@ from bevviz.stages.detector.names import (
 from bevviz.stages.detector.providers import open_session
 from bevviz.stages.detector.session import NetworkSession, list_tensors, reading_answer
 from bevviz.stages.detector.suppression import nms
+from bevviz.support.onnx_files import DEMO_MODEL
 from bevviz.support.text import did_you_mean
 
-DEMO_MODEL = Path(__file__).parents[2] / "data" / "demo_detector.onnx"
 MIN_SIDE, MAX_SIDE = 8, 4096  # pixels of the input: one cell of a grid, and the widest cameras of vehicles
 MAX_CANDIDATES = 30_000  # best candidates that enter the NMS; Ultralytics has the same limit
 
