@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -106,7 +105,6 @@ def open_page(
         warn(source.warnings)
 
         def make() -> WorkbenchSession:
-            _arrow_without_pandas()
             second_source = stack.enter_context(LabelledSource(paths, config))
             print_hints(source.scene, config)
             from bevviz.drive import Drive
@@ -141,29 +139,3 @@ def _show(recording: Path, port: int | None) -> int:
         announce("viewer", address)
         wait_for_interrupt()
     return 0
-
-
-def _arrow_without_pandas() -> None:
-    """Make pyarrow skip its import of pandas, which takes half a second and is not needed.
-
-    pyarrow looks for pandas at its first array. It looks again when one of its pandas functions is called.
-    """
-    if "pandas" in sys.modules:
-        return
-    finder = _NoPandas()
-    sys.meta_path.insert(0, finder)
-    try:
-        import pyarrow
-
-        pyarrow.array([True])
-    finally:
-        sys.meta_path.remove(finder)
-
-
-class _NoPandas:
-    """Import finder that hides pandas."""
-
-    @staticmethod
-    def find_spec(name: str, *_: object) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError(name)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 import uuid
 import zlib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
+import pyarrow
 import rerun.blueprint as rrb
 from rerun.recording_stream import RecordingStream
 
@@ -49,6 +52,7 @@ def load(name_or_path: str, scene: Scene, config: Config | None = None) -> rrb.B
     Raises:
         UserError: the name is unknown, the file does not exist, or it does not make a layout.
     """
+    _arrow_without_pandas()  # A layout makes the first array.
     scene = _configured(scene, config)
     if name_or_path in names():
         if not scene.lidar and scene.cameras:
@@ -128,3 +132,28 @@ class SavedBlueprint(rrb.Blueprint):
 
     def _log_to_stream(self, stream: RecordingStream) -> None:
         stream.send_chunks(self._chunks)
+
+
+@cache
+def _arrow_without_pandas() -> None:
+    """Make pyarrow skip its import of pandas, which takes half a second and is not needed.
+
+    pyarrow looks for pandas at its first array. It looks again when one of its pandas functions is called.
+    """
+    if "pandas" in sys.modules:
+        return
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        pyarrow.array([True])
+    finally:
+        sys.meta_path.remove(finder)
+
+
+class _NoPandas:
+    """Import finder that hides pandas."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name)
