@@ -36,3 +36,16 @@ test("pictures are held back until there is something to draw", async () => {
   pass(1000);
   assert.ok(drawn > before);
 });
+
+test("some time after the last data more pictures are drawn: a busy machine may not have read all", async () => {
+  window.requestAnimationFrame = draw;
+  const { wake } = await patches("late");
+  let drawn = 0;
+  const redraw = () => { drawn += 1; window.requestAnimationFrame(redraw); };
+  redraw();
+  wake(1000);
+  pass(4900);
+  const counts = [5000, 10000, 30000, 60000].map((wait) => { const before = drawn; pass(wait); return drawn - before; });
+  assert.ok(counts.slice(0, 3).every((count) => count > 0 && count < 20), counts.join());
+  assert.equal(counts[3], 0);
+});

@@ -99,10 +99,25 @@ const held = [];
 let last = performance.now();
 let left = PICTURES; // pictures that it may draw without a sign
 
+// A busy machine reads less for each picture. So after the last data the viewer may draw some more, or it could stay at
+// the image of an earlier frame under the boxes of the shown one.
+const LATE = [5e3, 15e3, 45e3]; // ms
+const LATE_PICTURES = 6;
+/** @type {number[]} */
+let later = [];
+
 // Let the viewer draw for a while, and until it has read these bytes.
 export function wake(bytes = 0) {
   last = performance.now();
-  left = Math.max(left, PICTURES) + Math.ceil(bytes / READ);
+  release(PICTURES);
+  left += Math.ceil(bytes / READ);
+  if (!bytes || !isPatched) return;
+  for (const timer of later) clearTimeout(timer);
+  later = LATE.map((wait) => window.setTimeout(() => release(LATE_PICTURES), wait));
+}
+/** @param {number} least number of pictures that the viewer may draw */
+function release(least) {
+  left = Math.max(left, least);
   for (const draw of held.splice(0)) nextPicture(draw);
 }
 
