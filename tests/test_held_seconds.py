@@ -18,12 +18,14 @@ from bevviz.errors import UserError
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Session
+from bevviz.recording import entities
 from bevviz.why import Selection
 from bevviz.workbench.growing_drive import RESULTS
 from bevviz.workbench.reports import ReportMaker
 from bevviz.workbench.running_robot import RunningRobot
 from bevviz.workbench.session import WorkbenchSession
 from tests.support.live_sessions import live_bench
+from tests.support.recordings import Recording
 from tests.support.waiting import until
 
 FRAMES, FIRST, HELD = 8, 4000, 2  # the live run has dropped or shown frames before
@@ -146,3 +148,15 @@ def test_a_report_is_cut_from_the_held_seconds(robot: RunningRobot, drive: Drive
     started = time.monotonic()
     session.close()
     assert time.monotonic() - started < 5
+
+
+def test_the_rest_of_a_frame_is_dim_beside_a_robot(
+    robot: RunningRobot, drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, pieces = drive.results[-1], list[bytes]()
+    monkeypatch.setattr(robot.recording, "add", pieces.append)
+    robot.mark(result, robot.explainer(result).about(Selection(object=0)))
+    (path := tmp_path / "marks.rrd").write_bytes(b"".join(pieces))
+    camera, recording = result.frame.cameras[0].name, Recording(path)
+    for entity in (entities.FUSED, entities.WHY_PART.path(f"{camera}/veil")):
+        assert recording.rows[entity][0]["stamp"] == result.frame.stamp

@@ -184,16 +184,26 @@ def focus_answer(to: Writer, result: FrameResult, answer: Answer, number: int) -
         The focus, for the positions of clicks.
     """
     frame = result.frame
-    boxes = {camera.name: box for camera in frame.cameras if (box := _image_box(camera, answer)) is not None}
-    place = focus_point(frame, answer)
+    boxes, place = _image_boxes(frame, answer), focus_point(frame, answer)
     if place is None:
         strips = [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
         place = np.concatenate(strips).mean(axis=0) if strips else None
     focus = Focus.on(frame, place, _length(answer), boxes)
     log_focus(to, frame, focus, number)
-    to.set_time(frame.index, frame.stamp, frame.received)
-    dim_rest(to, result, boxes)
+    dim_others(to, result, answer)
     return focus
+
+
+def dim_others(to: Writer, result: FrameResult, answer: Answer) -> None:
+    """Dim all of a frame but the subject of an answer.
+
+    Args:
+        to: writer of the answers.
+        result: result of the frame.
+        answer: the answer.
+    """
+    to.set_time(result.frame.index, result.frame.stamp, result.frame.received)
+    dim_rest(to, result, _image_boxes(result.frame, answer))
 
 
 def _length(answer: Answer) -> float:
@@ -229,12 +239,17 @@ def _image_layers(camera: Camera, answers: Sequence[Answer]) -> Iterator[Layer]:
 
 def cameras_of(frame: Frame, answer: Answer) -> list[str]:
     """Return the names of the cameras that show an answer's subject, the one with the largest box first."""
-    areas = {
-        camera.name: float(np.prod(box[2:] - box[:2]))
-        for camera in frame.cameras
-        if camera.image is not None and (box := _image_box(camera, answer)) is not None
-    }
-    return sorted(areas, key=lambda name: -areas[name])
+    pictured = {camera.name for camera in frame.cameras if camera.image is not None}
+    boxes = _image_boxes(frame, answer)
+    return sorted(
+        boxes.keys() & pictured, key=lambda name: -float(np.prod(boxes[name][2:] - boxes[name][:2]))
+    )
+
+
+def _image_boxes(frame: Frame, answer: Answer) -> dict[str, F32]:
+    """Return the (4,) box of an answer's subject in the image of each camera that sees it."""
+    boxes = {camera.name: _image_box(camera, answer) for camera in frame.cameras}
+    return {name: box for name, box in boxes.items() if box is not None}
 
 
 def _image_box(camera: Camera, answer: Answer) -> F32 | None:

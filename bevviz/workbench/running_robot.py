@@ -30,7 +30,7 @@ from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import FrameLogger, logged_rows
 from bevviz.why import Answer, Selection
-from bevviz.why.log import mark_answers
+from bevviz.why.log import dim_others, mark_answers
 from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, Settings
@@ -310,6 +310,7 @@ class RunningRobot(GrowingDrive):
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None = None) -> None:
         """Mark the object of an answer in every view of all pages."""
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
+        dim_others(self._marker, result, answer)
         self.recording.add(self._marks.read())
 
     def try_values(
