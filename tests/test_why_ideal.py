@@ -20,7 +20,7 @@ from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.assumed_truth import assumed_truth
-from bevviz.why.changes import changes_for
+from bevviz.why.changes import changes_for, other_methods
 from bevviz.why.collect import collect_evidence
 from bevviz.why.ideal import IdealStages
 from bevviz.why.kept_labels import kept_truth
@@ -185,6 +185,18 @@ def test_a_kept_label_says_nothing_about_other_objects() -> None:
     assert [(one.what, one.selection) for one in before] == [(one.what, one.selection) for one in after]
     assert blind._labelled is not None and (matches := blind._labelled.traces.matches) is not None
     assert (matches.partner < 0).any() and not matches.false.any()
+
+
+def test_other_methods_of_the_stages_that_lost_it_are_offered() -> None:
+    asked = explained("clustering.min_cluster_points=400")
+    answer = next(one for one in asked.missed() if ("clustering",) in one.restored_by)
+    assert answer.lost_in[0] == "clustering"
+    config = asked.traces.result.config
+    assert other_methods(answer.lost_in[:1], config) == (), "there is one alone"
+    stages = ("fusion", "detector", "ground", "fusion")
+    assert other_methods(stages, config) == ("fusion.method=centroid", "ground.method=plane")
+    plane = load(None, ["ground.method=plane"])
+    assert other_methods(("ground",), plane) == ("ground.method=polar",)
 
 
 def test_a_height_of_the_sensor_is_tried_against_a_roof() -> None:
