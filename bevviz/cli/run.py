@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.drive import Drive
+    from bevviz.model.frame import Scene
     from bevviz.model.protocols import Items, Observer, Processor
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.run import RunEnd
@@ -78,6 +79,7 @@ def run_logged(
     outputs: Outputs,
     observers: Callable[[RecordingStream], Sequence[Observer[R]]],
     finish: Callable[[], None] = lambda: None,
+    scene: Scene | None = None,
 ) -> int:
     """Run the frames with observers that log.
 
@@ -88,13 +90,14 @@ def run_logged(
         outputs: outputs of the recording.
         observers: makes the observers for the recording.
         finish: called after the last frame, before results are served.
+        scene: scene of the layout; default: that of the items.
 
     Returns:
         The exit status.
     """
     from bevviz.recording.recorder import DiskWatch
 
-    with outputs.opened(items.scene, config) as sinks:
+    with outputs.opened(scene or items.scene, config) as sinks:
         all_observers = [*observers(sinks.recording), DiskWatch(sinks)]
         early_warnings = list(items.warnings)  # Print these warnings before the long run, not after it.
         warn(early_warnings)
