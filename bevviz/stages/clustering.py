@@ -223,27 +223,37 @@ def _core_points(
 ) -> I32:
     """Return the number of core points of each cell. Move them to the front of their cell, in every array."""
     cells = len(start) - 1
-    cores = np.zeros(cells, np.int32)
+    cores, most = np.zeros(cells, np.int32), 0
+    for c in range(cells):
+        most = max(most, near[c + 1] - near[c])
+    unsure = np.empty(most, np.int32)
     for c in range(cells):
         size = start[c + 1] - start[c]
         if size >= min_points:
             cores[c] = size
             continue
-        reachable = size
+        # Neighbours that lie within eps as a whole count without a distance.
+        sure, rest, more = size, 0, 0
         for k in range(near[c], near[c + 1]):
-            reachable += start[neighbours[k] + 1] - start[neighbours[k]]
-        if reachable < min_points:
+            o = neighbours[k]
+            dx = max(box[c, 3] - box[o, 0], box[o, 3] - box[c, 0])
+            dy = max(box[c, 4] - box[o, 1], box[o, 4] - box[c, 1])
+            dz = max(box[c, 5] - box[o, 2], box[o, 5] - box[c, 2])
+            is_near = dx * dx + dy * dy + dz * dz < eps2
+            sure += is_near * (start[o + 1] - start[o])
+            more += (not is_near) * (start[o + 1] - start[o])
+            unsure[rest] = o
+            rest += not is_near
+        if sure >= min_points:
+            cores[c] = size
+            continue
+        if sure + more < min_points:
             continue
         for i in range(start[c], start[c + 1]):
             px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            count = size
-            for k in range(near[c], near[c + 1]):
-                o = neighbours[k]
-                dx = _gap(px, px, box[o, 0], box[o, 3])
-                dy = _gap(py, py, box[o, 1], box[o, 4])
-                dz = _gap(pz, pz, box[o, 2], box[o, 5])
-                if dx * dx + dy * dy + dz * dz >= eps2:
-                    continue
+            count = sure
+            for k in range(rest):
+                o = unsure[k]
                 for j in range(start[o], start[o + 1]):
                     dx, dy, dz = px - x[j], py - y[j], pz - z[j]
                     count += dx * dx + dy * dy + dz * dz < eps2
