@@ -101,8 +101,8 @@ let left = PICTURES; // pictures that it may draw without a sign
 
 // A busy machine reads less for each picture. So after the last data the viewer may draw some more, or it could stay at
 // the image of an earlier frame under the boxes of the shown one.
-const LATE = [5e3, 15e3, 45e3]; // ms
-const LATE_PICTURES = 6;
+const LATE = [3e3, 8e3, 16e3, 32e3]; // ms
+const LATE_PICTURES = 60; // Without a graphics card, most of them are left out.
 /** @type {number[]} */
 let later = [];
 
