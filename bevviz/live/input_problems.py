@@ -174,6 +174,7 @@ class InputProblems:
             over = f"{topic}: its clock agrees with the others again"
             self._problems.set("clock", topic, doubts.get(topic, ""), over, quiet=True, begins=2)
         told = {p.finding.subject for p in self._problems.current if p.finding.kind == "clock"}
+        told &= {*report.clocked}
         clocks = report.clocks
         right = clocks.reference(report.clocked)
         wrong = {topic for topic in told if clocks.wrong(topic, right)}  # not only late
