@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bevviz.cli import main
-from bevviz.compare.sides import published_result, robot_topic, shares_voxels
+from bevviz.compare.sides import published_result, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
@@ -312,9 +312,6 @@ def test_two_configurations_are_compared_on_kitti(kitti: tuple[str, str], capsys
     assert "EncodedImage:blob" in recording.at["/world/camera/image"]
     assert "EncodedImage:blob" not in recording.at["/b/world/camera/image"]
     assert "Points3D:positions" not in recording.at["/b/world/velodyne/points"]
-    assert "/world/velodyne/points/obstacles" in recording.at and "/world/camera/image/points" in recording.at
-    assert "/b/world/velodyne/points/obstacles" not in recording.at
-    assert "/b/world/camera/image/points" not in recording.at
     assert recording.at["/compare/states/person"]["StateChange:state"][0] == ["only A"]
     assert recording.at["/compare/count/only_a"]["Scalars:scalars"][0][0] == len(
         [o for o in first if o["change"] == "only A"]
@@ -433,23 +430,6 @@ def test_without_a_detector_it_is_not_said_that_nothing_differs(demo: str, capsy
     said = capsys.readouterr().out
     assert "no difference" not in said.replace("parameters: no difference", "")
     assert "no detector (--model FILE.onnx), so no objects; the number of clusters differs in 3 of 3" in said
-
-
-@pytest.mark.parametrize(
-    ("settings", "shared"),
-    [
-        (["clustering.eps=0.8"], True),
-        (["voxel.size=0.2"], False),
-        (["ground.distance_threshold=0.4"], False),
-        (["sync.motion_compensation=false"], False),
-        (["bev.range_x=30"], False),
-    ],
-)
-def test_voxels_are_shared_where_no_parameter_changes_them(settings: list[str], shared: bool) -> None:
-    other = load(settings=["detector.model=demo", *settings])
-    assert shares_voxels(DEFAULT, other) == shared
-    contents: Any = side_space(replace(kept_drives.scene(), shared=shared), entities.B).contents
-    assert ("/world/rslidar/points/obstacles" in contents) == shared
 
 
 def test_both_views_follow_the_robot(demo: str) -> None:

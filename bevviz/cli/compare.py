@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, cast
 
@@ -117,17 +117,16 @@ def _run(
     options: CompareOptions,
 ) -> int:
     from bevviz.checks import InputChecks
-    from bevviz.compare.sides import ComparisonRecorder, FirstSide, SideFailures, shares_voxels
+    from bevviz.compare.sides import ComparisonRecorder, FirstSide, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
 
     summary, failures = ComparisonSummary(names, changes(*configs)), SideFailures()
     checks = InputChecks(source, configs[0])
-    scene = replace(source.scene, shared=options.sides.robot is None and shares_voxels(*configs))
 
     def observers(recording: RecordingStream) -> list[Observer[ComparedFrame]]:
         print_hints(source.scene, config)
-        return [ComparisonRecorder(recording, *configs, summary, scene), summary, failures, FirstSide(checks)]
+        return [ComparisonRecorder(recording, *configs, summary), summary, failures, FirstSide(checks)]
 
     def finish() -> None:
         warn([*checks.warnings_beside(source.warnings), *failures.warnings])
@@ -139,7 +138,7 @@ def _run(
 
     output = options.output
     outputs = output.or_file(Path(f"{options.drive.paths[0].stem}_compare.rrd"))
-    return run_logged(source, processor, config, outputs, observers, finish, scene)
+    return run_logged(source, processor, config, outputs, observers, finish)
 
 
 def _sides(options: CompareOptions) -> tuple[tuple[str, str], tuple[Config, Config]]:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from bevviz.config import Config
     from bevviz.drive import Drive
-    from bevviz.model.frame import Scene
     from bevviz.model.protocols import Items, Observer, Processor
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.run import RunEnd
@@ -79,7 +78,6 @@ def run_logged(
     outputs: Outputs,
     observers: Callable[[RecordingStream], Sequence[Observer[R]]],
     finish: Callable[[], None] = lambda: None,
-    scene: Scene | None = None,
 ) -> int:
     """Run the frames with observers that log.
 
@@ -90,14 +88,13 @@ def run_logged(
         outputs: outputs of the recording.
         observers: makes the observers for the recording.
         finish: called after the last frame, before results are served.
-        scene: scene of the layout; default: that of the items.
 
     Returns:
         The exit status.
     """
     from bevviz.recording.recorder import DiskWatch
 
-    with outputs.opened(scene or items.scene, config) as sinks:
+    with outputs.opened(items.scene, config) as sinks:
         all_observers = [*observers(sinks.recording), DiskWatch(sinks)]
         early_warnings = list(items.warnings)  # Print these warnings before the long run, not after it.
         warn(early_warnings)

@@ -17,13 +17,12 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate.differences import FrameDifferences, before_after, differences, seen
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
-from bevviz.model.frame import Camera, Frame, LabelledBoxes3D, Scene
+from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
 from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.recording import entities
 from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.retention import keeps_everything
 from bevviz.stages.robot_results import detections_of, in_points_frame
 
 
@@ -113,15 +112,6 @@ class Comparison:
         return replace(compared, a=a, b=others[0].finish(b) if others and b is not None else b)
 
 
-def shares_voxels(a: Config, b: Config) -> bool:
-    """Return whether both configurations give the same voxels, ground, obstacles and occupancy grid."""
-    # Scans of one plane get another voxel size where none is stated.
-    stated = [{key for key in config.stated if key.startswith("voxel.")} for config in (a, b)]
-    sections = "voxel", "ground", "sync", "bev", "logging", "functions"
-    is_equal = stated[0] == stated[1] and all(getattr(a, name) == getattr(b, name) for name in sections)
-    return is_equal and keeps_everything(a)
-
-
 class ComparisonRecorder(Observer[ComparedFrame]):
     """Observer that logs both sides and their differences.
 
@@ -131,20 +121,19 @@ class ComparisonRecorder(Observer[ComparedFrame]):
         recording: target.
         a, b: the configurations.
         summary: of the same comparison.
-        scene: names of the sensors.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, a: Config, b: Config, summary: ComparisonSummary, scene: Scene
+        self, recording: rr.RecordingStream, a: Config, b: Config, summary: ComparisonSummary
     ) -> None:
-        self._recording, self._configs, self._summary, self._scene = recording, (a, b), summary, scene
+        self._recording, self._configs, self._summary = recording, (a, b), summary
 
     def begin(self, items: Items[object]) -> None:
         """Log the static entities of both sides."""
         a, b = self._configs
         self._loggers = (
-            FrameLogger(self._recording, a, self._scene),
-            FrameLogger(self._recording, b, self._scene, entities.B),
+            FrameLogger(self._recording, a, items.scene),
+            FrameLogger(self._recording, b, items.scene, entities.B),
         )
         for logger in self._loggers:
             logger.log_static()

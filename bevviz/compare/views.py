@@ -19,18 +19,17 @@ def side_space(scene: Scene, root: str) -> rrb.Spatial3DView:
     return space(scene, raw=False, names=False, name=f"3D {name}", root=root, beside=contents)
 
 
-def side_camera(scene: Scene, camera_name: str, root: str) -> rrb.Spatial2DView:
+def side_camera(camera_name: str, root: str) -> rrb.Spatial2DView:
     """Return the image view with one run's detections and with those missing in the other run."""
     name, only_here = _SIDES[root]
     image, detections = entities.IMAGE.path(camera_name), entities.DETECTIONS.path(camera_name)
-    points = [entities.PROJECTED.path(camera_name)] if root and scene.shared else []
     differences = [
         entities.IMAGE_DIFFERENCE.path(camera_name, change) for change in (only_here, Change.CLASS)
     ]
     return rrb.Spatial2DView(
         name=f"{camera_name} {name}",
         origin=entities.SENSOR.path(camera_name),
-        contents=[image, f"{root}{image}/**", *points, *differences],
+        contents=[image, f"{root}{image}/**", *differences],
         overrides=dict.fromkeys(
             (root + entities.WEAK.path(camera_name), root + entities.NAMES.path(detections)), HIDDEN
         ),
@@ -40,7 +39,7 @@ def side_camera(scene: Scene, camera_name: str, root: str) -> rrb.Spatial2DView:
 def side_pictures(scene: Scene, root: str) -> rrb.Tabs:
     """Return the camera views and the bird's-eye view of one run, in tabs."""
     name = _SIDES[root][0]
-    cameras = [side_camera(scene, camera_name, root) for camera_name in scene.cameras]
+    cameras = [side_camera(camera_name, root) for camera_name in scene.cameras]
     return rrb.Tabs(*cameras, birds_eye(scene, root, f"Bird's-eye view {name}"))
 
 

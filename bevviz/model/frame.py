@@ -379,5 +379,4 @@ class Scene:
     above: tuple[float, float, float, float] | None = None  # u, v, u, v: start of a look from above
     moving: bool = False  # the views go to what a user asks about
     raw: bool = True  # every raw cloud is logged
-    shared: bool = False  # both sides of a comparison have the same voxels, ground and occupancy grid
     color_by: tuple[Quantity, ...] = ()  # quantities that can colour the raw cloud

@@ -130,7 +130,6 @@ class FrameLogger(Writer):
         self._config = config
         self.streams_video = config.logging.video == "stream"
         self._scene, self._network = scene, network
-        self._shares = bool(root) and scene.shared  # another logger writes voxels, ground and grid
         self._intrinsics: dict[str, Intrinsics] = {}
         self._static_data: dict[str, StaticData] = {}
         self._track_lanes = TrackLanes()
@@ -279,8 +278,7 @@ class FrameLogger(Writer):
         self._log_lidar_results(result)
         for camera in result.cameras:
             log_detections(self, camera, result.explanations, has_truth=frame.truth is not None)
-            logging = self._config.logging
-            if logging.projected_points and logging.keep != "report" and not self._shares:
+            if self._config.logging.projected_points and self._config.logging.keep != "report":
                 log_projected_points(self, camera, packed=not keeps_everything(self._config))
         log_opinions_in_images(self, result)
         log_frustums(self, frame, result.cameras)
@@ -288,7 +286,7 @@ class FrameLogger(Writer):
         if result.bev is not None:
             log_bev(self, result.bev, self._config)
             log_opinions_in_bev(self, result)
-            if self._config.logging.keep != "report" and not self._shares:
+            if self._config.logging.keep != "report":
                 log_grid(self, result, result.bev)
         if not self.root:
             self._log_static_data(frame)
@@ -375,14 +373,13 @@ class FrameLogger(Writer):
         frame, config, clusters = result.frame, self._config, result.clusters
         size, obstacles = config.voxel.size, result.obstacles
         is_packed, is_report = not keeps_everything(config), config.logging.keep == "report"
-        if not (is_report or self._shares):
+        if not is_report:
             log_ground(self, result, size, packed=is_packed)
         if obstacles is None:
             return
         if not is_packed:
             obstacles = round_voxels(obstacles, size)
-            if not self._shares:
-                log_obstacles(self, frame, obstacles)
+            log_obstacles(self, frame, obstacles)
         elif not is_report:
             others = obstacles if clusters is None else unclustered(obstacles, clusters)
             log_obstacles(self, frame, packed_points(others, size))

@@ -74,11 +74,7 @@ def space(
             *name_entities,
             *(entities.NAMES.path(entities.MARKED.path(state)) for state in MARK_COLORS),
         ]
-    voxels = entities.GROUND.path(scene.lidar), entities.OBSTACLES.path(scene.lidar), entities.GRID
-    shared = voxels if root and scene.shared else ()
-    overrides: dict[Any, Any] = dict.fromkeys(
-        (path if path in shared else root + path for path in hidden), HIDDEN
-    )
+    overrides: dict[Any, Any] = dict.fromkeys((root + path for path in hidden), HIDDEN)
     if by is not None:
         overrides |= {root + path: quantity_visualizer(by) for path in clouds}
     position, target = EYE, LOOK_TARGET
@@ -98,13 +94,7 @@ def space(
     return rrb.Spatial3DView(
         name=name if scene.raw else f"{name}, voxels (raw clouds now and then, or none)",
         origin=root + entities.SENSOR.path(scene.lidar),
-        contents=[
-            f"{root}{entities.WORLD}/**",
-            *shared,
-            *beside,
-            *([f"{entities.WHY}/**"] if why else []),
-            *away,
-        ],
+        contents=[f"{root}{entities.WORLD}/**", *beside, *([f"{entities.WHY}/**"] if why else []), *away],
         background=_DARK,
         line_grid=False,
         spatial_information=rrb.SpatialInformation(target_frame=target_frame),
