@@ -115,7 +115,7 @@ class FindingFrame:
 
 @dataclass(slots=True)
 class FindingGroup:
-    """One finding in all of its frames."""
+    """One finding in all of its frames. ``add`` sums them up, since a page hears of it after each frame."""
 
     number: int
     what: str
@@ -124,24 +124,35 @@ class FindingGroup:
     position: Position | None = None  # position in the last frame
     box: F32 | None = None
     subject: str = ""  # of an anomaly
+    stamps: tuple[float, float] = math.inf, -math.inf  # the earliest and the latest one
+    nearest: float = math.inf  # metres; infinite: unknown
+    is_in_way: bool = False  # in any frame
+    is_second_name: bool = True  # in every frame
+
+    def add(self, frame: FindingFrame) -> None:
+        """Add a frame."""
+        self.frames.append(frame)
+        self.stamps = min(self.stamps[0], frame.stamp), max(self.stamps[1], frame.stamp)
+        self.nearest = self.nearest if math.isnan(frame.distance) else min(self.nearest, frame.distance)
+        self.is_in_way |= frame.in_way
+        self.is_second_name &= frame.text == ReasonKind.SECOND_NAME
 
     @property
     def reasons(self) -> list[str]:
         """Reasons to look at it first. Each counts once."""
         if self.what == "anomaly":
             return ["concerns everything that the sensors see"] * (self.name in _EVERYTHING)
-        if all(one.text == ReasonKind.SECOND_NAME for one in self.frames):
+        if self.is_second_name:
             return []
-        stamps = [one.stamp for one in self.frames]
-        lasts = max(stamps) - min(stamps)
-        reasons = ["in the way of the robot"] * any(one.in_way for one in self.frames)
+        lasts = self.stamps[1] - self.stamps[0]
+        reasons = ["in the way of the robot"] * self.is_in_way
         reasons += [f"nearer than {NEAR:g} m"] * (self.distance <= NEAR)
         return reasons + [f"lasts {lasts / 1e9:.1f} s"] * (lasts >= LONG)
 
     @property
     def distance(self) -> float:
         """Metres to it in its nearest frame."""
-        return min((one.distance for one in self.frames if not math.isnan(one.distance)), default=_UNKNOWN)
+        return _UNKNOWN if math.isinf(self.nearest) else self.nearest
 
     @property
     def rank(self) -> tuple[float, ...]:
@@ -213,7 +224,7 @@ class FindingList:
         taken_groups.add(group.number)
         self._groups[group.number] = self._groups.pop(group.number)
         group.position, group.box, group.subject = finding.position, finding.box, finding.subject
-        group.frames.append(
+        group.add(
             FindingFrame(
                 finding.frame,
                 finding.stamp,
@@ -253,7 +264,8 @@ class FindingList:
         with self._lock:
             for kind, name, frames in groups:
                 group = self._new(kind, name)
-                group.frames += frames
+                for frame in frames:
+                    group.add(frame)
                 if not stay:
                     self._overview.setdefault(frames[0].frame // CELL, []).append(group)
 

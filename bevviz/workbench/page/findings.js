@@ -60,8 +60,10 @@ export function update(message) {
   for (const number of message.gone) entries.delete(number);
   for (const one of message.entries) {
     const known = entries.get(one.number);
-    if (known) Object.assign(known, one, { sights: [...known.sights, ...one.sights] });
-    else entries.set(one.number, { key: one.number, best: 0, handled: null, ...one });
+    if (known) {
+      known.sights.push(...one.sights);
+      Object.assign(known, one, { sights: known.sights });
+    } else entries.set(one.number, { key: one.number, best: 0, handled: null, ...one });
   }
   draw();
 }
