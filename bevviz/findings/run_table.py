@@ -42,12 +42,15 @@ class StoredRun:
     Attributes:
         groups: the findings.
         frames: stamp and number of each frame.
-        explained: whether missed objects have a reason.
     """
 
     groups: list[StoredGroup]
     frames: list[tuple[int, int]]
-    explained: bool = True
+
+    @property
+    def explained(self) -> bool:
+        """Whether missed objects have a reason."""
+        return all(frame.text for group in self.groups if group.what == "missed" for frame in group.frames)
 
 
 UNRELATED = {"live", "logging", "store"}  # sections that change no finding
@@ -96,14 +99,11 @@ class ListKeeper(Observer[FrameResult]):
         self._table, self._session, self._scans = table, session, scans
         self._list = FindingList()
         self._frames: list[tuple[int, int]] = []
-        self._explained = True
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
         explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names)
-        findings = find_findings(explainer, restore=False)
-        self._explained &= all(finding.what != "missed" for finding in findings)
-        self.add(result.frame, findings)
+        self.add(result.frame, find_findings(explainer, restore=False))
 
     def add(self, frame: Frame, findings: Iterable[Finding]) -> None:
         """List the findings of a frame."""
@@ -114,7 +114,7 @@ class ListKeeper(Observer[FrameResult]):
         """Keep the list."""
         if len(self._frames) == self._scans:
             groups = [StoredGroup(*group) for group in self._list.content()]
-            self._table.save(StoredRun(groups, sorted(self._frames), self._explained))
+            self._table.save(StoredRun(groups, sorted(self._frames)))
 
 
 def list_keeper(source: BagSource, session: Session, config: Config | None = None) -> ListKeeper | None:
