@@ -106,3 +106,9 @@ def machine() -> str:
     names = [line.partition(":")[2].strip() for line in info.splitlines() if line.startswith("model name")]
     name = names[0] if names else platform.processor() or platform.machine()
     return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+
+
+def default_model() -> Path | None:
+    """Return YOLOX-nano among the data beside the project. None: there is none."""
+    model = Path(__file__).resolve().parents[2] / "shared/data/models/yolox_nano.onnx"
+    return model if model.exists() else None

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 
 from benchmarks import bags, runs, stages
-from benchmarks.measure import machine
+from benchmarks.measure import default_model, machine
 from bevviz.bags.source import BagSource
 from bevviz.config import load
 
@@ -31,7 +31,7 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="fewer frames and repetitions, a smaller bag")
     parser.add_argument("--size", type=float, default=1.0, help="GB of the bag of whole runs (default: 1)")
-    parser.add_argument("--model", type=Path, default=_default_model(), help="detector (default: yolox_nano)")
+    parser.add_argument("--model", type=Path, default=default_model(), help="detector (default: yolox_nano)")
     parser.add_argument("--write", type=Path, help="page whose marked part is replaced, instead of printing")
     options = parser.parse_args()
     cv2.setNumThreads(2)
@@ -77,11 +77,6 @@ def without_target(row: str) -> str:
     """Drop the column ``wanted`` of a row of the table."""
     cells = row.split("|")
     return "|".join(cells[:6] + cells[7:])
-
-
-def _default_model() -> Path | None:
-    model = Path(__file__).resolve().parents[2] / "shared/data/models/yolox_nano.onnx"
-    return model if model.exists() else None
 
 
 if __name__ == "__main__":

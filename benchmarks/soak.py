@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.measure import machine
+from benchmarks.measure import default_model, machine
 from benchmarks.robot import POSES
 from benchmarks.transport import PROFILE
 from bevviz.config.reloading import ReloadableConfig
@@ -51,7 +51,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0, help="how long (default: 1)")
     parser.add_argument("--rate", type=float, default=10.0, help="scans a second (default: 10)")
     parser.add_argument("--frames", type=int, default=30, help="scans rendered, played forth and back")
-    parser.add_argument("--model", default=_default_model(), help="detector (default: yolox_nano)")
+    parser.add_argument(
+        "--model", default=str(default_model() or "demo"), help="detector (default: yolox_nano)"
+    )
     parser.add_argument("--dds", action="store_true", help="receive the drive from another process")
     parser.add_argument("--profile", type=Path, default=PROFILE, help="the publisher's (default: the docs')")
     parser.add_argument("--domain", type=int, default=47, help="ROS domain that nobody else uses")
@@ -210,11 +212,6 @@ class Soak:
         )
         print(f"memory: most {memory.max():.0f} MB, at the end {growth:.3f} of when the recorder was full")
         return int(p99 > 1e3 / rate or growth > GROWTH)
-
-
-def _default_model() -> str:
-    model = Path(__file__).resolve().parents[2] / "shared/data/models/yolox_nano.onnx"
-    return str(model) if model.exists() else "demo"
 
 
 if __name__ == "__main__":

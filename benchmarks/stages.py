@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks import tutorial
-from benchmarks.measure import Times, interleaved
+from benchmarks.measure import Times, default_model, interleaved
 from bevviz.config import load
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.messages.clouds import decode_cloud
@@ -37,7 +37,6 @@ from bevviz.stages.voxel import voxel_grid
 
 STAGES = ("voxel", "ground", "clustering", "projection", "bev", "explain")
 EPS, MIN_POINTS = 0.5, 50
-MODEL = Path(__file__).resolve().parents[2] / "shared/data/models/yolox_nano.onnx"
 
 
 def row(what: str, against: str, times: Sequence[Times], wanted: float, same: str) -> str:
@@ -255,7 +254,8 @@ def with_detections(count: int = 30, rounds: int = 5) -> dict[str, float]:
 
     Of each frame the fastest of ``rounds`` counts, and of these the mean.
     """
-    frames, config = list(SyntheticSource(frames=count)), load(settings=[f"detector.model={MODEL}"])
+    frames = list(SyntheticSource(frames=count))
+    config = load(settings=[f"detector.model={default_model() or 'demo'}"])
     alone = Session(config)
     known = {id(c.camera): c.detections for frame in frames for c in alone.run_single(frame).cameras}
     times = np.empty((rounds, count, 3))

@@ -15,6 +15,7 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,9 +28,6 @@ from bevviz.findings.finding_list import CELL
 from tests.support.workbench_pages import serving
 
 WORST = 10
-NEAR, LONG = 10.0, 0.5e9  # metres and nanoseconds, as in page/triage.js
-SENSORS = ("sensor", "sync", "tf", "stage")
-RANK = ("missed", "unmatched", "lost", "contradicted", "doubtful", "unnamed", "false", "anomaly")
 
 Entries = dict[int, dict[str, Any]]
 
@@ -48,7 +46,7 @@ def main() -> None:
         with serving("open", str(options.bag.resolve()), model=options.model) as (address, server):
             early, whole = watch(address, start, options.after)
             seconds, memory = time.monotonic() - start, peak_memory(server.pid)
-    worst = sorted(whole.values(), key=order)[:WORST]
+    worst = sorted(whole.values(), key=itemgetter("rank"))[:WORST]
     print(
         "the worst:",
         ", ".join(f"{one['what']} {one['name']} at frame {one['sights'][0]['frame']}" for one in worst),
@@ -76,23 +74,10 @@ def watch(address: str, start: float, times: list[float]) -> tuple[dict[float, E
                 for number in message["gone"]:
                     del entries[number]
                 for one in message["entries"]:
-                    entries.setdefault(one["number"], {**one, "sights": []})["sights"] += one["sights"]
+                    known = entries.get(one["number"], {"sights": []})
+                    entries[one["number"]] = {**one, "sights": known["sights"] + one["sights"]}
             if message["type"] == "progress" and message["over"]:
                 return early, entries
-
-
-def order(entry: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the sort key of the page's table."""
-    sights = entry["sights"]
-    stamps, away = (
-        [int(s["stamp"]) for s in sights],
-        [99 if s["distance"] is None else s["distance"] for s in sights],
-    )
-    level = sum([any(s["in_way"] for s in sights), min(away) <= NEAR, max(stamps) - min(stamps) >= LONG])
-    if entry["what"] == "anomaly":
-        level = 3 if entry["name"] in SENSORS else 0
-    rank = 0 if entry["what"] == "unmatched" else RANK.index(entry["what"])
-    return -level, rank, min(away), stamps[0]
 
 
 def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
