@@ -230,6 +230,7 @@ def test_findings_are_marked_and_noted_beside_the_bag(
     """A handled finding leaves the table in all pages, and can be listed again. A note is text."""
     page.locator("#found li button").first.click()
     chosen = page.locator("#found li:has([aria-current=true])")
+    until(lambda: chosen.locator(".chip").count())  # comes with the hints, after the answer
     text = chosen.locator("button").first.inner_text()
     chosen.locator("input").fill("parked, of no concern")
     chosen.get_by_text("ignore", exact=True).click()
