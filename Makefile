@@ -35,7 +35,8 @@ check: $(VENV)/.tested
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The page's scripts: types, rules and tests. It needs Node.js 18 or newer, with npm.
-page-check: tests/page/node_modules/.installed
+page-check: $(VENV)/.tested tests/page/node_modules/.installed
+	$(BIN)/python -m tools.make_page_types
 	tests/page/node_modules/.bin/tsc --project tests/page
 	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.js bevviz/workbench/page tests/page tests/support
 	node --test tests/page/*.test.js

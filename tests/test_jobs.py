@@ -21,9 +21,9 @@ def test_a_job_tells_how_it_ended() -> None:
     def fail(job: Job) -> None:
         raise UserError("bag.mcap: the file has gone")
 
-    jobs.start(Job(0, ("voxel.size=0.2",), "overlay-1", total=3), count)
+    jobs.start(Job(0, ("voxel.size=0.2",), total=3), count)
     until(lambda: not jobs.jobs[-1].going)
-    head = {"number": 0, "settings": ["voxel.size=0.2"], "asked_by": "overlay-1", "cancelled_by": ""}
+    head = {"number": 0, "settings": ["voxel.size=0.2"], "cancelled_by": ""}
     assert jobs.jobs[0].as_dict() == {**head, "state": "over", "error": "", "done": 3, "total": 3}
     jobs.start(Job(1), fail)
     until(lambda: not jobs.jobs[-1].going)

@@ -1,14 +1,8 @@
-"""The page's scripts: their types."""
+"""The page's scripts, beside what 'make page-check' tests."""
 
 from __future__ import annotations
 
 import pytest
-
-from tools.make_page_types import FILE, page_types
-
-
-def test_the_kept_types_of_the_page_are_those_of_the_code() -> None:
-    assert FILE.read_text() == page_types(), "run: python -m tools.make_page_types"
 
 
 def test_the_viewers_script_has_the_widget_that_is_exported() -> None:

@@ -191,13 +191,11 @@ def test_the_drive_is_run_with_other_values(talk: Talk, address: str, hinted: Hi
         ]
         assert trials[0] == trials[1]
     trial = trials[0]
-    assert trial["done"] == trial["total"] == len(trial["strip"]) == FRAMES
+    assert trial["done"] == trial["total"] == FRAMES
     assert trial["f1"]["before"] != trial["f1"]["after"]
     fixed = [stamp_and_pick(sight) for entry in talk.of("fixed") for sight in entry["sights"]]
     assert (stamp, pick) in fixed
     assert len(fixed) == trial["counts"]["fixed"]
-    good = sum(len(e["sights"]) for e in talk.of("fixed", "false gone"))
-    assert sum(frame["better"] for frame in trial["strip"]) == good
     talk.say(type="drive", set=["clustering.eps=0.7"])
     talk.say(type="cancel", what="drive")
     ended = talk.until("progress", lambda m: m["trials"][-1]["settings"] == ["clustering.eps=0.7"])["trials"][

@@ -469,10 +469,6 @@ def test_the_drive_is_run_with_other_values(page: Page) -> None:
     until(lambda: state(page).get("set") == ["clustering.eps=0.3"])
     until(lambda: "eps=0.3" in page.inner_text("#trial-set"))
     assert "differences of clustering.eps=0.9" in page.inner_text("#trial-listed")
-    strip = page.locator("#strip").bounding_box()
-    assert strip is not None
-    page.locator("#strip").click(position={"x": strip["width"] - 5, "y": 5})
-    until(lambda: frame(page) == FRAMES - 1)
 
     page.click("#fix")
     until(page.locator("#fix-cancel").is_visible)

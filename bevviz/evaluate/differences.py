@@ -284,13 +284,6 @@ class BeforeAfter:
         return sum(pair.change in (Change.MOVED, Change.CLASS) for pair in self.pairs)
 
     @property
-    def balance(self) -> tuple[int, int]:
-        """Number of objects that get better and that get worse. Without ground truth: new and gone ones."""
-        if self.truth is None:
-            return len(self.new_false), len(self.false_gone)
-        return len(self.fixed) + len(self.false_gone), len(self.broken) + len(self.new_false)
-
-    @property
     def names(self) -> ChangedObjects:
         """Names of the objects that the change affects."""
         before_of, after_of = _rows_by_label(self.before), _rows_by_label(self.after)

@@ -46,11 +46,8 @@ class FixSearch(Jobs[FixJob]):
         super().__init__("fix", source.news.tell)
         self._source, self._paths, self._truth, self._labels = source, tuple(paths), truth, labels
 
-    def begin(self, asked_by: str = "") -> None:
+    def begin(self) -> None:
         """Start to search.
-
-        Args:
-            asked_by: name of the overlay of the page that asks.
 
         Raises:
             UserError: a search is running, or there is no ground truth.
@@ -58,7 +55,7 @@ class FixSearch(Jobs[FixJob]):
         self.check_idle("a fix is being searched")
         if self._source.truth_of is None:
             raise UserError("there is no ground truth, by which a fix is judged")
-        self.start(FixJob(len(self.jobs), asked_by=asked_by), self._search)
+        self.start(FixJob(len(self.jobs)), self._search)
 
     def as_dict(self) -> FixEntry:
         """Return the newest search as JSON for the page. Before the first one, the state is empty."""

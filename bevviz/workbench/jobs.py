@@ -20,7 +20,6 @@ class Job:
     Attributes:
         number: number of the job among those of its kind, from 0.
         settings: settings that it is about.
-        asked_by: name of the overlay of the page that asked for it. Empty: a page without one.
         total: number of steps.
         state: waiting, running, over, cancelled or failed.
         error: reason of the failure.
@@ -31,7 +30,6 @@ class Job:
 
     number: int
     settings: tuple[str, ...] = ()
-    asked_by: str = ""
     total: int = 0
     state: str = "running"
     error: str = ""
@@ -58,7 +56,6 @@ class Job:
         return {
             "number": self.number,
             "settings": list(self.settings),
-            "asked_by": self.asked_by,
             "cancelled_by": self.cancelled_by,
             "state": self.state,
             "error": self.error,

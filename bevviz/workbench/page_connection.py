@@ -387,12 +387,12 @@ class PageConnection:
     async def _drive(self, message: types.RunDrive) -> None:
         """Run the drive with other values."""
         await asyncio.to_thread(
-            self._workbench.tools.trials.begin, message["set"], self._name, _span(message.get("span"))
+            self._workbench.tools.trials.begin, message["set"], _span(message.get("span"))
         )
 
     async def _fix(self, message: types.FindFix) -> None:
         """Search values that repair the drive."""
-        self._workbench.tools.fix.begin(self._name)
+        self._workbench.tools.fix.begin()
 
     async def _cancel(self, message: types.Cancel) -> None:
         if message["what"] == "try":
@@ -408,7 +408,7 @@ class PageConnection:
     async def _report(self, message: types.MakeReport) -> None:
         reports, settings = self._workbench.reports, message.get("set", ())
         range_ = message["before"], message["after"]
-        asked = await self._frame(message), settings, *range_, message["text"], _identity(message), self._name
+        asked = await self._frame(message), settings, *range_, message["text"], _identity(message)
         await self._in_turn(message["id"], lambda: reports.begin(*asked), settings)
 
     async def _note(self, message: types.AddNote) -> None:

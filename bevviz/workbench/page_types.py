@@ -30,7 +30,6 @@ Chip = Literal["", "hint", "cannot tell", "tried in vain"]
 RowRemark = TypedDict("RowRemark", {"remark": str, "chip": Chip, "text": str})  # text: the reason
 OtherObject = TypedDict("OtherObject", {"pick": str, "name": str, "reported": bool, "reason": str})
 Problem = TypedDict("Problem", {"text": str, "seconds": int})  # of the robot's data, and for how long
-StripFrame = TypedDict("StripFrame", {"stamp": str, "better": int, "worse": int})  # numbers of objects
 ReportFile = TypedDict("ReportFile", {"name": str, "megabytes": float})
 
 
@@ -99,7 +98,6 @@ class JobEntry(TypedDict):
 
     number: int
     settings: list[str]
-    asked_by: str
     cancelled_by: str
     state: str
     error: str
@@ -114,7 +112,6 @@ class TrialEntry(JobEntry):
     span: Span | None
     counts: dict[str, int]
     f1: BeforeAfter | None
-    strip: list[StripFrame]
 
 
 class FixEntry(JobEntry):

@@ -121,7 +121,6 @@ class ReportMaker(Jobs[ReportJob]):
         after: float,
         note: str,
         identity: Identity | None = None,
-        asked_by: str = "",
     ) -> ReportJob:
         """Start to make a report.
 
@@ -132,7 +131,6 @@ class ReportMaker(Jobs[ReportJob]):
             after: seconds after the frame.
             note: what went wrong, in the user's words.
             identity: the object that the page shows. None: the report is about the worst of the frame.
-            asked_by: name of the overlay of the page that asks.
 
         Raises:
             UserError: a report is in progress, there is no such frame, the object is not in it, the range is
@@ -164,7 +162,7 @@ class ReportMaker(Jobs[ReportJob]):
             tried=session.tried_on(number, settings, about) if settings else None,
             notes=session.notes(),
         )
-        report = ReportJob(len(self.jobs), settings, asked_by, name=output.stem)
+        report = ReportJob(len(self.jobs), settings, name=output.stem)
         self.start(report, partial(self._make, request))
         return report
 

@@ -41,8 +41,6 @@ class Trial(Job):
     """A run over the drive with other values, and its effect on each frame.
 
     Attributes:
-        strip: per frame its stamp, how many objects get better and how many get worse. Without ground truth,
-            how many objects appear and how many disappear.
         counts: number of changes by kind.
         scores: score before and after.
         known: whether there is ground truth.
@@ -51,7 +49,6 @@ class Trial(Job):
     """
 
     state: str = "waiting"
-    strip: list[tuple[int, int, int]] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
     known: bool = False
@@ -73,14 +70,12 @@ class Trial(Job):
     def as_dict(self) -> TrialEntry:
         """Return the trial as JSON for the page."""
         before, after = (rounded(score.f1) for score in self.scores)
-        strip = [] if self.going else self.strip
         return {
             **Job.as_dict(self),
             "lane": self.lane,
             "span": None if self.span is None else {"first": str(self.span[0]), "last": str(self.span[1])},
             "counts": {key: number for key, number in self.counts.items() if number},
             "f1": {"before": before, "after": after} if self.known else None,
-            "strip": [{"stamp": str(stamp), "better": good, "worse": bad} for stamp, good, bad in strip],
         }
 
 
@@ -92,12 +87,11 @@ class TrialRunner(Jobs[Trial]):
         self._drive = drive
         self._begun = 0  # number of trials until now
 
-    def begin(self, settings: Settings, asked_by: str = "", span: tuple[int, int] | None = None) -> None:
+    def begin(self, settings: Settings, span: tuple[int, int] | None = None) -> None:
         """Run the drive, or a span of it, with these settings. A trial that is running is cancelled.
 
         Args:
             settings: the settings.
-            asked_by: name of the overlay of the page that asks.
             span: first and last stamp of the frames. None: the whole drive.
 
         Raises:
@@ -114,7 +108,7 @@ class TrialRunner(Jobs[Trial]):
         if span is not None:
             frames = NumberedFrames(drive.again, _numbers(drive, span))
         known = drive.truth_of is not None
-        trial = Trial(self._begun, settings, asked_by, frames.total or 0, known=known, span=span)
+        trial = Trial(self._begun, settings, frames.total or 0, known=known, span=span)
         self._begun += 1
         drive.lanes[trial.lane] = trial.buffer
         drive.findings.replace(tuple(DIFFERENCES))
@@ -158,7 +152,6 @@ class _TrialObserver(Observer[FrameResult]):
         trial.counts["changed"] += change.changed
         for tried in (False, True):
             drive.findings.add((finding for finding, side in findings if side == tried), tried=tried)
-        trial.strip.append((frame.stamp, *change.balance))
         sides = (before, change.before), (after, change.after)
         for score, (objects, matches) in zip(trial.scores, sides, strict=True):
             if objects is not None and matches is not None and change.truth is not None:

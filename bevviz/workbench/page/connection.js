@@ -137,8 +137,11 @@ export function send(message, failed) {
 
 export const isConnected = () => questions?.readyState === WebSocket.OPEN;
 
-// Whether another page asked for a job.
-export const isOthers = (/** @type {{ asked_by: string }} */ job) => Boolean(overlay) && job.asked_by !== overlay;
+/**
+ * Who cancelled a job, in words.
+ * @param {{ cancelled_by: string }} job
+ */
+export const cancelled = ({ cancelled_by: by }) => (by && by !== overlay ? "cancelled on another page" : "cancelled");
 
 /** @type {[() => void, number][]} */
 let awaited = [];

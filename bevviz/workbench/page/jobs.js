@@ -1,12 +1,10 @@
 // Background work: trials of other values over the drive, and reports. Also the text field for notes.
 
-import { $, at, beforeAfter, element, inSpan, spanText, state } from "./page_state.js";
-import { isTried, seek } from "./viewer.js";
-import { follow, isOthers, send } from "./connection.js";
+import { $, beforeAfter, element, inSpan, spanText, state } from "./page_state.js";
+import { isTried } from "./viewer.js";
+import { cancelled, follow, send } from "./connection.js";
 
-const OTHERS = "asked for on another page";
-
-/** @import { FixEntry, Progress, ReportEntry, StripFrame, TrialEntry } from "./types" */
+/** @import { FixEntry, Progress, ReportEntry, TrialEntry } from "./types" */
 
 /** @type {TrialEntry[]} */
 let trials = []; // runs with other values, from the server, the newest last
@@ -48,23 +46,7 @@ export function start(using) {
   };
   $("note").onclick = () => send({ type: "note", time: Number(state.time), pick: state.pick, text: $("words").value,
     span: state.span }, say("noted"));
-  $("strip").onclick = (event) => {
-    const trial = shownRun();
-    if (!trial?.strip.length) return;
-    const row = Math.floor((event.offsetX / $("strip").clientWidth) * trial.strip.length);
-    seek(trial.strip[Math.min(row, trial.strip.length - 1)].stamp);
-  };
-  $("strip").onkeydown = (event) => { // The arrow keys step through the frames wherever the focus is.
-    const trial = shownRun();
-    if (event.key === "Enter" && trial?.strip.length) seek(worst(trial.strip).stamp);
-  };
 }
-
-/**
- * The frame that gets worst.
- * @param {StripFrame[]} frames
- */
-const worst = (frames) => frames.reduce((a, b) => (b.worse - b.better > a.worse - a.better ? b : a));
 
 /** @param {{ text: string }} message */
 export function noted({ text }) {
@@ -112,8 +94,6 @@ export function showRuns() {
   const newest = trials[trials.length - 1];
   $("trial-listed").hidden = message === newest;
   $("trial-listed").textContent = `The table of findings has the differences of ${named(newest)}.`;
-  $("strip").hidden = going || !message.strip.length;
-  if (!$("strip").hidden) strip(message.strip);
 }
 
 /**
@@ -151,35 +131,7 @@ function summary(message) {
   parts.push(frames);
   for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
   if (message.state === "cancelled") parts.push(cancelled(message));
-  if (isOthers(message)) parts.push(OTHERS);
   return parts.join("; ");
-}
-
-const cancelled = (/** @type {{ asked_by: string, cancelled_by: string }} */ job) => (job.cancelled_by && isOthers({ asked_by: job.cancelled_by }) ? "cancelled on another page" : "cancelled");
-
-/**
- * Draw one bar per frame: fixed and false gone upwards, broken and new false downwards.
- * @param {StripFrame[]} frames
- */
-function strip(frames) {
-  const canvas = $("strip");
-  const [width, height] = [canvas.clientWidth || 360, 36];
-  canvas.width = width;
-  canvas.height = height;
-  const draw = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
-  const most = Math.max(1, ...frames.map(({ better, worse }) => Math.max(better, worse)));
-  const each = width / frames.length;
-  const style = getComputedStyle(document.documentElement);
-  for (const [row, { better, worse }] of frames.entries()) {
-    const side = (/** @type {number} */ number) => (number / most) * (height / 2 - 1);
-    draw.fillStyle = style.getPropertyValue("--good");
-    draw.fillRect(row * each, height / 2 - side(better), Math.max(1, each - 1), side(better));
-    draw.fillStyle = style.getPropertyValue("--mark");
-    draw.fillRect(row * each, height / 2, Math.max(1, each - 1), side(worse));
-  }
-  draw.fillStyle = style.getPropertyValue("--line");
-  draw.fillRect(0, height / 2, width, 1);
-  canvas.title = `each frame: fixed and false gone upwards, broken and new false downwards; the worst is at ${at(worst(frames).stamp)} (Enter)`;
 }
 
 // --- search of a fix ----------------------------------------------------------------------------
@@ -187,8 +139,7 @@ function strip(frames) {
 /** @param {FixEntry} fix */
 function showFix(fix) {
   const going = fix.state === "running";
-  const by = isOthers(fix) ? ` (${OTHERS})` : "";
-  const steps = (fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...") + by;
+  const steps = fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...";
   $("fix").disabled = going;
   $("fix-section").hidden = !fix.state;
   for (const id of /** @type {const} */ (["fix-bar", "fix-cancel"])) $(id).hidden = !going;
@@ -220,7 +171,7 @@ function report(one) {
     });
     item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
       element("span", "faint", [` in ${one.folder}`, one.settings.join(", "),
-        one.state === "cancelled" ? cancelled(one) : "", isOthers(one) ? OTHERS : ""].filter(Boolean).join("; ")));
+        one.state === "cancelled" ? cancelled(one) : ""].filter(Boolean).join("; ")));
   }
   return item;
 }

@@ -78,11 +78,9 @@ export function draw() {
   const shown = lanes(rows);
   canvas.hidden = times.length < 2 || (kind === "live" && !shown.length);
   if (canvas.hidden) return;
-  for (const slider of [canvas, $("strip")]) {
-    slider.ariaValueText = [at(state.time), state.span ? `${spanText(state.span)} marked` : ""].filter(Boolean).join(", ");
-    slider.ariaValueNow = String(shownFrame() ?? 0);
-    slider.ariaValueMax = String(frameTimes.number(times.length - 1));
-  }
+  canvas.ariaValueText = [at(state.time), state.span ? `${spanText(state.span)} marked` : ""].filter(Boolean).join(", ");
+  canvas.ariaValueNow = String(shownFrame() ?? 0);
+  canvas.ariaValueMax = String(frameTimes.number(times.length - 1));
   const width = canvas.clientWidth;
   const height = ROW * Math.max(1, shown.length) + 4;
   canvas.style.height = `${height}px`;
