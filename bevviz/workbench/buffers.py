@@ -12,7 +12,6 @@ from bevviz.support.contexts import Closable
 from bevviz.support.files import catch_full_disk
 
 AHEAD = 6  # pieces of the run that may be sent before the page acknowledges the first of them
-CACHE = 800_000_000  # bytes of frames on demand that are kept
 NEIGHBOURS = (1, -1)  # frames that are made after the one that a page requests
 
 
@@ -127,57 +126,6 @@ class RecordingBuffer(Closable):
                 raise IndexError(row)
             start, end = self._ends[row], self._ends[row + 1]
             return os.pread(self._file.fileno(), end - start, start)
-
-
-class FrameCache(Closable):
-    """Pieces of frames by number, in a temporary file of limited size. The oldest are overwritten.
-
-    Args:
-        size: bytes of the file.
-
-    Raises:
-        UserError: the disk of the temporary folder is full.
-    """
-
-    def __init__(self, size: int = CACHE) -> None:
-        with catch_full_disk():
-            self._file = tempfile.TemporaryFile(prefix="bevviz-")  # noqa: SIM115, as in RecordingBuffer
-        self._size, self._end = size, 0
-        self._places: dict[int, tuple[int, int]] = {}  # first byte and the byte after the last
-        self._lock = threading.Lock()
-
-    def close(self) -> None:
-        """Delete the temporary file."""
-        with self._lock:
-            self._places.clear()
-            self._file.close()
-
-    def get(self, number: int) -> bytes | None:
-        """Return the piece of a frame. None: it is not kept, or no longer."""
-        with self._lock:
-            if number not in self._places:
-                return None
-            start, end = self._places[number]
-            return os.pread(self._file.fileno(), end - start, start)
-
-    def put(self, number: int, piece: bytes) -> None:
-        """Keep the piece of a frame in place of the oldest ones.
-
-        Raises:
-            UserError: the disk of the temporary folder is full.
-        """
-        with self._lock:
-            self._places.pop(number, None)
-            if len(piece) > self._size:
-                return
-            start = self._end if self._end + len(piece) <= self._size else 0
-            self._end = start + len(piece)
-            for other, (low, high) in list(self._places.items()):
-                if low < self._end and high > start:
-                    del self._places[other]
-            with catch_full_disk():
-                write_at(self._file.fileno(), piece, start)
-            self._places[number] = start, self._end
 
 
 class BufferReader:

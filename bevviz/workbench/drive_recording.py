@@ -23,7 +23,7 @@ from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
-from bevviz.workbench.buffers import FrameCache, RecordingBuffer
+from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.growing_drive import Settings
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
@@ -54,8 +54,6 @@ class DriveRecording(Closable):
         self.scene, self._config, self._total = replace(scene, moving=bool(scene.lidar)), config, total
         self.rows, self.on_demand = RecordingBuffer(), False
         self.usual_focus: Focus | None = None
-        self._frames: FrameCache | None = None
-        self._frame_versions: dict[int, int] = {}  # of the frames in ``_frames``
         self._rows_by_stamp: dict[int, int] = {}
         self._numbers_by_row: dict[int, int] = {}
         self._drawn: list[tuple[int, int, int]] = []  # stamp, number and receive time, sorted
@@ -80,8 +78,6 @@ class DriveRecording(Closable):
         if self._numbers is not None:
             self._numbers_stream.read()
         self.rows.close()
-        if self._frames is not None:
-            self._frames.close()
 
     def stream(
         self, batches: rr.ChunkBatcherConfig | None = None
@@ -126,7 +122,7 @@ class DriveRecording(Closable):
                 self._log_usual_focus(result.frame, first)
             piece = self._drawn_piece(result, findings)
         if not self._rows_by_stamp and len(piece) * self._total > WHOLE:
-            self._frames, self.on_demand = FrameCache(), True
+            self.on_demand = True
             self._logger.streams_video = False  # A page may lack the packets that a picture depends on.
         self._rows_by_stamp[result.frame.stamp] = len(self.rows)
         self._numbers_by_row[len(self.rows)] = result.frame.index
@@ -145,21 +141,11 @@ class DriveRecording(Closable):
         """Return the number of the frame that a row has. None: it has none."""
         return self._numbers_by_row.get(row)
 
-    def frame(self, number: int, version: int) -> bytes | None:
-        """Return the piece of a frame, if it is kept in this version."""
-        if self._frames is None or self._frame_versions.get(number) != version:
-            return None
-        return self._frames.get(number)
-
-    def draw(self, result: FrameResult, findings: Sequence[Finding], version: int) -> bytes:
+    def draw(self, result: FrameResult, findings: Sequence[Finding]) -> bytes:
         """Return the piece of a frame on demand. It is complete in itself."""
-        assert self._frames is not None
         with self._drawing:
             self._logger.refresh()
-            piece = self._drawn_piece(result, findings)
-            self._frames.put(result.frame.index, piece)
-            self._frame_versions[result.frame.index] = version
-        return piece
+            return self._drawn_piece(result, findings)
 
     def _drawn_piece(self, result: FrameResult, findings: Sequence[Finding]) -> bytes:
         """Log a frame. The next frame of those that were drawn before clears what it did not know of."""

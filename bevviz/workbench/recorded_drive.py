@@ -316,20 +316,17 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         return int(number in self._facts)
 
     def piece(self, number: int, *, wanted: bool) -> bytes | None:
-        """Return the recording of a frame, which is made if it is not kept.
+        """Return the recording of a frame on demand.
 
         Args:
             number: number of the frame.
             wanted: whether a page waits for it. The run pauses then.
         """
-        version = self.version(number)
-        if (piece := self.recording.frame(number, version)) is not None:
-            return piece
         try:
             with self.quiet() if wanted else nullcontext():
                 result = self.look(number) if wanted else self.look_aside(number)
                 findings = find_findings(self.explainer(result))
-                piece = self.recording.draw(self._with_tracks(result), findings, version)
+                piece = self.recording.draw(self._with_tracks(result), findings)
         except UserError:  # There is no such frame, or it cannot be read.
             return None
         self._picture(result.frame)
