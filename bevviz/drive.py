@@ -66,8 +66,9 @@ class Drive(Closable, Tabular):
         self._viewer: NotebookViewer | None = None
 
     def close(self) -> None:
-        """Close the source."""
+        """Close the source and the session."""
         self.frames.close()
+        self.session.close()
 
     def __repr__(self) -> str:
         seconds = f"{self.times[-1]:.1f} s" if len(self) else "empty"
@@ -292,9 +293,10 @@ class Drive(Closable, Tabular):
 
     def __iter__(self) -> Iterator[FrameResult]:
         """Yield the result of every frame in order, with tracks and anomalies. Results are computed ahead."""
-        for result in iterate_results(self.frames, self.new_session()):
-            self.checks.observe(result)
-            yield result
+        with self.new_session() as session:
+            for result in iterate_results(self.frames, session):
+                self.checks.observe(result)
+                yield result
 
     def new_session(self) -> Session:
         """Return a session for a run over the whole drive. It has its own tracks and shares the networks.
@@ -308,8 +310,8 @@ class Drive(Closable, Tabular):
 
     def run(self, observers: Sequence[Observer[FrameResult]]) -> RunEnd:
         """Run every frame in order and pass the results to the observers, see ``bevviz.pipeline.run.run``."""
-        session = self.new_session()
-        return run(self.frames, session, [*observers, self.checks])
+        with self.new_session() as session:
+            return run(self.frames, session, [*observers, self.checks])
 
     @errors_about_arguments()
     def evaluate(

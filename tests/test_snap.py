@@ -183,6 +183,27 @@ def test_a_request_during_a_save_waits_for_its_own(monkeypatch: pytest.MonkeyPat
     assert saved == 3 * [Path("/slow.rrd")]
 
 
+def test_a_save_that_hangs_delays_the_end_of_a_run_for_a_while(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "PATIENCE", 0.1)
+    saving, goes_on = threading.Event(), threading.Event()
+
+    def hang(path: Path | None) -> Path:
+        saving.set()
+        goes_on.wait(20)
+        return Path("/late.rrd")
+
+    start = time.monotonic()
+    with Control(hang, never):
+        asker = threading.Thread(target=say, args=(next(runtime.rglob("*.sock")), b"{}\n"))
+        asker.start()
+        assert saving.wait(20)
+    assert time.monotonic() - start < 10
+    goes_on.set()
+    asker.join()
+
+
 def test_the_client_imports_little() -> None:
     heavy = "{'numpy', 'rerun', 'numba', 'cv2'}"
     code = f"import bevviz.live.requests, sys; print(sorted({heavy} & sys.modules.keys()))"

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from bevviz.evaluate.metrics import Limit
     from bevviz.model.protocols import Observer
     from bevviz.model.results import FrameResult
+    from bevviz.pipeline.session import Session
 
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
@@ -77,6 +78,7 @@ def _evaluate(options: EvaluateOptions) -> int:
     from bevviz.evaluate.evaluation import Evaluation
     from bevviz.evaluate.ground_truth import truth_in
     from bevviz.evaluate.metrics import parse_limits
+    from bevviz.pipeline.session import Session
     from bevviz.why.false_objects import false_causes
 
     truth, limits = options.truth, parse_limits(options.limits.min, options.limits.max)
@@ -85,7 +87,8 @@ def _evaluate(options: EvaluateOptions) -> int:
         evaluation = Evaluation(truth_in(frames, truth.truth, truth.kitti_labels), false_causes)
         if not any(limit.metric.startswith(("ground", "object_points")) for limit in limits):
             _check_detector(config)
-        status = _run(frames, config, evaluation, options)
+        with Session(config) as session:
+            status = _run(frames, session, evaluation, options)
         if not evaluation.judged:
             raise UserError(
                 f"{options.drive.paths[0]}: there is truth for none of the {evaluation.without} frames"
@@ -104,7 +107,7 @@ def _check_detector(config: Config) -> None:
         )
 
 
-def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: EvaluateOptions) -> int:
+def _run(frames: BagSource, session: Session, evaluation: Evaluation, options: EvaluateOptions) -> int:
     """Run the pipeline with an evaluation and return the exit status.
 
     The table is printed before a recording is served.
@@ -114,9 +117,8 @@ def _run(frames: BagSource, config: Config, evaluation: Evaluation, options: Eva
     from bevviz.evaluate.log import EvaluationRecorder
     from bevviz.findings.marks import MarkRecorder
     from bevviz.findings.run_table import list_keeper
-    from bevviz.pipeline.session import Session
 
-    session, failures, outputs = Session(config), FailureSummary(), options.output
+    config, failures, outputs = session.config, FailureSummary(), options.output
     # The workbench takes stated labels for the frames' own. This run has them apart.
     truth = options.truth
     keeper = None if truth.truth or truth.kitti_labels else list_keeper(frames, session)

@@ -42,6 +42,7 @@ class Control(Closable):
     def __init__(self, save: Callable[[Path | None], Path], warn: Callable[[str], None]) -> None:
         self.save = save  # public, because it may be replaced later
         self._server: ThreadingUnixStreamServer | None = None
+        self._saving = threading.Lock()  # held until a request is answered
         reasons: list[str] = []
         for folder in folders():
             try:
@@ -58,20 +59,24 @@ class Control(Closable):
         self._thread.start()
 
     def close(self) -> None:
-        """Remove the socket and wait for a save in progress."""
+        """Remove the socket and wait a while for a save in progress."""
         if self._server is None:
             return
         Path(str(self._server.server_address)).unlink(missing_ok=True)
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+        if self._saving.acquire(timeout=PATIENCE):
+            self._saving.release()
 
     def _listen(self, folder: Path) -> ThreadingUnixStreamServer:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_owned(folder)
         path = folder / f"{os.getpid()}.sock"
         path.unlink(missing_ok=True)
-        return ThreadingUnixStreamServer(str(path), partial(_Conversation, self._answer))
+        server = ThreadingUnixStreamServer(str(path), partial(_Conversation, self._answer, self._saving))
+        server.daemon_threads = True
+        return server
 
     def _answer(self, request: bytes) -> dict[str, str]:
         try:
@@ -95,8 +100,10 @@ class _Conversation(StreamRequestHandler):
 
     timeout = ANSWER
 
-    def __init__(self, answer: Callable[[bytes], dict[str, str]], *connection: Any) -> None:
-        self._answer = answer
+    def __init__(
+        self, answer: Callable[[bytes], dict[str, str]], saving: threading.Lock, *connection: Any
+    ) -> None:
+        self._answer, self._saving = answer, saving
         super().__init__(*connection)
 
     def handle(self) -> None:
@@ -106,7 +113,8 @@ class _Conversation(StreamRequestHandler):
             if request is None:  # the client only tested whether a process listens
                 return
             self.wfile.write(b'{"heard": true}\n')
-            self.wfile.write(json.dumps(self._answer(request)).encode() + b"\n")
+            with self._saving:
+                self.wfile.write(json.dumps(self._answer(request)).encode() + b"\n")
 
 
 @contextmanager

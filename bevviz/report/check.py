@@ -150,7 +150,7 @@ def check(rrd: Path, *, model: Path | None = None, settings: Sequence[str] = ())
         ]
         comparer = _Comparer(stored, result)
         try:
-            with open_window([bag], current_config, info.low, info.high) as source:
+            with session, open_window([bag], current_config, info.low, info.high) as source:
                 if run(source, session, [comparer, Progress("check")], stop=comparer.complete).interrupted:
                     raise KeyboardInterrupt
         except UserError as error:

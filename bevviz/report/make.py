@@ -179,7 +179,7 @@ def make(
             with open_window(request.paths, request.config, low, high) as source_of_results:
                 made = list(result_messages(source_of_results))
             request = replace(request, config=without_result_files(request.config))
-        session = Session(request.config, detect, loader=loader)
+        session = stack.enter_context(Session(request.config, detect, loader=loader))
         content = _cut(whole_bag, window, topics, bag, redactor, made)
         written.files.append(bag)
         written.warnings += [

@@ -149,7 +149,8 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             self._opened(explainer)
             if self.again.total >= LEAST and not is_known:
                 self._make_overview()
-            run(self.again, self.drive.new_session(), [self], stop=self._stop)
+            with self.drive.new_session() as session:
+                run(self.again, session, [self], stop=self._stop)
             if not (self._stop.is_set() or self._is_listed):
                 self.findings.end_overview(self.scans)
                 self._save_list()

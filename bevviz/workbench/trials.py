@@ -122,7 +122,8 @@ class TrialRunner(Jobs[Trial]):
         while not drive.over and not trial.stop.wait(0.1):
             pass  # The results of the first run are needed for comparison.
         trial.state = "running"
-        run(frames, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
+        with session:
+            run(frames, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
 
 
 def _numbers(drive: RecordedDrive, span: tuple[int, int]) -> range:

@@ -94,8 +94,7 @@ def _fill(
     """
     config = _with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
-    with job.selection.source([job.bag], job.config) as source:
-        session = Session(config)
+    with job.selection.source([job.bag], job.config) as source, Session(config) as session:
         recording.parent.mkdir(parents=True, exist_ok=True)
         with open_recording(
             source.scene,

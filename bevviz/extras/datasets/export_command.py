@@ -68,7 +68,8 @@ def _export(options: ExportOptions) -> int:
         print_hints(drive.scene, config)
         export = export_class(output.folder, output.camera)
         failures = FailureSummary()
-        end = run_with_progress(drive.frames, drive.new_session(), [export, failures, drive.checks])
+        with drive.new_session() as session:
+            end = run_with_progress(drive.frames, session, [export, failures, drive.checks])
         warn([*drive.checks.warnings, *failures.warnings])
     warn(f"{count} frame(s) left out: {why}" for why, count in export.skipped.items())
     if export.frames:

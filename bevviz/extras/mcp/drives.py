@@ -79,7 +79,8 @@ class AskedDrive:
     def run(self, settings: Sequence[str], observers: Sequence[Observer[FrameResult]]) -> None:
         """Run the drive with some values changed."""
         config = agent_config(self.drive.config, settings)
-        run(self.drive.frames, Session(config, loader=self.drive.session.loader), observers)
+        with Session(config, loader=self.drive.session.loader) as session:
+            run(self.drive.frames, session, observers)
 
     @cached_property
     def findings(self) -> RunFindings:
