@@ -17,9 +17,11 @@ from urllib.parse import urlsplit
 import pytest
 
 import bevviz
+from bevviz.cli import main
 from bevviz.pipeline.notes import HandledFinding, Notes
 from bevviz.recording import entities
 from bevviz.workbench.thumbnails import WIDTH
+from tests.support.kept_drives import BAG
 from tests.support.waiting import until
 from tests.support.workbench_pages import (
     FRAMES,
@@ -410,6 +412,44 @@ def choose_missed(page: Page, *, with_hints: bool) -> None:
         if (page.locator("#hints button").count() > 0) == with_hints:
             return
     pytest.fail("there is no such row")
+
+
+@pytest.mark.long
+def test_a_box_is_drawn_kept_and_removed(browser: Browser, tmp_path: Path) -> None:
+    """Its form follows what is typed. The answer is that of ground truth as long as its note is kept."""
+    bag = tmp_path / "street.mcap"
+    topics = ["/rslidar_points", "/zed2/*", "/odom"]
+    assert main(["cut", str(BAG), "--end", "0.15", "--topics", *topics, "-o", str(bag)]) == 0
+    with served(bag) as address, opened(browser, address) as page:
+        until(lambda: page.inner_text("#run") == "2 frames")
+        page.keyboard.press("Home")
+        step = page.locator("#steps .label")
+        click = {"entity_path": entities.IMAGE.path("zed"), "position": [20, 20]}
+        page.evaluate(f"window.clickInViewer({json.dumps(click)})")
+        until(lambda: step.count() and "draw its box" in step.inner_text())
+        step.click()
+        until(lambda: page.input_value("#label-class") == "person")
+        numbers = page.locator("#label-numbers input")
+        numbers.first.fill("")
+        until(lambda: page.inner_text("#label-text") == "Each field needs a number.")
+        for number, value in enumerate(("9", "2", "0", "4", "2", "2", "30")):
+            numbers.nth(number).fill(value)
+        until(lambda: page.inner_text("#label-text").endswith(" points in it."))
+        page.fill("#label-class", "car")
+        page.click("#label >> text=keep as truth")
+        until(
+            lambda: page.inner_text("#label-text").startswith(f"Kept in {bag}.notes.json: the car at 9.2 m")
+        )
+        (note,) = Notes([bag])
+        assert (note.label, note.box) == ("car", (9, 2, 0, 4, 2, 2, 0.524))
+        until(lambda: step.count() and "change its label" in step.inner_text())
+        assert verdict(page).startswith("The car")
+        step.click()
+        until(lambda: page.input_value("#label-class") == "car" and numbers.nth(6).input_value() == "30")
+        page.click("#label-cancel")
+        page.locator("#found li", has_text="car at 9.2 m").locator("[title='remove this note']").click()
+        until(lambda: not list(Notes([bag])))
+        until(lambda: step.count() and "draw its box" in step.inner_text())
 
 
 @pytest.mark.long

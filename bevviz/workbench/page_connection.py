@@ -236,7 +236,7 @@ class PageConnection:
         workbench, frame = self._workbench, await self._frame(message)
         settings = self._source.asked_settings(message.get("set", ()), again="pick" in message)
         head: types.Reply = {"id": number, "frame": frame, "set": message.get("set", ())}
-        origin = message.get("origin")
+        origin = None if _identity(message) else message.get("origin")  # A row is of its own frame.
         asked_in = frame if origin is None else await self._frame(origin)
 
         def work() -> tuple[Selection, FrameResult, Answer, dict[str, Any]] | types.Nothing | types.Absent:
@@ -258,10 +258,14 @@ class PageConnection:
                 text = f"{name} of frame {identity.frame} is not in frame {frame}{values}: {found}."
                 return {"type": "absent", **head, "text": text, "pick": str(identity)}
             answer, *others = workbench.ask(frame, settings, selection)
-            pick = str(workbench.identity(frame, settings, selection, answer, identity))
-            followed = {"pick": pick, "found": found, "labelled": answer.label >= 0}
+            identity = workbench.identity(frame, settings, selection, answer, identity)
+            followed = {"pick": str(identity), "place": bool(identity.place), "found": found}
             result = self._source.look(frame, settings)
-            more = {"beside": [*other_answers(others)], "cameras": cameras_of(result.frame, answer)}
+            more = {
+                "labelled": answer.label >= 0,
+                "beside": [*other_answers(others)],
+                "cameras": cameras_of(result.frame, answer),
+            }
             tree = {"type": "answer", **head, **answer_tree(answer), **followed, **more}
             return selection, result, answer, tree
 

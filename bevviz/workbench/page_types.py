@@ -202,13 +202,17 @@ class Reply(TypedDict):
 @json_form
 @dataclass(frozen=True)
 class AnswerMessage(AnswerResult):
-    """An answer. ``cameras`` show its subject, the one with the largest part of it first."""
+    """An answer. ``cameras`` show its subject, the one with the largest part of it first.
+
+    ``place``: it is about a place, not an object.
+    """
 
     type: Literal["answer"]
     id: int
     frame: int
     set: Sequence[str]
     pick: str
+    place: bool
     found: str
     beside: Sequence[OtherObject]
     labelled: bool

@@ -100,12 +100,13 @@ class Site:
         return _file(PAGE, FILES, name, "no-cache")
 
     async def viewer(self, request: Request) -> Response:
-        """Return a file of Rerun's web viewer. The script also exports its widget, which holds the viewer."""
-        name, cache = request.path_params["name"], "private, max-age=31536000, immutable"
-        if name == "widget.js" and WIDGET in (text := (self._viewer / name).read_text()):
-            text += "export { ViewerWidget };\n"
-            return Response(text, media_type=KINDS[".js"], headers={"Cache-Control": cache})
-        return _file(self._viewer, VIEWER, name, cache)
+        """Return a file of Rerun's web viewer. Our form of its script also exports the widget."""
+        name = request.path_params["name"]
+        if name == "exported_widget.js":
+            text = (self._viewer / "widget.js").read_text()
+            text += "export { ViewerWidget };\n" if WIDGET in text else ""
+            return Response(text, media_type=KINDS[".js"], headers={"Cache-Control": "no-cache"})
+        return _file(self._viewer, VIEWER, name, "private, max-age=31536000, immutable")
 
     async def config(self, request: Request) -> Response:
         """Return the configuration with the tried settings as a YAML file."""

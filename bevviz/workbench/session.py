@@ -89,7 +89,6 @@ class WorkbenchSession(Closable):
         self._tools: DriveTools | None = None
         self._reports: ReportMaker | None = None
         self._local = threading.local()  # The explainer of each thread that asks.
-        self._labels = 0  # number of changes of the labels until now
         self._lock = threading.Lock()  # guards _answers
         self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
 
@@ -225,11 +224,10 @@ class WorkbenchSession(Closable):
     ) -> tuple[FrameExplainer, list[Answer], list[Answer]]:
         """Return the explainer of the frame, the answers, and those of them that a place selects."""
         result = self.source.look(number, settings)
-        made_of, explainer = getattr(self._local, "explainer", ((None, 0), None))
-        if explainer is None or made_of[0] is not result or made_of[1] != self._labels:
-            made_of = result, self._labels
-            explainer = self.source.explainer(result)
-            self._local.explainer = made_of, explainer
+        known, labels = getattr(self._local, "explainer", None), self.labels(result.frame)
+        if known is None or known[0] is not result or known[1] != labels:
+            known = self._local.explainer = result, labels, self.source.explainer(result)
+        explainer: FrameExplainer = known[2]
         candidates = explainer.candidates(selection) if selection.is_place else []
         return explainer, candidates or explainer.ask(selection), candidates
 
@@ -420,20 +418,23 @@ class WorkbenchSession(Closable):
         self._tell_notes()
         return f"Kept in {notes.path}: the {about}. The note in the list removes it."
 
+    def labels(self, frame: Frame) -> tuple[Note, ...]:
+        """Return the notes with the labels of a frame that the user keeps."""
+        with suppress(UserError):
+            return tuple(note for note in self.notes() if is_label_in(note, frame))
+        return ()
+
     def _note_of(self, answer: Answer, frame: Frame) -> Note | None:
         """Return the note with the label that an answer is about. None: there is no label."""
-        labels = [note for note in self.tools.notes if is_label_in(note, frame)]
+        labels = self.labels(frame)
         return labels[answer.label] if 0 <= answer.label < len(labels) else None
 
     def _kept_labels(self, frame: Frame) -> Truth | None:
-        """Return the labels of a frame that the user keeps. None: there are none, or they cannot be read."""
-        with suppress(UserError):
-            return kept_truth(self.tools.notes, frame, self.source.pipeline.stages.class_names)
-        return None
+        """Return the labels of a frame that the user keeps. None: there are none."""
+        return kept_truth(self.labels(frame), frame, self.source.pipeline.stages.class_names)
 
     def _forget_answers(self) -> None:
         """Forget the answers that were made with other labels."""
-        self._labels += 1
         self.source.forget_remarks()
         with self._lock:
             self._answers.clear()

@@ -15,7 +15,7 @@ import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from 
 const REQUESTS = 300; // ms between two requests of frames while the time goes on
 
 /** @import { AnswerMessage, Absent, Control, Error, Hints, Nothing, Opening, Origin, Robot, SideEffects, Span, Tried, Welcome } from "./types" */
-/** @typedef {{ pick: string, origin?: Origin }} Known */
+/** @typedef {{ pick: string, origin: Origin | null }} Known */
 /** @typedef {Known | import("./viewer.js").Click} Subject what is asked about */
 
 /** @type {Control[]} */
@@ -68,14 +68,14 @@ function ask(what) {
 function askOther(what) {
   list.leave();
   remember(Boolean(state.pick));
-  if ("pick" in what) [state.pick, state.origin] = [what.pick, what.origin ?? null];
+  if ("pick" in what) [state.pick, state.origin] = [what.pick, what.origin];
   ask(what);
 }
 
 // Row numbers differ between frames and values. The address of an answer's object is valid in all of them.
 // Until it has come, the row number goes with its frame and values.
 const askAgain = () => {
-  if (state.pick) ask({ pick: state.pick, ...(state.pick.startsWith("{") || !state.origin ? {} : { origin: state.origin }) });
+  if (state.pick) ask({ pick: state.pick, origin: state.origin });
 };
 
 /**
@@ -162,7 +162,7 @@ function answer(message) {
   $("beside-title").hidden = !message.beside.length;
   layout.show(message.cameras);
   label.close();
-  $("steps").replaceChildren(...(message.labelled || message.pick.includes('"place"') ? labelStep(message.labelled) : []));
+  $("steps").replaceChildren(...(message.labelled || message.place ? labelStep(message.labelled) : []));
   $("hints").textContent = message.reported || message.empty ? "" : "Trying what would change it ...";
   freshness();
   list.showAnswer();

@@ -16,7 +16,7 @@ export const kind = $("viewer").dataset.kind; // page (of a drive) or live (of a
 const hasGraphics = Boolean(document.createElement("canvas").getContext("webgl2"));
 if (hasGraphics) keepCompiled(new URL(`/viewer/${version}/re_viewer_bg.wasm`, location.href).href);
 /** @type {{ default: Widget }} */
-const script = hasGraphics ? await import(`/viewer/${version}/widget.js`) : { default: cameraOnly() };
+const script = hasGraphics ? await import(`/viewer/${version}/exported_widget.js`) : { default: cameraOnly() };
 
 // Results of the run and results with other values are on two timelines of the same recording.
 const OPENED = "stamp";
