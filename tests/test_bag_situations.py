@@ -44,6 +44,21 @@ def test_points_that_the_data_lack_are_said(tmp_path: Path) -> None:
     assert said.endswith("40 of 240 points are missing")
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_points_in_the_other_byte_order_are_read(tmp_path: Path, stated: bool) -> None:
+    items = bags.small_items(scans=2)
+    for item in items:
+        if item.topic == bags.CLOUD:
+            item.message.is_bigendian = stated
+            if not stated:
+                item.message.data = item.message.data.view("<u4").byteswap().view(np.uint8)
+    sound, _ = read(bags.write(tmp_path / "sound", bags.small_items(scans=2)))
+    frame, doubts = read(bags.write(tmp_path / "drive", items))
+    np.testing.assert_array_equal(frame.points, sound.points)
+    (said,) = doubts
+    assert said.startswith(f"{bags.CLOUD}: is_bigendian is {stated}, but only the other byte order gives")
+
+
 # --- time --------------------------------------------------------------------------------------
 
 SECOND = 1_000_000_000
@@ -419,7 +434,7 @@ def camera_matrix(f: float, x: float, y: float, other: float = 0.0) -> F64:
             {"width": 128, "height": 96, "binning_x": 2, "binning_y": 2},
             60,
             (32, 24),
-            "is that of the binned images",
+            "by binning 2 x 2 .* is that of the images",
         ),
         (
             {"width": 128, "height": 96, "binning_x": 2, "binning_y": 2, "k": camera_matrix(120, 64, 48)},
@@ -435,6 +450,13 @@ def camera_matrix(f: float, x: float, y: float, other: float = 0.0) -> F64:
             (26, 20),
             "",
         ),
+        (
+            {"width": 128, "height": 96, "roi": roi(30, 20, 64, 48)},
+            60,
+            (32, 24),
+            "by its region of interest .* is that of the images",
+        ),
+        ({"roi": roi(30, 20, 64, 48)}, 60, (32, 24), "by its region of interest .* is that of the images"),
         ({"k": camera_matrix(60, 32, 24, 120)}, 60, (32, 24), "no square pixels"),
         ({"k": camera_matrix(5, 32, 24)}, 5, (32, 24), "a field of view of 162 degrees"),
         (

@@ -720,7 +720,11 @@ def test_bad_transforms_are_named_and_spare_the_good_ones(bad: Message, text: st
     with pytest.raises(MessageError, match=f"/tf: .*{text}"):
         transforms.decode_transforms(Message(transforms=[bad]))
     good = transform_message("base", "lidar")
-    assert [t.child for t in transforms.decode_transforms(Message(transforms=[bad, good]))] == ["lidar"]
+    refused: list[str] = []
+    mixed = Message(transforms=[bad, good])
+    assert [t.child for t in transforms.decode_transforms(mixed, "/tf_static", refused.append)] == ["lidar"]
+    (said,) = refused
+    assert said.startswith("/tf_static: ") and text in said
 
 
 def test_odometry_is_decoded() -> None:

@@ -59,22 +59,23 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
     model, coefficients = "", np.zeros(0)
     if not rectified and (np.any(D) or (len(D) and _is_fisheye(msg.distortion_model))):
         model, coefficients = _distortion(msg.distortion_model, D, topic)
-    matrix = matrix.copy()
-    matrix[0, 2] -= msg.roi.x_offset
-    matrix[1, 2] -= msg.roi.y_offset
+    sensor, offset = (int(msg.width), int(msg.height)), np.array([msg.roi.x_offset, msg.roi.y_offset])
+    region = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int)
     binning = np.array([max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)])
-    width, height = np.array([msg.roi.width or msg.width, msg.roi.height or msg.height], int) // binning
-    size, doubt = (int(width), int(height)), ""
-    cropped = bool(msg.roi.x_offset or msg.roi.y_offset) or (0 < msg.roi.width < msg.width)
-    scaled = matrix / np.array([[binning[0]], [binning[1]], [1]])
-    if not cropped and off_centre(scaled, size) > MOST_OFF > 2 * off_centre(matrix, size):
+    width, height = (region // binning).tolist()
+    size, doubt = (width, height), ""
+    cropped = bool(offset.any()) or (0 < msg.roi.width < msg.width)
+    outside = bool((offset + region > sensor).any()) and all(sensor)
+    if (outside or off_centre(matrix, sensor) > MOST_OFF) and 2 * off_centre(matrix, size) < MOST_OFF:
+        why = f"binning {binning[0]} x {binning[1]}" if binning.max() > 1 else "its region of interest"
         doubt = (
-            f"its K is for the full sensor by binning {binning[0]} x {binning[1]}, but its centre "
-            f"({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}) is that of the binned images of {width} x {height} "
-            "pixels: K is taken as theirs"
+            f"by {why} its K is for the full sensor, but its centre ({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}) "
+            f"is that of the images of {width} x {height} pixels: K is taken as theirs"
         )
     else:
-        matrix = scaled
+        matrix = matrix.copy()
+        matrix[:2, 2] -= offset
+        matrix /= np.array([[binning[0]], [binning[1]], [1]])
     return Intrinsics(*size, matrix, model, coefficients, baseline, cropped=cropped, doubt=doubt)
 
 

@@ -17,6 +17,8 @@ MOST_FIELDS = 1024  # fields of a point; each element of a field counts
 # Metres from the cloud's origin. No sensor measures so far, and coordinates on Earth are smaller (UTM: 1e7).
 # Stages compute squares and higher powers, which do not fit into float32 for larger numbers.
 FARTHEST = 1e8
+SMALLEST = 1e-9  # metres; rounding makes numbers of this size
+MEASURED = 0.5  # share of the coordinates within these limits; in the wrong byte order a quarter is
 
 _AXES = ("x", "y", "z")
 # By datatype of a PointField.
@@ -80,6 +82,12 @@ def unpack_cloud(msg: Any, data: Any, count: int | None = None) -> Cloud:
         )
     layout = point_layout(msg.fields, msg.point_step, ">" if msg.is_bigendian else "<")
     grid, doubt = _point_grid(np.frombuffer(data, np.uint8), layout, rows, columns, int(msg.row_step))
+    if not _look_measured(grid) and _look_measured(swapped := grid.view(layout.newbyteorder())):
+        grid = swapped
+        flag = bool(msg.is_bigendian)
+        doubt = (
+            f"is_bigendian is {flag}, but only the other byte order gives coordinates of a sensor: it is read"
+        )
     cloud = make_cloud(stamp_ns(msg.header.stamp), msg.header.frame_id, grid, rows * columns)
     return replace(cloud, doubt=doubt)
 
@@ -253,6 +261,18 @@ def _point_grid(
         return np.ndarray((rows, columns), layout, data, strides=(pitch, step)), ""
     doubt = f"a cloud states {header}, which does not fit its {size} bytes of data: {outcome}"
     return np.ndarray((rows, columns), layout, data, strides=(pitch, step)), doubt
+
+
+def _look_measured(grid: NDArray[np.void]) -> bool:
+    """Return whether x, y and z of a sample of the points are numbers that a sensor measures.
+
+    Most floats that are read in the wrong byte order are far too small or too large.
+    """
+    sample = grid[:: len(grid) // 16 + 1, :: grid.shape[1] // 64 + 1] if grid.size else grid
+    values = np.array([sample[name] for name in _AXES if name in (sample.dtype.names or ())], np.float64)
+    values = np.abs(values[np.isfinite(values) & (values != 0)])
+    plausible = (values > SMALLEST) & (values < FARTHEST)
+    return not len(values) or float(plausible.mean()) > MEASURED
 
 
 def _row_pitch(size: int, rows: int, row_bytes: int, row_step: int) -> int:

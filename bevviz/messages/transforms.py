@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,12 +32,15 @@ class StampedTransform:
     parent_from_child: F64
 
 
-def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
+def decode_transforms(
+    msg: Any, topic: str = "/tf", refuse: Callable[[str], None] = lambda reason: None
+) -> list[StampedTransform]:
     """Return the transforms of a tf2_msgs/TFMessage. Transforms that are not rigid are left out.
 
     Args:
         msg: the message, or the transforms that the decoder of another message type returned.
         topic: topic of the message, for errors.
+        refuse: called with the reason for each transform that is left out beside others.
 
     Raises:
         MessageError: no transform is rigid.
@@ -56,6 +60,8 @@ def decode_transforms(msg: Any, topic: str = "/tf") -> list[StampedTransform]:
             problems.append(error)
     if problems and not transforms:
         raise problems[0]
+    for problem in problems:
+        refuse(str(problem))
     return transforms
 
 

@@ -89,7 +89,7 @@ def make_handlers(
         return read(message, decoder, message.topic, message.received)
 
     def add_transforms(message: M, static: bool) -> None:
-        for transform in read(message, decode_transforms, message.topic):
+        for transform in read(message, decode_transforms, message.topic, sync.tf.refuse):
             held = message.topic in roles.tf_held
             sync.add_transform(clocked(message, transform), static, held=held, topic=message.topic)
 

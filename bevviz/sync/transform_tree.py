@@ -191,6 +191,10 @@ class TransformBuffer:
         if edge.stamps and edge.stamps[0] < edge.stamps[-1] - self._duration * 5 // 4:
             edge.keep(edge.stamps[-1] - self._duration, edge.stamps[-1])
 
+    def refuse(self, reason: str) -> None:
+        """Count a transform that cannot be decoded in ``problems``."""
+        self._problems[f"{reason}: ignored"] += 1
+
     def _compare(self, edge: _Edge, child: str, pose: F64, topic: str) -> None:
         """Note that a static edge is stated again with another pose."""
         former = edge.poses[-1] if edge.poses else pose
