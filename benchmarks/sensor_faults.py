@@ -148,8 +148,8 @@ def measure(drive: Results, tally: SensorTally) -> None:
             for name, fault in SENSOR_FAULTS.items():
                 for plant in fault.plants:
                     window = [plant(drive, i, row) for i in range(row, row + HORIZON)]
-                    tally.delays[name].append(_delay(copy.deepcopy(watch), window, fault.told_by, tally))
-        new = [a for a in watch.update(result) if (a.subject, a.since) not in seen]
+                    tally.delays[name].append(_delay(_copy(watch), window, fault.told_by, tally))
+        new = [a for a in _update(watch, result) if (a.subject, a.since) not in seen]
         seen |= {(a.subject, a.since) for a in new}
         tally.alarms += new
     fading = [thinned(r, max(1 - 0.02 * max(i - FIRST, 0), 0.1), i) for i, r in enumerate(drive[:FADED])]
@@ -170,7 +170,7 @@ def play_forth_and_back(drive: Results, tally: SensorTally) -> None:
     start = drive[0].frame.stamp
     for number, row in zip(range(round(PLAYED / STEP)), itertools.cycle(rows), strict=False):
         result = _moved(drive[row], start + round(number * STEP * 1e9) - drive[row].frame.stamp)
-        new = [a for a in watch.update(result) if (a.subject, a.since) not in seen]
+        new = [a for a in _update(watch, result) if (a.subject, a.since) not in seen]
         seen |= {(a.subject, a.since) for a in new}
         tally.played_alarms += new
     tally.played += PLAYED
@@ -192,11 +192,23 @@ def _moved(result: FrameResult, by: int) -> FrameResult:
     return replace(result, frame=frame, cameras=tuple(cameras))
 
 
+def _update(watch: SensorWatch, result: FrameResult) -> Sequence[Anomaly]:
+    """Return the faults of a frame."""
+    return watch.update(result.frame, result.voxels, result.ground)
+
+
+def _copy(watch: SensorWatch) -> SensorWatch:
+    """Return a copy with the same past. Both share the threads and what these were asked for."""
+    check = watch._placement._check
+    shared = [watch.worker, watch._checker, watch._lock, *([] if check is None else [check[3]])]
+    return copy.deepcopy(watch, {id(one): one for one in shared})
+
+
 def _delay(watch: SensorWatch, window: Sequence[FrameResult], told_by: str, tally: SensorTally) -> float:
     """Return the seconds from the first frame to the one that tells the fault."""
     delay, others = float("inf"), False
     for row, result in enumerate(window):
-        for anomaly in watch.update(result):
+        for anomaly in _update(watch, result):
             if anomaly.since < window[0].frame.stamp - NEWEST:
                 continue  # an alarm from before the fault
             words = anomaly.subject.partition(": ")

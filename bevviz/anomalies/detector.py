@@ -81,7 +81,7 @@ class AnomalyDetector:
         """Yield the anomalies of this frame from every rule."""
         if result.tracks is not None:
             yield from self._objects.update(result, result.tracks, config)
-        yield from self._sensors.update(result)
+        yield from self._sensors.update(result.frame, result.voxels, result.ground)
         yield from self._detections(result, config)
         yield from self._clocks(result, config)
         yield from self._transforms(result, config)

@@ -17,7 +17,7 @@ import numpy as np
 
 from bevviz.anomalies.sensor_faults import SensorFault
 from bevviz.model.frame import F32, F64, I64, U8, Camera
-from bevviz.model.results import FrameResult
+from bevviz.model.results import Ground, Voxels
 from bevviz.support.numba_kernel import kernel
 
 BINS = 360  # directions in which the range is compared
@@ -55,9 +55,10 @@ class ScanShape:
     slope: F64  # (2,) rise of the ground along x and along y; NaN: unknown
 
     @staticmethod
-    def measure(result: FrameResult, before: ScanShape | None = None) -> ScanShape:
-        """Measure the scan of a frame, in the bands of the scan before."""
-        points = result.frame.points
+    def measure(
+        points: F32, voxels: Voxels | None, ground: Ground | None, before: ScanShape | None = None
+    ) -> ScanShape:
+        """Measure the (N, 3) points of a scan, in the bands of the scan before."""
         points = points[:: -(-len(points) // POINTS) or 1]
         bounds = _elevation_bounds(points) if before is None else before.elevations
         band, x, y, distance = _between(points, bounds)
@@ -70,7 +71,7 @@ class ScanShape:
             .reshape(-1, BINS)
             .astype(np.float32)
         )
-        return ScanShape(ranges, bounds, _ground_slope(result))
+        return ScanShape(ranges, bounds, _ground_slope(voxels, ground))
 
     def change_to(self, other: ScanShape) -> float:
         """Return the mean difference of the ranges in each direction, as a logarithm."""
@@ -130,22 +131,22 @@ def _between(points: F32, bounds: F64) -> tuple[I64, F32, F32, F32]:
     return band[:count], x[:count], y[:count], distance[:count]
 
 
-def _ground_slope(result: FrameResult) -> F64:
+def _ground_slope(voxels: Voxels | None, ground: Ground | None) -> F64:
     """Return the (2,) slope of the near ground along x and y, NaN if it is not known."""
-    if result.ground is None or result.voxels is None:
+    if ground is None or voxels is None:
         return np.full(2, np.nan)
-    rows = np.flatnonzero(result.ground.mask)
-    ground = result.voxels.points[rows[:: -(-len(rows) // GROUND_POINTS) or 1]]
-    ground = ground[np.hypot(ground[:, 0], ground[:, 1]) < GROUND].astype(np.float64)
-    if len(ground) < LEAST_GROUND:
+    rows = np.flatnonzero(ground.mask)
+    points = voxels.points[rows[:: -(-len(rows) // GROUND_POINTS) or 1]]
+    points = points[np.hypot(points[:, 0], points[:, 1]) < GROUND].astype(np.float64)
+    if len(points) < LEAST_GROUND:
         return np.full(2, np.nan)
-    on_plane = np.ones(len(ground), np.bool_)
+    on_plane = np.ones(len(points), np.bool_)
     plane = np.zeros(3)
-    columns = np.column_stack([ground[:, :2], np.ones(len(ground))])
+    columns = np.column_stack([points[:, :2], np.ones(len(points))])
     for _ in range(2):
         kept = columns[on_plane]
-        plane = np.linalg.lstsq(kept.T @ kept, kept.T @ ground[on_plane, 2], rcond=None)[0]
-        error = np.abs(columns @ plane - ground[:, 2])
+        plane = np.linalg.lstsq(kept.T @ kept, kept.T @ points[on_plane, 2], rcond=None)[0]
+        error = np.abs(columns @ plane - points[:, 2])
         on_plane = error < 0.1 + 2 * np.median(error)
     return plane[:2]
 

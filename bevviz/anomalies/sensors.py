@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,57 +19,68 @@ from bevviz.anomalies.sensor_faults import (
     UsualChange,
 )
 from bevviz.model.frame import Cloud, Frame
-from bevviz.model.results import Anomaly, FrameResult
+from bevviz.model.results import Anomaly, Ground, Voxels
 from bevviz.support.contexts import Closable
 
 GAP = 1.0  # seconds between two frames, after which the past tells nothing
+REMEMBERED = 8  # newest frames whose faults are kept: a frame may be judged while earlier ones are completed
 
 
 class SensorWatch(Closable):
     """Detector of faults of cameras, LiDARs and their mountings in consecutive frames.
 
-    Runs with other configurations on the same frames may share it: the same frame twice is one frame.
+    Runs with other configurations on the same frames may share it: the same frame twice is one frame. Any
+    thread may call ``update``, each in the order of the frames.
 
     Attributes:
-        worker: a thread for ``update``, or for what ``update`` leaves to it. It takes one task after another.
+        worker: a thread for ``update``. It takes one task after another.
     """
 
     def __init__(self) -> None:
         self.worker = ThreadPoolExecutor(1, "sensors")
+        self._checker = ThreadPoolExecutor(1, "placement")
         self._start: int | None = None
         self._stamp = 0
-        self._last: tuple[int, int] | None = None  # number and stamp of the last frame
-        self._found: list[Anomaly] = []  # its faults
+        self._found: dict[tuple[int, int], list[Anomaly]] = {}  # number and stamp of a frame -> its faults
+        self._lock = threading.Lock()
         self.clear()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the threads."""
         self.worker.shutdown(cancel_futures=True)
+        self._checker.shutdown(cancel_futures=True)
 
     def clear(self) -> None:
         """Forget all sensors, for a drive that starts again or has a gap."""
         self._images: dict[str, ImageWatch] = {}
         self._scans: dict[str, ScanWatch] = {}
         self._mountings: dict[str, MountingWatch] = {}
-        self._placement = PlacementWatch(self.worker)
+        self._placement = PlacementWatch(self._checker)
         self._shape: ScanShape | None = None
         self._scan_change = UsualChange(LEAST_SCAN_CHANGE)
         self._still_scans, self._still_since, self._scan_stamp = 0, 0, 0
 
-    def update(self, result: FrameResult) -> Sequence[Anomaly]:
+    def update(self, frame: Frame, voxels: Voxels | None, ground: Ground | None) -> Sequence[Anomaly]:
         """Return the faults of all sensors in this frame."""
-        frame = result.frame
-        if (frame.index, frame.stamp) == self._last:
-            return self._found
-        self._last = frame.index, frame.stamp
+        key = frame.index, frame.stamp
+        with self._lock:
+            if key not in self._found:
+                if len(self._found) >= REMEMBERED:
+                    del self._found[next(iter(self._found))]
+                self._found[key] = self._update(frame, voxels, ground)
+            return self._found[key]
+
+    def _update(self, frame: Frame, voxels: Voxels | None, ground: Ground | None) -> list[Anomaly]:
+        """Return the faults in the frame that follows the last one."""
         if self._start is None or frame.stamp < self._stamp:
             self._start = frame.stamp
         if not 0 <= frame.stamp - self._stamp <= GAP * 1e9:
             self.clear()
         self._stamp = frame.stamp
-        faults = [(fault, 1e-9 * (fault.since - self._start)) for fault in self._faults(result)]
-        self._found = [_anomaly(fault, f" since {since:.1f} s") for fault, since in faults]
-        return self._found
+        faults = [
+            (fault, 1e-9 * (fault.since - self._start)) for fault in self._faults(frame, voxels, ground)
+        ]
+        return [_anomaly(fault, f" since {since:.1f} s") for fault, since in faults]
 
     def update_alone(self, frame: Frame) -> Iterator[Anomaly]:
         """Yield the cameras whose image shows nothing. The frame does not follow the frame before."""
@@ -78,15 +90,14 @@ class SensorWatch(Closable):
             if fault is not None:
                 yield _anomaly(fault)
 
-    def _faults(self, result: FrameResult) -> Iterator[SensorFault]:
+    def _faults(self, frame: Frame, voxels: Voxels | None, ground: Ground | None) -> Iterator[SensorFault]:
         """Yield the faults that each rule finds in this frame."""
-        frame = result.frame
         clouds, distrusted = _clouds(frame), set[str]()
         for cloud in clouds:
             yield from self._scans.setdefault(cloud.name, ScanWatch(f"LiDAR {cloud.name}")).update(cloud)
         before, self._shape = self._shape, None
         if frame.lidar and any(camera.image is not None for camera in frame.cameras):
-            self._shape = ScanShape.measure(result, before)
+            self._shape = ScanShape.measure(frame.points, voxels, ground, before)
         scene, scan_ratio = None, float("nan")
         if before is not None and self._shape is not None:
             scene = before.rotation_to(self._shape)

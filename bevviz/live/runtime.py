@@ -32,7 +32,6 @@ from bevviz.live.status import Health, Notes
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.run import DropPolicy, run
 from bevviz.pipeline.session import Session
 from bevviz.pipeline.stage_loader import StageLoader
@@ -348,19 +347,9 @@ class LoggingObserver(Observer[FrameResult]):
 
 
 class LiveSession(Session):
-    """Session that leaves the robot's motion to its transforms: an estimate would delay each result.
-
-    Its sensors are judged while the results are explained, which takes as long.
-    """
+    """Session that leaves the robot's motion to its transforms: an estimate would delay each result."""
 
     estimates_motion = False
-
-    def finish(self, result: FrameResult) -> FrameResult:
-        """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
-        sensors = self._sensors.worker.submit(self._sensors.update, result)
-        explained = add_explanations(result)
-        sensors.result()
-        return self.add_anomalies(explained)
 
 
 class ObservingSession(Session):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Protocol
@@ -73,6 +73,7 @@ def perceive(
     *,
     network: Executor | None = None,
     edits: StageEdits | None = None,
+    on_ground: Callable[[Frame, Voxels | None, Ground | None], object] | None = None,
 ) -> FrameResult:
     """Run the stages that need no other frame on one frame: everything but tracks and anomalies.
 
@@ -87,6 +88,7 @@ def perceive(
         network: executor of the detector. It runs beside the LiDAR stages, since it does not need Python's
             lock. None: it runs after them.
         edits: changes of single stages' results. None: the stages are left as they are.
+        on_ground: called once the ground is known, while the detector works.
     """
     log, detector_log = StageLog(memo), StageLog(memo)
     start = common_clock()
@@ -111,6 +113,8 @@ def perceive(
         ground = _ground(log, frame, voxels, config, stages)
         if edits is not None and ground is not None:
             ground = edits.ground(voxels, ground)
+    if on_ground is not None:
+        on_ground(frame, voxels, ground)
     if voxels is not None and ground is not None:
         obstacles = log.run("ground", _obstacles, voxels, ground)
     if obstacles is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ class Session(Closable):
         self._anomalies = AnomalyDetector(self._sensors)
 
     def close(self) -> None:
-        """End the thread that watches the sensors."""
+        """End the threads that watch the sensors."""
         self._sensors.close()
 
     @property
@@ -97,14 +97,24 @@ class Session(Closable):
 
     def run_explained(self, frame: Frame) -> FrameResult:
         """Return the result of the next frame with explanations, without bird's-eye view and anomalies."""
-        return add_explanations(self.perceive(frame), seen=False)
+        return add_explanations(self._perceive(frame), seen=False)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
-        """Estimate the motion to the next frame, run the stages on it, and update the tracks."""
+        """Estimate the motion to the next frame, run the stages on it, and update the tracks.
+
+        A thread judges the sensors meanwhile, for ``add_anomalies``.
+        """
+        sensors = self._sensors
+        return self._perceive(frame, network, lambda *scan: sensors.worker.submit(sensors.update, *scan))
+
+    def _perceive(
+        self, frame: Frame, network: Executor | None = None, on_ground: Callable[..., object] | None = None
+    ) -> FrameResult:
         config, stages = self._in_force
         log = StageLog()
         frame = self._placed(frame, config, log)
-        return self._add_tracks(perceive(frame, config, stages, self._memo, network=network), log)
+        result = perceive(frame, config, stages, self._memo, network=network, on_ground=on_ground)
+        return self._add_tracks(result, log)
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
