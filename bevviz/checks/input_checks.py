@@ -68,7 +68,8 @@ class InputChecks(Observer[FrameResult]):
             follows: it follows the frame before, so that sensors are compared with their past.
         """
         result = FrameResult.unprocessed(frame, self._read.config)
-        self._collect(result, self._onsets.of([*self._watch.update(result)] if follows else []))
+        faults = self._watch.update(frame, None, None) if follows else []
+        self._collect(result, self._onsets.of(faults))
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the frames, and collect what the checks need of each."""
