@@ -12,7 +12,6 @@ from bevviz.support.contexts import Closable
 from bevviz.support.files import catch_full_disk
 
 AHEAD = 6  # pieces of the run that may be sent before the page acknowledges the first of them
-NEIGHBOURS = (1, -1)  # frames that are made after the one that a page requests
 
 
 class News:
@@ -176,91 +175,4 @@ class BufferReader:
             if row is not None and row >= self._next and row not in self._early:
                 self._early.add(row)
                 return row
-        return None
-
-
-class FrameMaker(Protocol):
-    """Drive whose frames are rows of a buffer, or are made on demand."""
-
-    @property
-    def on_demand(self) -> bool:
-        """Whether frames are made on demand. It is known once there is a row."""
-
-    def row(self, stamp: int) -> int | None:
-        """Return the row of the frame at a stamp. None: there is none, or not yet."""
-
-    def number_in(self, row: int) -> int | None:
-        """Return the number of the frame that a row has. None: it has none."""
-
-    def number_at(self, stamp: int) -> int:
-        """Return the number of the frame at a stamp."""
-
-    def version(self, number: int) -> int:
-        """Return a number that changes if the frame would be drawn otherwise than before."""
-
-    def piece(self, number: int, *, wanted: bool) -> bytes | None:
-        """Return the piece of a frame. None: there is no such frame, or it cannot be read.
-
-        Args:
-            number: number of the frame.
-            wanted: whether a page waits for it. Else it is a neighbour of such a frame.
-        """
-
-
-class DriveReader(BufferReader):
-    """Reader of a drive. Of one with frames on demand: the rows, then the frames that this page looks at.
-
-    Args:
-        rows: pieces that every page gets.
-        first: row of the first piece.
-        state: state of the page.
-        frames: makes the frames.
-    """
-
-    def __init__(self, rows: RecordingBuffer, first: int, state: PageState, frames: FrameMaker) -> None:
-        super().__init__(rows, first, state, frames.row)
-        self._frames = frames
-        self._requested = -1  # number of the frame that the page waits for
-        self._queue: list[int] = []  # numbers of the frames to make
-        self._versions: dict[int, int] = {}  # of the frames that the page has
-
-    def take(self) -> Sequence[bytes | str]:
-        """Return the next row, or the frame to send now."""
-        if not self._frames.on_demand:
-            return super().take()
-        pieces: tuple[bytes | str, ...] = ()
-        if self._next < len(self._buffer):
-            pieces = (self._buffer[self._next],)
-            self._next += 1
-        elif (frame := self._frame()) is not None:
-            pieces = str(frame[0]), frame[1]
-        self._sent += bool(pieces)
-        return pieces
-
-    def _pieces(self, row: int) -> Sequence[bytes | str]:
-        """Return the piece of a row, after the number of its frame. The page tells what it lacks."""
-        number = self._frames.number_in(row)
-        return super()._pieces(row) if number is None else (str(number), self._buffer[row])
-
-    def _frame(self) -> tuple[int, bytes] | None:
-        """Return the next frame and its number. None: the page waits for nothing, or can take no more."""
-        while not self._state.gone:
-            stamp = None
-            while self._state.requested:  # The newest one counts: the user has moved on from the others.
-                stamp = self._state.requested.pop(0)
-            if stamp is not None:
-                self._requested = number = self._frames.number_at(stamp)
-                self._queue = [number, *(number + by for by in NEIGHBOURS)]
-            if not self._queue:
-                return None
-            wanted = self._queue[0] == self._requested
-            if not wanted and self._sent >= self._state.count + AHEAD:
-                return None
-            number = self._queue.pop(0)
-            version = self._frames.version(number)
-            if self._versions.get(number) != version:
-                piece = self._frames.piece(number, wanted=wanted)
-                if piece is not None:
-                    self._versions[number] = version
-                    return number, piece
         return None

@@ -410,10 +410,10 @@ class PageConnection:
             (tools.fix if message["what"] == "fix" else tools.trials).cancel(self._name)
 
     async def _report(self, message: types.MakeReport) -> None:
-        reports, settings = self._workbench.reports, message.get("set", ())
+        workbench, settings = self._workbench, message.get("set", ())
         range_ = message["before"], message["after"]
         asked = await self._frame(message), settings, *range_, message["text"], _identity(message)
-        await self._in_turn(message["id"], lambda: reports.begin(*asked), settings)
+        await self._in_turn(message["id"], lambda: workbench.begin_report(*asked), settings)
 
     async def _note(self, message: types.AddNote) -> None:
         number, text, span = message["id"], message["text"], _span(message.get("span"))

@@ -27,7 +27,7 @@ from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import Answer, FrameExplainer
 from bevviz.why.log import focus_answer, mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
-from bevviz.workbench.buffers import BufferReader, DriveReader, PageState, Reader, RecordingBuffer
+from bevviz.workbench.buffers import AHEAD, BufferReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from bevviz.workbench.page_types import RunProgress
 
 PATIENCE = 10.0  # seconds that close() waits for the run to end
+NEIGHBOURS = (1, -1)  # frames that are made after the one that a page requests
 FIRST = 6.0  # seconds that the run waits until a page has drawn the first frame
 
 
@@ -299,18 +300,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         if buffer is None:
             raise UserError(f"there is no recording '{lane}'")
         if lane == "recording":
-            return nullcontext(DriveReader(buffer, first, state, self))
+            return nullcontext(DriveReader(self, first, state))
         row_of = None if lane.startswith("overlay") else lambda _: None
         return nullcontext(BufferReader(buffer, first, state, row_of))
-
-    def row(self, stamp: int) -> int | None:
-        """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
-        recorded = self.shown_at(stamp)
-        return None if recorded is None else self.recording.row(recorded[0])
-
-    def number_in(self, row: int) -> int | None:
-        """Return the number of the frame that a row has. None: it has none."""
-        return self.recording.number_in(row)
 
     def version(self, number: int) -> int:
         """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
@@ -473,3 +465,66 @@ class _OverviewObserver(Observer[FrameResult]):
     def observe(self, result: FrameResult) -> None:
         """Pass the result on."""
         self._drive.observe_single(result)
+
+
+class DriveReader(BufferReader):
+    """Reader of a drive. Of one with frames on demand: the rows, then the frames that this page looks at.
+
+    Args:
+        drive: the drive.
+        first: row of the first piece.
+        state: state of the page.
+    """
+
+    def __init__(self, drive: RecordedDrive, first: int, state: PageState) -> None:
+        super().__init__(drive.recording.rows, first, state, self._row_at)
+        self._drive = drive
+        self._requested = -1  # number of the frame that the page waits for
+        self._queue: list[int] = []  # numbers of the frames to make
+        self._versions: dict[int, int] = {}  # of the frames that the page has
+
+    def take(self) -> Sequence[bytes | str]:
+        """Return the next row, or the frame to send now."""
+        if not self._drive.on_demand:
+            return super().take()
+        pieces: tuple[bytes | str, ...] = ()
+        if self._next < len(self._buffer):
+            pieces = (self._buffer[self._next],)
+            self._next += 1
+        elif (frame := self._frame()) is not None:
+            pieces = str(frame[0]), frame[1]
+        self._sent += bool(pieces)
+        return pieces
+
+    def _row_at(self, stamp: int) -> int | None:
+        """Return the row of the frame that a viewer shows at a stamp. None: it is not recorded."""
+        recorded = self._drive.shown_at(stamp)
+        return None if recorded is None else self._drive.recording.row(recorded[0])
+
+    def _pieces(self, row: int) -> Sequence[bytes | str]:
+        """Return the piece of a row, after the number of its frame. The page tells what it lacks."""
+        number = self._drive.recording.number_in(row)
+        return super()._pieces(row) if number is None else (str(number), self._buffer[row])
+
+    def _frame(self) -> tuple[int, bytes] | None:
+        """Return the next frame and its number. None: the page waits for nothing, or can take no more."""
+        while not self._state.gone:
+            stamp = None
+            while self._state.requested:  # The newest one counts: the user has moved on from the others.
+                stamp = self._state.requested.pop(0)
+            if stamp is not None:
+                self._requested = number = self._drive.number_at(stamp)
+                self._queue = [number, *(number + by for by in NEIGHBOURS)]
+            if not self._queue:
+                return None
+            wanted = self._queue[0] == self._requested
+            if not wanted and self._sent >= self._state.count + AHEAD:
+                return None
+            number = self._queue.pop(0)
+            version = self._drive.version(number)
+            if self._versions.get(number) != version:
+                piece = self._drive.piece(number, wanted=wanted)
+                if piece is not None:
+                    self._versions[number] = version
+                    return number, piece
+        return None

@@ -7,23 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from bevviz.bags.remote import beside
-from bevviz.bags.source import iso
-from bevviz.config import Config, changed_config
-from bevviz.errors import UserError
+from bevviz.config import Config
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
 from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
-    from bevviz.pipeline.notes import Note
     from bevviz.report.make import ReportRequest
-    from bevviz.report.report_subject import TriedValues
-    from bevviz.why import Answer
-    from bevviz.why.identity import Identity
-    from bevviz.workbench.growing_drive import GrowingDrive, Settings
+    from bevviz.workbench.growing_drive import Settings
     from bevviz.workbench.page_types import ReportEntry
 
 LONGEST = 600.0  # seconds before or after the frame, at most
@@ -76,24 +70,6 @@ class ReportedBag:
     start: int
 
 
-class QuestionLog(Protocol):
-    """Answers and notes of a workbench session, which a report quotes."""
-
-    source: GrowingDrive
-
-    def notes(self) -> list[Note]:
-        """Return the notes."""
-
-    def about(self, number: int, identity: Identity) -> Answer:
-        """Return the answer about an object in a frame of the drive as opened."""
-
-    def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
-        """Return number of the frame and answer of each question in a range of log times, newest first."""
-
-    def tried_on(self, number: int, settings: Settings, answer: Answer | None) -> TriedValues:
-        """Return what other values do to the object of an answer, to its frame, and to the drive."""
-
-
 def folder_beside(paths: Sequence[Path]) -> Path:
     """Return the folder of a bag, or the working directory if that is read-only."""
     folder = beside(paths[0]).parent
@@ -104,65 +80,23 @@ class ReportMaker(Jobs[ReportJob]):
     """Reports of a workbench session.
 
     Args:
-        session: the workbench session.
+        tell: tells the pages about progress.
         bag_of: returns the bag that has a frame.
         folder: folder of the reports.
     """
 
-    def __init__(self, session: QuestionLog, bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
-        super().__init__("report", session.source.news.tell)
-        self._session, self._bag_of, self._folder = session, bag_of, folder
+    def __init__(self, tell: Callable[[], None], bag_of: Callable[[int], ReportedBag], folder: Path) -> None:
+        super().__init__("report", tell)
+        self.bag_of, self._folder = bag_of, folder
 
-    def begin(
-        self,
-        number: int,
-        settings: Settings,
-        before: float,
-        after: float,
-        note: str,
-        identity: Identity | None = None,
-    ) -> ReportJob:
-        """Start to make a report.
-
-        Args:
-            number: number of the frame that it is about.
-            settings: values that are tried. The report is of the drive as opened, and says what they change.
-            before: seconds before the frame.
-            after: seconds after the frame.
-            note: what went wrong, in the user's words.
-            identity: the object that the page shows. None: the report is about the worst of the frame.
-
-        Raises:
-            UserError: a report is in progress, there is no such frame, the object is not in it, the range is
-                too long, or a value is wrong.
-        """
-        from bevviz.report.make import ReportRequest
-
-        self.check_idle("a report is being made")
-        if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
-            raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
-        session, bag = self._session, self._bag_of(number)
-        received = session.source.look(number, settings).frame.received
+    def output(self, bag: ReportedBag, received: int) -> Path:
+        """Return the path of the next report about a frame."""
         seconds = (received - bag.start) / 1e9
-        output = _free(self._folder, f"{beside(bag.paths[0]).stem}-{seconds:.1f}s")
-        low, high = received - round(before * 1e9), received + round(after * 1e9)
-        about = None if identity is None else session.about(number, identity)
-        changed_config(bag.config, settings)  # Wrong values are told before the report is begun.
-        request = ReportRequest(
-            paths=bag.paths,
-            config=bag.config,
-            at=iso(received),
-            before=before,
-            after=after,
-            output=output,
-            note=note.strip(),
-            answers=[] if about is None else [about],
-            result=session.source.look(number),
-            asked=[answer for frame, answer in session.asked_within(low, high) if frame != number],
-            tried=session.tried_on(number, settings, about) if settings else None,
-            notes=session.notes(),
-        )
-        report = ReportJob(len(self.jobs), settings, name=output.stem)
+        return _free(self._folder, f"{beside(bag.paths[0]).stem}-{seconds:.1f}s")
+
+    def begin(self, request: ReportRequest, settings: Settings) -> ReportJob:
+        """Start to make a report. It tells of what the settings change."""
+        report = ReportJob(len(self.jobs), settings, name=request.output.stem)
         self.start(report, partial(self._make, request))
         return report
 

@@ -56,7 +56,8 @@ def robot_session(live: Live) -> WorkbenchSession:
     robot = RunningRobot(live)
     session = WorkbenchSession(robot)
     if live.raw is not None:
-        session.equip(ReportMaker(session, robot.bag_of, Path(live.config.live.flight_folder).absolute()))
+        folder = Path(live.config.live.flight_folder).absolute()
+        session.equip(ReportMaker(robot.news.tell, robot.bag_of, folder))
     return session
 
 

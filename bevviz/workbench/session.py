@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevviz.bags.source import iso
+from bevviz.config import changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth
@@ -30,7 +32,7 @@ from bevviz.workbench.fix_search import FixSearch
 from bevviz.workbench.growing_drive import GrowingDrive, Settings
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
-from bevviz.workbench.reports import ReportedBag, ReportMaker, folder_beside
+from bevviz.workbench.reports import LONGEST, ReportedBag, ReportJob, ReportMaker, folder_beside
 from bevviz.workbench.trials import TrialRunner, frame_effects, trial_effects
 
 if TYPE_CHECKING:
@@ -241,7 +243,56 @@ class WorkbenchSession(Closable):
             while len(self._answers) > ASKED:
                 self._answers.popitem(last=False)
 
-    def about(self, number: int, identity: Identity) -> Answer:
+    def begin_report(
+        self,
+        number: int,
+        settings: Settings,
+        before: float,
+        after: float,
+        note: str,
+        identity: Identity | None = None,
+    ) -> ReportJob:
+        """Start to make a report.
+
+        Args:
+            number: number of the frame that it is about.
+            settings: values that are tried. The report is of the drive as opened, and says what they change.
+            before: seconds before the frame.
+            after: seconds after the frame.
+            note: what went wrong, in the user's words.
+            identity: the object that the page shows. None: the report is about the worst of the frame.
+
+        Raises:
+            UserError: a report is in progress, there is no such frame, the object is not in it, the range is
+                too long, or a value is wrong.
+        """
+        from bevviz.report.make import ReportRequest
+
+        reports = self.reports
+        reports.check_idle("a report is being made")
+        if not (0 <= before <= LONGEST and 0 <= after <= LONGEST):
+            raise UserError(f"a report is of up to {LONGEST:g} seconds before and after")
+        bag, received = reports.bag_of(number), self.source.look(number, settings).frame.received
+        low, high = received - round(before * 1e9), received + round(after * 1e9)
+        about = None if identity is None else self._about(number, identity)
+        changed_config(bag.config, settings)  # Wrong values are told before the report is begun.
+        request = ReportRequest(
+            paths=bag.paths,
+            config=bag.config,
+            at=iso(received),
+            before=before,
+            after=after,
+            output=reports.output(bag, received),
+            note=note.strip(),
+            answers=[] if about is None else [about],
+            result=self.source.look(number),
+            asked=[answer for frame, answer in self._asked_within(low, high) if frame != number],
+            tried=self.tried_on(number, settings, about) if settings else None,
+            notes=self.notes(),
+        )
+        return reports.begin(request, settings)
+
+    def _about(self, number: int, identity: Identity) -> Answer:
         """Return the answer about an object in a frame of the drive as opened, with hints if it has them.
 
         Raises:
@@ -263,7 +314,7 @@ class WorkbenchSession(Closable):
         )
         return next(same, answer)
 
-    def asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
+    def _asked_within(self, low: int, high: int) -> list[tuple[int, Answer]]:
         """Return the answers about the drive as opened in a range of log times, newest first.
 
         Each comes with the number of its frame. Of several answers about one object of a frame, the newest
@@ -482,7 +533,7 @@ def recorded_session(
     def bag_of(number: int) -> ReportedBag:
         return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
 
-    reports = ReportMaker(session, bag_of, folder_beside(paths))
+    reports = ReportMaker(source.news.tell, bag_of, folder_beside(paths))
     fix = FixSearch(source, paths, *labels)
     session.equip(reports, DriveTools(TrialRunner(source), fix, Notes(paths)))
     return session
