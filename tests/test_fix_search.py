@@ -13,7 +13,7 @@ from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.errors import UserError
 from bevviz.evaluate import truth_source
-from bevviz.workbench.page_types import FixEntry
+from bevviz.workbench.fix_search import FixJob
 from bevviz.workbench.session import WorkbenchSession, recorded_session
 from tests.support.waiting import PATIENCE
 
@@ -37,7 +37,7 @@ def session(bag: Path) -> Iterator[WorkbenchSession]:
             yield session
 
 
-def progress(session: WorkbenchSession) -> FixEntry:
+def progress(session: WorkbenchSession) -> FixJob:
     """Return what the page is told of the search."""
     entry = session.progress()["fix"]
     assert entry is not None
@@ -56,16 +56,16 @@ def ended(session: WorkbenchSession) -> str:
 def test_the_wrong_parameter_is_found(session: WorkbenchSession, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bevviz.why.fix.TRIALS", 6)
     fix = session.tools.fix
-    assert progress(session)["state"] == ""
+    assert session.progress()["fix"] is None
     fix.begin()
     with pytest.raises(UserError, match="wait for it, or cancel it"):
         fix.begin()
     assert ended(session) == "over"
     found = progress(session)
-    assert found["done"] == found["total"] == 6
-    (setting,) = [one for one in found["settings"] if one.startswith("detector.conf_threshold=")]
+    assert found.done == found.total == 6
+    (setting,) = [one for one in found.settings if one.startswith("detector.conf_threshold=")]
     assert float(setting.partition("=")[2]) < 0.9
-    assert "missed objects" in found["text"] and "--set" not in found["text"]
+    assert "missed objects" in found.text and "--set" not in found.text
 
 
 def test_a_cancelled_search_can_be_begun_again(session: WorkbenchSession) -> None:
@@ -74,7 +74,7 @@ def test_a_cancelled_search_can_be_begun_again(session: WorkbenchSession) -> Non
         fix.begin()
         fix.cancel()
         assert ended(session) == "cancelled"
-    assert progress(session)["settings"] == []
+    assert progress(session).settings == ()
 
 
 def test_a_drive_without_truth_has_no_fix(bag: Path) -> None:

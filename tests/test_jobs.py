@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from bevviz.errors import UserError
+from bevviz.support.json_form import json_tree
 from bevviz.workbench.jobs import Job, Jobs
 from tests.support.waiting import until
 
@@ -24,7 +25,7 @@ def test_a_job_tells_how_it_ended() -> None:
     jobs.start(Job(0, ("voxel.size=0.2",), total=3), count)
     until(lambda: not jobs.jobs[-1].going)
     head = {"number": 0, "settings": ["voxel.size=0.2"], "cancelled_by": ""}
-    assert jobs.jobs[0].as_dict() == {**head, "state": "over", "error": "", "done": 3, "total": 3}
+    assert json_tree(jobs.jobs[0]) == {**head, "state": "over", "error": "", "done": 3, "total": 3}
     jobs.start(Job(1), fail)
     until(lambda: not jobs.jobs[-1].going)
     assert (jobs.jobs[1].state, jobs.jobs[1].error) == ("failed", "bag.mcap: the file has gone")

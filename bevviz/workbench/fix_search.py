@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.errors import UserError
-from bevviz.workbench.jobs import Job, Jobs
+from bevviz.workbench.jobs import Job, Jobs, job_form
 
 if TYPE_CHECKING:
     from bevviz.workbench.growing_drive import GrowingDrive
-    from bevviz.workbench.page_types import FixEntry
 
 
+@job_form
 @dataclass(slots=True)
 class FixJob(Job):
     """Search of a fix. ``settings`` are those that repair the drive.
@@ -24,10 +24,6 @@ class FixJob(Job):
     """
 
     text: str = ""
-
-    def as_dict(self) -> FixEntry:
-        """Return the search as JSON for the page."""
-        return {**Job.as_dict(self), "text": self.error or self.text}
 
 
 class FixSearch(Jobs[FixJob]):
@@ -56,10 +52,6 @@ class FixSearch(Jobs[FixJob]):
         if self._source.truth_of is None:
             raise UserError("there is no ground truth, by which a fix is judged")
         self.start(FixJob(len(self.jobs)), self._search)
-
-    def as_dict(self) -> FixEntry:
-        """Return the newest search as JSON for the page. Before the first one, the state is empty."""
-        return (self.jobs[-1] if self.jobs else FixJob(0, state="")).as_dict()
 
     def _search(self, job: FixJob) -> None:
         """Search the parameters that decide what is missed or false."""

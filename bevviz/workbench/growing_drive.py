@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, NotRequired
 
 import numpy as np
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
@@ -33,10 +34,35 @@ from bevviz.why.robot_questions import RobotObject, RobotQuestions
 from bevviz.workbench.buffers import News, PageState, Reader
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 
-if TYPE_CHECKING:
-    from bevviz.workbench.page_types import RobotReply, RunProgress
-
 Settings = tuple[str, ...]
+
+
+class Span(TypedDict):
+    """Frames from one stamp to another."""
+
+    first: str
+    last: str
+
+
+class Problem(TypedDict):
+    """What is wrong with the robot's data, and for how long."""
+
+    text: str
+    seconds: int
+
+
+class RunProgress(TypedDict):
+    """Progress of the source: ``phase`` of a drive, ``problems`` and ``held`` of a robot."""
+
+    done: int
+    total: int | None
+    over: bool
+    error: str
+    warnings: list[str]
+    phase: NotRequired[Literal["overview", "again", "run"]]
+    problems: NotRequired[list[Problem]]
+    held: NotRequired[list[str]]
+
 
 RESULTS = 6  # results of frames that were asked about
 READ = 4  # frames that are kept as they were read
@@ -127,7 +153,7 @@ class GrowingDrive(Closable):
         self.following = threading.Lock()  # guards the bag that the robot's chain is read from
         self._aside: FrameExplainer | None = None
         self.first = 0
-        self.commands: Mapping[str, Callable[[Any], RobotReply]] = {}
+        self.commands: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {}
         self._newest: deque[FrameResult] = deque(maxlen=newest)
         self._held: OrderedDict[int, FrameResult] = OrderedDict()  # results that stay, by number
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()

@@ -5,14 +5,20 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
+
+from pydantic import ConfigDict, with_config
 
 from bevviz.errors import UserError, first_line
+from bevviz.support.json_form import LEFT_OUT
 
-if TYPE_CHECKING:
-    from bevviz.workbench.page_types import JobEntry
+# A job is a message to the page, which all of its keys are in.
+job_form = with_config(
+    ConfigDict(arbitrary_types_allowed=True, json_schema_serialization_defaults_required=True)
+)
 
 
+@job_form
 @dataclass(slots=True)
 class Job:
     """Work in a thread of its own.
@@ -35,7 +41,7 @@ class Job:
     error: str = ""
     done: int = 0
     cancelled_by: str = ""
-    stop: threading.Event = field(default_factory=threading.Event)
+    stop: Annotated[threading.Event, LEFT_OUT] = field(default_factory=threading.Event)
 
     @property
     def going(self) -> bool:
@@ -50,18 +56,6 @@ class Job:
         """
         if self.stop.is_set():
             raise CancelledError
-
-    def as_dict(self) -> JobEntry:
-        """Return the job as JSON for the page."""
-        return {
-            "number": self.number,
-            "settings": list(self.settings),
-            "cancelled_by": self.cancelled_by,
-            "state": self.state,
-            "error": self.error,
-            "done": self.done,
-            "total": self.total,
-        }
 
 
 class CancelledError(Exception):

@@ -17,6 +17,7 @@ from bevviz.evaluate.metrics import METRICS
 from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.model.reasons import FACTS
 from bevviz.support.colors import class_color
+from bevviz.support.json_form import json_tree
 from bevviz.support.loggers import logger
 
 if TYPE_CHECKING:
@@ -154,9 +155,9 @@ class PageConnection:
             await news.wait()
             await asyncio.sleep(TOGETHER)
 
-    async def _send(self, message: types.ToPage | dict[str, Any]) -> None:
+    async def _send(self, message: types.ToPage | Mapping[str, Any]) -> None:
         async with self._sending:
-            await self._socket.send_text(json.dumps(message))
+            await self._socket.send_text(json.dumps(message, default=json_tree))
 
     def _notes(self) -> types.Notes:
         from bevviz.workbench.page_messages import handled_entry, note_entry
@@ -192,7 +193,7 @@ class PageConnection:
             if message["type"] != "remarks":  # It makes no question idle.
                 self._newest = max(self._newest, message["id"])
             if command := self._source.commands.get(message["type"]):
-                await self._send(await asyncio.to_thread(self._reply, command, message))
+                await self._send(await asyncio.to_thread(command, message))
             else:
                 await self._handlers[message["type"]](message)
         except (WebSocketDisconnect, RuntimeError):
@@ -331,7 +332,7 @@ class PageConnection:
         number = self._trying = message["id"]
         try:
             frame, identity = await self._frame(message), _identity(message)
-            effects: types.TriedEffects = await self._in_turn(
+            effects = await self._in_turn(
                 number, lambda: workbench.try_values(frame, settings, identity, attempt), settings
             )
         finally:
@@ -390,9 +391,7 @@ class PageConnection:
 
     async def _drive(self, message: types.RunDrive) -> None:
         """Run the drive with other values."""
-        await asyncio.to_thread(
-            self._workbench.tools.trials.begin, message["set"], _span(message.get("span"))
-        )
+        await asyncio.to_thread(self._workbench.tools.trials.begin, message["set"], message.get("span"))
 
     async def _fix(self, message: types.FindFix) -> None:
         """Search values that repair the drive."""
@@ -416,7 +415,7 @@ class PageConnection:
         await self._in_turn(message["id"], lambda: workbench.begin_report(*asked), settings)
 
     async def _note(self, message: types.AddNote) -> None:
-        number, text, span = message["id"], message["text"], _span(message.get("span"))
+        number, text, span = message["id"], message["text"], message.get("span")
         frame, identity = await self._frame(message), _identity(message)
         about = await self._in_turn(
             number, lambda: self._workbench.note(frame, text, identity, self._overlay, span)
@@ -462,13 +461,6 @@ class PageConnection:
         finding = handled_finding(message)
         await self._in_turn(message["id"], lambda: self._workbench.handle(finding))
 
-    def _reply(self, command: Callable[[Any], types.RobotReply], message: object) -> types.RobotReply:
-        """Return the reply of the source to one of its commands."""
-        try:
-            return command(message)
-        except UserError as error:
-            return {"type": "said", "text": str(error), "wrong": True}
-
     async def _shown(self, message: types.Shown) -> None:
         """Let the run continue: the page has drawn its first frame."""
         self._source.go_on()
@@ -476,11 +468,6 @@ class PageConnection:
     async def _frame(self, message: types.AboutFrame | types.Origin) -> int:
         """Return the number of the frame that the page shows. The run may not have reached it yet."""
         return await asyncio.to_thread(self._source.number_at, round(message["time"]))
-
-
-def _span(span: types.Span | None) -> tuple[int, int] | None:
-    """Return the first and the last stamp of a span."""
-    return None if span is None else (int(span["first"]), int(span["last"]))
 
 
 def _identity(message: types.AboutFrame) -> Identity | None:

@@ -17,20 +17,20 @@ from bevviz.findings.finding_list import Entry
 from bevviz.support.json_form import json_form
 from bevviz.why.answer_results import AnswerResult, HintResult
 from bevviz.why.robot_questions import RobotSteps
+from bevviz.workbench.fix_search import FixJob
+from bevviz.workbench.growing_drive import RunProgress, Span
+from bevviz.workbench.reports import ReportJob
+from bevviz.workbench.trials import Trial, TriedEffects
 
 # --- parts of messages -------------------------------------------------------------------------
 
 
-Span = TypedDict("Span", {"first": str, "last": str})  # stamps
-BeforeAfter = TypedDict("BeforeAfter", {"before": float | None, "after": float | None})  # null: unknown
 FrameTime = TypedDict("FrameTime", {"stamp": str, "frame": int})
 Row = TypedDict("Row", {"frame": int, "pick": str})  # an object in a frame
 Origin = TypedDict("Origin", {"time": float, "set": tuple[str, ...]})  # where a pick is valid
 Chip = Literal["", "hint", "cannot tell", "tried in vain"]
 RowRemark = TypedDict("RowRemark", {"remark": str, "chip": Chip, "text": str})  # text: the reason
 OtherObject = TypedDict("OtherObject", {"pick": str, "name": str, "reported": bool, "reason": str})
-Problem = TypedDict("Problem", {"text": str, "seconds": int})  # of the robot's data, and for how long
-ReportFile = TypedDict("ReportFile", {"name": str, "megabytes": float})
 
 
 class Control(TypedDict):
@@ -44,18 +44,6 @@ class Control(TypedDict):
     low: NotRequired[float]
     high: NotRequired[float]
     choices: NotRequired[list[str]]
-
-
-class SideEffects(TypedDict):
-    """Effects of other values on a frame, as those of a hint."""
-
-    fixed: list[str]
-    added: list[str]
-    false: list[str]
-    lost: list[str]
-    right: list[str]
-    false_gone: list[str]
-    changed: int
 
 
 class LabelBox(TypedDict):
@@ -93,41 +81,6 @@ class NoteEntry(TypedDict):
     points_frame: str
 
 
-class JobEntry(TypedDict):
-    """A job in the background."""
-
-    number: int
-    settings: list[str]
-    cancelled_by: str
-    state: str
-    error: str
-    done: int
-    total: int
-
-
-class TrialEntry(JobEntry):
-    """A run with other values. ``span`` is null for the whole drive."""
-
-    lane: str
-    span: Span | None
-    counts: dict[str, int]
-    f1: BeforeAfter | None
-
-
-class FixEntry(JobEntry):
-    """A search of a fix, and its result in words."""
-
-    text: str
-
-
-class ReportEntry(JobEntry):
-    """A report."""
-
-    name: str
-    files: list[ReportFile]
-    folder: str
-
-
 # --- messages to the page ----------------------------------------------------------------------
 
 
@@ -156,8 +109,7 @@ Entries = TypedDict("Entries", {"type": Literal["entries"], "entries": list[Entr
 Controls = TypedDict("Controls", {"type": Literal["controls"], "controls": list[Control]})
 Noted = TypedDict("Noted", {"type": Literal["noted"], "id": int, "text": str})
 Held = TypedDict("Held", {"type": Literal["held"], "frame": int, "stamp": str})
-Said = TypedDict("Said", {"type": Literal["said"], "text": str, "wrong": NotRequired[bool]})
-RobotReply: TypeAlias = Held | Said
+Said = TypedDict("Said", {"type": Literal["said"], "text": str})
 
 
 class Notes(TypedDict):
@@ -169,26 +121,13 @@ class Notes(TypedDict):
     error: str
 
 
-class RunProgress(TypedDict):
-    """Progress of the source: ``phase`` of a drive, ``problems`` and ``held`` of a robot."""
-
-    done: int
-    total: int | None
-    over: bool
-    error: str
-    warnings: list[str]
-    phase: NotRequired[Literal["overview", "again", "run"]]
-    problems: NotRequired[list[Problem]]
-    held: NotRequired[list[str]]
-
-
 class Progress(RunProgress):
     """Progress of the run and of all jobs."""
 
     type: Literal["progress"]
-    reports: list[ReportEntry]
-    trials: list[TrialEntry]
-    fix: FixEntry | None
+    reports: list[ReportJob]
+    trials: list[Trial]
+    fix: FixJob | None
 
 
 class Reply(TypedDict):
@@ -266,16 +205,6 @@ class Robot(Reply, RobotSteps):
     type: Literal["robot"]
 
 
-class TriedEffects(TypedDict):
-    """Effects of other values on a frame."""
-
-    changes: dict[str, str]
-    effects: SideEffects
-    opinions: dict[str, BeforeAfter]
-    failures: list[str]
-    f1: NotRequired[BeforeAfter]
-
-
 class Tried(Reply, TriedEffects):
     """A frame was tried with other values."""
 
@@ -285,7 +214,7 @@ class Tried(Reply, TriedEffects):
 
 ToPage: TypeAlias = (
     Welcome | Failed | Error | Opening | Frames | Entries | Notes | Progress | Nothing | Absent | Hints
-) | (Robot | Label | Remark | Tried | Controls | Noted | RobotReply)  # fmt: skip
+) | (Robot | Label | Remark | Tried | Controls | Noted | Held | Said)  # fmt: skip
 
 # --- messages from the page --------------------------------------------------------------------
 

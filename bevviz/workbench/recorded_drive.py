@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,13 +28,10 @@ from bevviz.why.log import focus_answer, mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import AHEAD, BufferReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
-from bevviz.workbench.growing_drive import GrowingDrive, Settings
+from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
 from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.thumbnails import Thumbnails
-
-if TYPE_CHECKING:
-    from bevviz.workbench.page_types import RunProgress
 
 PATIENCE = 10.0  # seconds that close() waits for the run to end
 NEIGHBOURS = (1, -1)  # frames that are made after the one that a page requests

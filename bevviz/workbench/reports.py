@@ -13,46 +13,42 @@ from bevviz.bags.remote import beside
 from bevviz.config import Config
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.workbench.jobs import Job, Jobs
+from bevviz.workbench.jobs import Job, Jobs, job_form
 
 if TYPE_CHECKING:
     from bevviz.report.make import ReportRequest
     from bevviz.workbench.growing_drive import Settings
-    from bevviz.workbench.page_types import ReportEntry
 
 LONGEST = 600.0  # seconds before or after the frame, at most
 
 
+@dataclass(frozen=True, slots=True)
+class ReportFile:
+    """File of a report."""
+
+    name: str
+    megabytes: float
+
+
+@job_form
 @dataclass(slots=True)
 class ReportJob(Job):
     """A finished report, or the one in progress. ``settings`` are the tried values that it tells of.
 
     Attributes:
         name: file name without suffix. Its number is in the address of its files.
-        files: paths of its files.
+        files: its files.
+        folder: path of their folder.
     """
 
     name: str = ""
-    files: list[Path] = field(default_factory=list)
-
-    def as_dict(self) -> ReportEntry:
-        """Return the report as JSON for the page."""
-        return {
-            **Job.as_dict(self),
-            "name": self.name,
-            "files": [
-                {"name": path.name, "megabytes": path.stat().st_size / 1e6} for path in self._existing_files()
-            ],
-            "folder": str(self.files[0].parent) if self.files else "",
-        }
-
-    def _existing_files(self) -> Sequence[Path]:
-        """Return its files that exist."""
-        return [path for path in self.files if path.is_file()]
+    files: list[ReportFile] = field(default_factory=list)
+    folder: str = ""
 
     def file(self, name: str) -> Path | None:
         """Return the path of a file by its name, if it exists."""
-        return next((path for path in self._existing_files() if path.name == name), None)
+        path = Path(self.folder, name)
+        return path if name in [file.name for file in self.files] and path.is_file() else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +99,9 @@ class ReportMaker(Jobs[ReportJob]):
     def _make(self, request: ReportRequest, report: ReportJob) -> None:
         from bevviz.report.make import make
 
-        report.files = make(request, [_ReportProgress(report, self._tell)], report.stop).files
+        paths = make(request, [_ReportProgress(report, self._tell)], report.stop).files
+        report.files = [ReportFile(path.name, path.stat().st_size / 1e6) for path in paths]
+        report.folder = str(request.output.parent)
 
 
 class _ReportProgress(Observer[FrameResult]):

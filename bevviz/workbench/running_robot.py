@@ -33,7 +33,7 @@ from bevviz.why import Answer, Selection
 from bevviz.why.log import dim_others, mark_answers
 from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, Settings
+from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, RunProgress, Settings
 from bevviz.workbench.held_seconds import HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
@@ -41,7 +41,7 @@ from bevviz.workbench.reports import ReportedBag, ReportMaker
 from bevviz.workbench.session import WorkbenchSession
 
 if TYPE_CHECKING:
-    from bevviz.workbench.page_types import Held, Hold, ListHeld, Mark, RunProgress, Said, Snap
+    from bevviz.workbench.page_types import Held, Hold, ListHeld, Mark, Said, Snap
 
 KEPT = 4  # held frames that are kept
 BEFORE = 500_000_000  # nanoseconds of messages before a scan that its frame needs

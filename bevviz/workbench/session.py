@@ -29,14 +29,14 @@ from bevviz.why.kept_labels import box_of, is_label_in, kept_truth, proposed_lab
 from bevviz.why.resolve import select_subjects
 from bevviz.why.subject import points_in_box
 from bevviz.workbench.fix_search import FixSearch
-from bevviz.workbench.growing_drive import GrowingDrive, Settings
+from bevviz.workbench.growing_drive import GrowingDrive, Settings, Span
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.recorded_drive import RecordedDrive
 from bevviz.workbench.reports import LONGEST, ReportedBag, ReportJob, ReportMaker, folder_beside
-from bevviz.workbench.trials import TrialRunner, frame_effects, trial_effects
+from bevviz.workbench.trials import TrialRunner, TriedEffects, frame_effects, trial_effects
 
 if TYPE_CHECKING:
-    from bevviz.workbench.page_types import Progress, TriedEffects
+    from bevviz.workbench.page_types import Progress
 
 ASKED = 8  # answers that are kept for reports
 
@@ -144,19 +144,14 @@ class WorkbenchSession(Closable):
 
     def progress(self) -> Progress:
         """Return the progress message for the page."""
-        message: Progress = {
+        fixes = [] if self._tools is None else self._tools.fix.jobs
+        return {
             "type": "progress",
             **self.source.progress(),
-            "reports": [],
-            "trials": [],
-            "fix": None,
+            "reports": [] if self._reports is None else self._reports.jobs,
+            "trials": [] if self._tools is None else self._tools.trials.jobs,
+            "fix": fixes[-1] if fixes else None,
         }
-        if self._reports is not None:
-            message["reports"] = [report.as_dict() for report in self._reports.jobs]
-        if self._tools is not None:
-            message["trials"] = [trial.as_dict() for trial in self._tools.trials.jobs]
-            message["fix"] = self._tools.fix.as_dict()
-        return message
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -376,7 +371,7 @@ class WorkbenchSession(Closable):
         text: str,
         identity: Identity | None,
         overlay: PageOverlay | None = None,
-        span: tuple[int, int] | None = None,
+        span: Span | None = None,
     ) -> str:
         """Save a note about a span, an object, or the frame if the object is not in it. Return its subject.
 
@@ -392,7 +387,8 @@ class WorkbenchSession(Closable):
             pick = str(self.identity(number, (), selection, answer, identity))
         stamp, received, end = result.frame.stamp, result.frame.received, 0
         if span is not None:
-            first, end = self.source.look(self.source.number_at(span[0])).frame, span[1]
+            first = self.source.look(self.source.number_at(int(span["first"]))).frame
+            end = int(span["last"])
             stamp, received = first.stamp, first.received
             name = name or f"the span of {(end - stamp) / 1e9:.2f} s"
         self.tools.notes.add(Note(stamp, received, text.strip(), name.removeprefix("the "), pick, end))

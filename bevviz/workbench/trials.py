@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import Annotated, NotRequired
 
 import numpy as np
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError
@@ -23,37 +24,57 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
+from bevviz.support.json_form import LEFT_OUT
 from bevviz.why import FrameExplainer, Selection
 from bevviz.workbench.buffers import RecordingBuffer
-from bevviz.workbench.growing_drive import Settings
-from bevviz.workbench.jobs import Job, Jobs
+from bevviz.workbench.growing_drive import Settings, Span
+from bevviz.workbench.jobs import Job, Jobs, job_form
 from bevviz.workbench.overview import NumberedFrames
 from bevviz.workbench.recorded_drive import RecordedDrive
-
-if TYPE_CHECKING:
-    from bevviz.workbench.page_types import BeforeAfter, SideEffects, TrialEntry, TriedEffects
 
 RUNS = 6  # trials that are kept
 
 
+class BeforeAfter(TypedDict):
+    """A number before and after a change. None: it is unknown."""
+
+    before: float | None
+    after: float | None
+
+
+class TriedEffects(TypedDict):
+    """Effects of other values on a frame."""
+
+    changes: dict[str, str]
+    effects: differences.ChangedObjects
+    opinions: dict[str, BeforeAfter]
+    failures: list[str]
+    f1: NotRequired[BeforeAfter]
+
+
+@job_form
 @dataclass(slots=True)
 class Trial(Job):
     """A run over the drive with other values, and its effect on each frame.
 
     Attributes:
         counts: number of changes by kind.
-        scores: score before and after.
-        known: whether there is ground truth.
-        buffer: recording of its results, for the pages that show its settings.
+        f1: F1 before and after. None: there is no ground truth, or no frame yet.
+        lane: name by which a page requests its recording.
         span: first and last stamp of the frames that it runs over. None: the whole drive.
+        scores: score before and after.
+        buffer: recording of its results, for the pages that show its settings.
     """
 
     state: str = "waiting"
     counts: Counter[str] = field(default_factory=Counter)
-    scores: tuple[ObjectScore, ObjectScore] = field(default_factory=lambda: (ObjectScore(), ObjectScore()))
-    known: bool = False
-    buffer: RecordingBuffer = field(default_factory=RecordingBuffer)
-    span: tuple[int, int] | None = None
+    f1: BeforeAfter | None = None
+    lane: str = ""
+    span: Span | None = None
+    scores: Annotated[tuple[ObjectScore, ObjectScore], LEFT_OUT] = field(
+        default_factory=lambda: (ObjectScore(), ObjectScore())
+    )
+    buffer: Annotated[RecordingBuffer, LEFT_OUT] = field(default_factory=RecordingBuffer)
 
     @property
     def text(self) -> str:
@@ -61,22 +82,6 @@ class Trial(Job):
         counts = ", ".join(f"{self.counts[kind]} {kind}" for kind in DIFFERENCES if self.counts[kind])
         frames = f"the whole drive of {self.done}" if self.span is None else f"{self.done}"
         return f"In {frames} frames: {counts or 'no change'}." if self.state == "over" else ""
-
-    @property
-    def lane(self) -> str:
-        """Name by which a page requests its recording."""
-        return f"run-{self.number}"
-
-    def as_dict(self) -> TrialEntry:
-        """Return the trial as JSON for the page."""
-        before, after = (rounded(score.f1) for score in self.scores)
-        return {
-            **Job.as_dict(self),
-            "lane": self.lane,
-            "span": None if self.span is None else {"first": str(self.span[0]), "last": str(self.span[1])},
-            "counts": {key: number for key, number in self.counts.items() if number},
-            "f1": {"before": before, "after": after} if self.known else None,
-        }
 
 
 class TrialRunner(Jobs[Trial]):
@@ -87,7 +92,7 @@ class TrialRunner(Jobs[Trial]):
         self._drive = drive
         self._begun = 0  # number of trials until now
 
-    def begin(self, settings: Settings, span: tuple[int, int] | None = None) -> None:
+    def begin(self, settings: Settings, span: Span | None = None) -> None:
         """Run the drive, or a span of it, with these settings. A trial that is running is cancelled.
 
         Args:
@@ -107,8 +112,8 @@ class TrialRunner(Jobs[Trial]):
         frames: Items[Frame] = drive.again
         if span is not None:
             frames = NumberedFrames(drive.again, _numbers(drive, span))
-        known = drive.truth_of is not None
-        trial = Trial(self._begun, settings, frames.total or 0, known=known, span=span)
+        lane = f"run-{self._begun}"
+        trial = Trial(self._begun, settings, frames.total or 0, lane=lane, span=span)
         self._begun += 1
         drive.lanes[trial.lane] = trial.buffer
         drive.findings.replace(tuple(DIFFERENCES))
@@ -126,10 +131,9 @@ class TrialRunner(Jobs[Trial]):
             run(frames, session, [_TrialObserver(drive, trial, session.config)], stop=trial.stop)
 
 
-def _numbers(drive: RecordedDrive, span: tuple[int, int]) -> range:
+def _numbers(drive: RecordedDrive, span: Span) -> range:
     """Return the numbers of the frames of a span."""
-    first, last = (drive.number_at(stamp) for stamp in span)
-    return range(first, last + 1)
+    return range(drive.number_at(int(span["first"])), drive.number_at(int(span["last"])) + 1)
 
 
 class _TrialObserver(Observer[FrameResult]):
@@ -150,13 +154,17 @@ class _TrialObserver(Observer[FrameResult]):
         change = differences.before_after(before, after, drive.truth(frame))
         findings = list(difference_findings(explainer, change, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
-        trial.counts["changed"] += change.changed
+        if change.changed:
+            trial.counts["changed"] += change.changed
         for tried in (False, True):
             drive.findings.add((finding for finding, side in findings if side == tried), tried=tried)
         sides = (before, change.before), (after, change.after)
         for score, (objects, matches) in zip(trial.scores, sides, strict=True):
             if objects is not None and matches is not None and change.truth is not None:
                 score.count(objects.names, change.truth, matches)
+        if change.truth is not None:
+            f1_before, f1_after = (rounded(score.f1) for score in trial.scores)
+            trial.f1 = {"before": f1_before, "after": f1_after}
         trial.done += 1
         self._show()
         drive.wait_for_quiet()
@@ -222,7 +230,7 @@ def trial_effects(
     """
     message: TriedEffects = {
         "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},
-        "effects": cast("SideEffects", asdict(frame_effects(before, after, truth, truth_row).names)),
+        "effects": frame_effects(before, after, truth, truth_row).names,
         "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }

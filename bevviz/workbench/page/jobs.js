@@ -4,15 +4,15 @@ import { $, beforeAfter, element, inSpan, spanText, state } from "./page_state.j
 import { isTried } from "./viewer.js";
 import { cancelled, follow, send } from "./connection.js";
 
-/** @import { FixEntry, Progress, ReportEntry, TrialEntry } from "./types" */
+/** @import { FixJob, Progress, ReportJob, Trial } from "./types" */
 
-/** @type {TrialEntry[]} */
+/** @type {Trial[]} */
 let trials = []; // runs with other values, from the server, the newest last
 /** @type {(settings: string[]) => void} */
 let use = () => {}; // shows the settings of a run
 
 export const settings = () => trials.at(-1)?.settings ?? null; // of the newest run, whose differences are listed
-const isShown = (/** @type {TrialEntry} */ run) => run.settings.join() === state.set.join();
+const isShown = (/** @type {Trial} */ run) => run.settings.join() === state.set.join();
 const shownRun = () => trials.find(isShown) ?? trials.at(-1);
 
 /** @param {typeof use} using */
@@ -107,9 +107,9 @@ function row(values, kind = "td") {
 }
 
 // The values of a run, and the span that it was run over.
-const named = (/** @type {TrialEntry} */ run) => [run.settings.join(", "), ...(run.span ? [`of ${spanText(run.span)}`] : [])].join("; ");
+const named = (/** @type {Trial} */ run) => [run.settings.join(", "), ...(run.span ? [`of ${spanText(run.span)}`] : [])].join("; ");
 
-/** @param {TrialEntry} run */
+/** @param {Trial} run */
 function runRow(run) {
   const button = element("button", "", named(run));
   button.onclick = () => use(run.settings);
@@ -121,9 +121,9 @@ function runRow(run) {
 }
 
 const KINDS = ["fixed", "broken", "new false", "false gone", "new", "gone"];
-const kindsOf = (/** @type {TrialEntry[]} */ runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
+const kindsOf = (/** @type {Trial[]} */ runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
 
-/** @param {TrialEntry} message */
+/** @param {Trial} message */
 function summary(message) {
   const parts = [];
   if (message.f1) parts.push(`F1 ${beforeAfter(message.f1)}`);
@@ -136,16 +136,16 @@ function summary(message) {
 
 // --- search of a fix ----------------------------------------------------------------------------
 
-/** @param {FixEntry} fix */
+/** @param {FixJob} fix */
 function showFix(fix) {
   const going = fix.state === "running";
   const steps = fix.total ? `${fix.done} of ${fix.total} settings tried` : "Reading frames ...";
   $("fix").disabled = going;
-  $("fix-section").hidden = !fix.state;
+  $("fix-section").hidden = false;
   for (const id of /** @type {const} */ (["fix-bar", "fix-cancel"])) $(id).hidden = !going;
   $("fix-bar").max = fix.total || 1;
   $("fix-bar").value = fix.done;
-  $("fix-text").textContent = { "": "", running: steps, cancelled: `${cancelled(fix).replace("c", "C")}.` }[fix.state] ?? fix.text;
+  $("fix-text").textContent = { running: steps, failed: fix.error, cancelled: `${cancelled(fix).replace("c", "C")}.` }[fix.state] ?? fix.text;
   $("fix-text").className = fix.state === "failed" ? "alarm" : "faint";
   $("fix-use").hidden = going || !fix.settings.length;
   $("fix-use").textContent = `try ${fix.settings.join(", ")}`;
@@ -154,7 +154,7 @@ function showFix(fix) {
 
 // --- reports ------------------------------------------------------------------------------------
 
-/** @param {ReportEntry} one */
+/** @param {ReportJob} one */
 function report(one) {
   const item = element("li", one.state === "failed" ? "alarm" : "", "");
   if (one.state === "failed") item.textContent = `${one.name}: ${one.error}`;

@@ -14,7 +14,7 @@ import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from 
 
 const REQUESTS = 300; // ms between two requests of frames while the time goes on
 
-/** @import { AnswerMessage, Absent, Control, Error, Hints, Nothing, Opening, Origin, Robot, SideEffects, Span, Tried, Welcome } from "./types" */
+/** @import { AnswerMessage, Absent, Control, Error, Hints, Nothing, Opening, Origin, Robot, ChangedObjects, Span, Tried, Welcome } from "./types" */
 /** @typedef {{ pick: string, origin: Origin | null }} Known */
 /** @typedef {Known | import("./viewer.js").Click} Subject what is asked about */
 
@@ -259,7 +259,7 @@ function labelStep(isKept) {
 
 /**
  * Describe the effects of other values on a frame. Hints and tried values use the same words.
- * @param {SideEffects} effect
+ * @param {ChangedObjects} effect
  */
 function effects(effect) {
   const rest = (/** @type {string[]} */ all, /** @type {string[]} */ some) => all.filter((name) => !some.includes(name));

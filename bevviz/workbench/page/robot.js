@@ -28,6 +28,8 @@ function say(text, wrong) {
   $("said").className = wrong ? "alarm" : "faint";
 }
 
+const command = (/** @type {import("./connection.js").Sent} */ message) => send(message, ({ text }) => say(text, true));
+
 // The slider has one step for each frame of the held seconds, which go on. While it is held, they stay.
 /** @type {number[] | null} */
 let sliding = null; // times of the frames when the slider was taken
@@ -59,7 +61,7 @@ $("past").onchange = () => {
   const wanted = sliding[Math.min(Number($("past").value), sliding.length - 1)];
   sliding = null;
   say("Holding the frame ...");
-  send({ type: "hold", time: wanted });
+  command({ type: "hold", time: wanted });
 };
 
 // What is wrong with the robot's data now, and for how long.
@@ -74,7 +76,7 @@ function showProblems(problems) {
 }
 
 function mark() {
-  if (time !== null) send({ type: "mark", time, text: $("mark-text").value });
+  if (time !== null) command({ type: "mark", time, text: $("mark-text").value });
   $("mark-text").value = "";
 }
 
@@ -83,16 +85,16 @@ on({
     say(`Frame ${message.frame} is held: ask about it.`);
     seek(message.stamp); // The viewer may get the frame only after this message.
   },
-  said: (message) => say(message.text, message.wrong),
+  said: (message) => say(message.text),
   gone: () => say("No connection to the robot: the last frame that came is shown.", true),
 });
 
 // What the keys of these buttons do.
 export const actions = {
-  h: () => { if (time !== null) send({ type: "hold", time }); },
+  h: () => { if (time !== null) command({ type: "hold", time }); },
   f: () => { say("At the newest frame."); if (newest !== null) goTo(String(BigInt(Math.round(newest))), true); },
-  l: () => { say("Listing ..."); send({ type: "list" }); },
-  s: () => { say("Saving ..."); send({ type: "snap" }); },
+  l: () => { say("Listing ..."); command({ type: "list" }); },
+  s: () => { say("Saving ..."); command({ type: "snap" }); },
   m: mark,
 };
 for (const [id, key] of /** @type {const} */ ([["hold", "h"], ["follow", "f"], ["list", "l"], ["snap", "s"], ["mark", "m"]])) $(id).onclick = actions[key];
