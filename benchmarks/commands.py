@@ -173,13 +173,11 @@ def _open(bag: Path, model: str) -> None:
     import bevviz
     from bevviz.bags.source import BagSource
     from bevviz.config import load
-    from bevviz.evaluate import truth_source
     from bevviz.workbench.session import recorded_session
 
     config = load(None, [f"detector.model={model}"])
     source, again = BagSource([bag], config), BagSource([bag], config)
-    truth_of = truth_source(source.roles, None, None, len(source.scans))
-    session = recorded_session(bevviz.Drive(source, config), again, [bag], truth_of)
+    session = recorded_session(bevviz.Drive(source, config), again, [bag])
     drive: Any = session.source
     drive.start()
     drive.go_on()

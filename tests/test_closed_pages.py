@@ -33,7 +33,7 @@ def test_closed_pages_leave_no_threads(tmp_path: Path) -> None:
     with (
         bevviz.open(bag) as drive,
         BagSource([bag], drive.config) as again,
-        recorded_session(drive, again, [bag], None) as session,
+        recorded_session(drive, again, [bag]) as session,
         ThreadPoolExecutor(1) as questions,
     ):
 

@@ -12,7 +12,6 @@ import bevviz
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.errors import UserError
-from bevviz.evaluate import truth_source
 from bevviz.workbench.fix_search import FixJob
 from bevviz.workbench.session import WorkbenchSession, recorded_session
 from tests.support.waiting import PATIENCE
@@ -31,10 +30,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def session(bag: Path) -> Iterator[WorkbenchSession]:
     """Yield the session of a drive whose threshold leaves no detection. Its run is not started."""
     values = {"detector.conf_threshold": 0.99}
-    with bevviz.open(bag, model="demo", set=values) as drive, BagSource([bag], drive.config) as again:
-        truth_of = truth_source(again.roles, None, None, FRAMES)
-        with recorded_session(drive, again, [bag], truth_of) as session:
-            yield session
+    with (
+        bevviz.open(bag, model="demo", set=values) as drive,
+        BagSource([bag], drive.config) as again,
+        recorded_session(drive, again, [bag]) as session,
+    ):
+        yield session
 
 
 def progress(session: WorkbenchSession) -> FixJob:
@@ -81,7 +82,8 @@ def test_a_drive_without_truth_has_no_fix(bag: Path) -> None:
     with (
         bevviz.open(bag, model="demo") as drive,
         BagSource([bag], drive.config) as again,
-        recorded_session(drive, again, [bag], None) as session,
-        pytest.raises(UserError, match="no ground truth"),
+        recorded_session(drive, again, [bag]) as session,
     ):
-        session.tools.fix.begin()
+        session.source.has_truth = False
+        with pytest.raises(UserError, match="no ground truth"):
+            session.tools.fix.begin()

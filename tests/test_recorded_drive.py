@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import pytest
 import bevviz
 from bevviz.config import changed_config
 from bevviz.errors import UserError
-from bevviz.evaluate import match, truth_in, truth_of
+from bevviz.evaluate import match, truth_of
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
 from bevviz.model.frame import Frame
@@ -216,7 +216,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     from rerun.chunk import RrdReader
 
     with bevviz.open(bag, model="demo") as drive, bevviz.open(bag, model="demo") as again:
-        bench = RecordedDrive(drive, again.frames, truth_in(again.frames))
+        bench = RecordedDrive(drive, again.frames)
         session = WorkbenchSession(bench)
         bench.observe(drive.at(frame=0))
         overlay, other = bench.open_overlay(), bench.open_overlay()
@@ -234,7 +234,7 @@ def test_other_values_are_beside_what_the_drive_makes(bag: Path, tmp_path: Path)
     assert result.objects is not None
     assert result.frame.truth is not None
     found, _ = match(result.objects, truth_of(result.frame, result.frame.truth))
-    effects = told["effects"]
+    effects = asdict(told["effects"])
     assert len(effects["lost"]) == len(effects["right"]) == (found >= 0).sum() > 0
     assert len(effects["false_gone"]) == (found < 0).sum() > 0
     assert recoloured["effects"] != told["effects"]

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -391,7 +392,7 @@ def test_the_objects_method_is_changed_there_and_back(
         session.try_values(0, ("objects.method=nowhere:detect",))
     assert bench.live.config.objects.method == "topic:/nobody"
     told = session.try_values(0, ())
-    assert not told["changes"] and not told["opinions"] and not any(told["effects"].values())
+    assert not told["changes"] and not told["opinions"] and not any(asdict(told["effects"]).values())
     again = bench.live.session.run_single(results[0].frame)
     assert again.opinions is None and again.objects is not None and results[0].objects is not None
     assert again.objects.names == results[0].objects.names

@@ -110,11 +110,11 @@ def open_page(
             from bevviz.drive import Drive
             from bevviz.workbench.session import recorded_session
 
-            truth_of, labels = truth.find(source), (truth.truth, truth.kitti_labels)
+            labels = truth.truth, truth.kitti_labels
             if labels != (None, None):
-                source.truth_of = second_source.truth_of = truth_of
+                source.truth_of = second_source.truth_of = truth.find(source)
             drive = Drive(source, config)
-            return recorded_session(drive, second_source, paths, truth_of, first, labels, opened)
+            return recorded_session(drive, second_source, paths, first, labels, opened)
 
         def ready(address: str) -> None:
             announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, page.browser)

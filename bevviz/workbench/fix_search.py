@@ -49,7 +49,7 @@ class FixSearch(Jobs[FixJob]):
             UserError: a search is running, or there is no ground truth.
         """
         self.check_idle("a fix is being searched")
-        if self._source.truth_of is None:
+        if not self._source.has_truth:
             raise UserError("there is no ground truth, by which a fix is judged")
         self.start(FixJob(len(self.jobs)), self._search)
 

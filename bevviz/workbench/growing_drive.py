@@ -18,7 +18,7 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 
 from bevviz.config import Config, changed_config
 from bevviz.errors import UserError
-from bevviz.evaluate import Truth
+from bevviz.evaluate import Truth, truth_of
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.finding_list import FindingList
 from bevviz.model.frame import F32, F64, Frame
@@ -126,10 +126,10 @@ class GrowingDrive(Closable):
     Args:
         title: name of the drive or the robot.
         pipeline: pipeline session with the configuration in force and the loaded networks.
-        truth_of: returns the ground truth of a frame. None: there is none.
         newest: number of newest results that stay in memory.
 
     Attributes:
+        has_truth: whether frames carry ground truth.
         scans: number of scans. 0 for a robot.
         single_frames: the frames are unrelated, and their stamps are made up.
         findings: findings, grouped over frames.
@@ -140,10 +140,8 @@ class GrowingDrive(Closable):
         commands: further messages of the page by type, each with the function that returns the reply.
     """
 
-    def __init__(
-        self, title: str, pipeline: Session, truth_of: TruthLookup | None = None, newest: int = 0
-    ) -> None:
-        self.title, self.pipeline, self.truth_of = title, pipeline, truth_of
+    def __init__(self, title: str, pipeline: Session, newest: int = 0) -> None:
+        self.title, self.pipeline, self.has_truth = title, pipeline, False
         self.scans, self.single_frames = 0, False
         self.findings, self.news = FindingList(), News()
         self.opening: int | None = None
@@ -325,7 +323,7 @@ class GrowingDrive(Closable):
 
     def truth(self, frame: Frame) -> Truth | None:
         """Return the ground truth of a frame, if there is any."""
-        return None if self.truth_of is None else self.truth_of(frame)
+        return None if frame.truth is None else truth_of(frame, frame.truth)
 
     def explainer(self, result: FrameResult) -> FrameExplainer:
         """Return an explainer of a result, for the list and for questions."""

@@ -111,7 +111,7 @@ class PageConnection:
             "run": self._run,
             "overlay": self._name,
             "bag": source.title,
-            "truth": source.truth_of is not None,
+            "truth": source.has_truth,
             "single": source.single_frames,
             "detector": bool(self._opened.detector.model),
             "opened": opened_values(self._opened),
@@ -338,9 +338,8 @@ class PageConnection:
         finally:
             if self._trying == number:
                 self._trying = 0
-        pieces = 0 if overlay is None else len(overlay.buffer)
         head: types.Reply = {"id": number, "frame": frame, "set": settings}
-        await self._send({"type": "tried", **head, "pieces": pieces, **effects})
+        await self._send({"type": "tried", **head, **effects})
         new_controls = controls(self._source.configured(settings), self._opened)
         if new_controls != self._controls:  # a stage was replaced by a user's function, or is no longer
             self._controls = new_controls

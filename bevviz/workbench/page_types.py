@@ -209,7 +209,6 @@ class Tried(Reply, TriedEffects):
     """A frame was tried with other values."""
 
     type: Literal["tried"]
-    pieces: int
 
 
 ToPage: TypeAlias = (

@@ -12,7 +12,6 @@ import numpy as np
 from bevviz.bags.source import BagSource
 from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
-from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.frame_findings import Finding, find_findings, findings_of
 from bevviz.findings.marks import log_findings
 from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun
@@ -48,7 +47,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     Args:
         drive: the drive that questions are about.
         again: the same frames a second time. The run reads them.
-        truth_of: returns the ground truth of a frame.
         first: number of the scan that is shown first.
         table: place of the list of a whole run. None: it is not kept.
         opened: called once a page shows the first frame, before the run.
@@ -64,12 +62,12 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self,
         drive: Drive,
         again: FrameSource,
-        truth_of: TruthLookup | None = None,
         first: int = 0,
         table: RunTable | None = None,
         opened: Callable[[FrameExplainer], None] = lambda explainer: None,
     ) -> None:
-        super().__init__(drive.scene.name, drive.session, truth_of)
+        super().__init__(drive.scene.name, drive.session)
+        self.has_truth = drive.scene.truth
         self.drive, self.again, self.scans = drive, again, len(drive)
         recording = getattr(drive.frames, "recording", None)
         self.single_frames = bool(getattr(recording, "single_frames", False))

@@ -19,7 +19,6 @@ import rerun as rr
 
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate import Truth, truth_of
 from bevviz.findings.frame_findings import KINDS, find_findings
 from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live, ObservingSession
@@ -123,8 +122,7 @@ class RunningRobot(GrowingDrive):
         """Keep a new frame."""
         self.add(result)
         self._forget_gone()
-        if result.frame.truth is not None and self.truth_of is None:
-            self.truth_of = _truth_in_frame
+        self.has_truth |= result.frame.truth is not None
         self.news.tell()
 
     def reader(self, lane: str, first: int, state: PageState) -> AbstractContextManager[Reader]:
@@ -387,8 +385,3 @@ class RunningRobot(GrowingDrive):
         text = f"mark at frame {number}: {text}"
         self.live.notes.info(text)
         return {"type": "said", "text": text}
-
-
-def _truth_in_frame(frame: Frame) -> Truth | None:
-    """Return the ground truth that a frame carries, if there is any."""
-    return None if frame.truth is None else truth_of(frame, frame.truth)

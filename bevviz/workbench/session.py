@@ -15,7 +15,6 @@ from bevviz.config import changed_config
 from bevviz.drive import Drive
 from bevviz.errors import UserError
 from bevviz.evaluate import Truth
-from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.run_table import run_table
 from bevviz.model.frame import Boxes3D, Frame
 from bevviz.model.protocols import FrameSource
@@ -504,7 +503,6 @@ def recorded_session(
     drive: Drive,
     again: FrameSource,
     paths: Sequence[Path],
-    truth_of: TruthLookup | None = None,
     first: int = 0,
     labels: tuple[str | None, Path | None] = (None, None),
     opened: Callable[[FrameExplainer], None] = lambda explainer: None,
@@ -515,7 +513,6 @@ def recorded_session(
         drive: the drive that questions are about.
         again: the same frames a second time. The run reads them while questions read those of ``drive``.
         paths: paths of the bag.
-        truth_of: returns the ground truth of a frame. The frames of both sources carry it as well.
         first: number of the scan that is shown first.
         labels: stated topic and files of the ground truth.
         opened: called once a page shows the first frame, before the run.
@@ -523,7 +520,7 @@ def recorded_session(
     recording = getattr(drive.frames, "recording", None)
     files = [] if recording is None else [file.path for file in recording.files]
     table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
-    source = RecordedDrive(drive, again, truth_of, first, table, opened)
+    source = RecordedDrive(drive, again, first, table, opened)
     session = WorkbenchSession(source)
 
     def bag_of(number: int) -> ReportedBag:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bevviz.bags.source import BagSource
-from bevviz.model.frame import Frame, LabelledBoxes3D
+from bevviz.model.frame import Frame, LabelledBoxes3D, Scene
 from bevviz.support.contexts import Closable
 
 if TYPE_CHECKING:
@@ -78,6 +78,11 @@ class LabelledSource(BagSource):
     """
 
     truth_of: TruthLookup | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """Names that entities and blueprints are made from."""
+        return super().scene if self.truth_of is None else replace(super().scene, truth=True)
 
     def __iter__(self) -> Iterator[Frame]:
         return map(self._labelled, super().__iter__())

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,7 +157,7 @@ class Oracle:
         )
         assert frame.truth is not None
         made = trial_effects(before, after, truth_of(frame, frame.truth))
-        effects: dict[str, Any] = dict(made["effects"])
+        effects: dict[str, Any] = asdict(made["effects"])
         changed = effects.pop("changed")
         words = {name for names in effects.values() for name in names}
         words |= {" → ".join("–" if one is None else f"{one:g}" for one in made["f1"].values())}  # noqa: RUF001

@@ -24,7 +24,6 @@ from pydantic import TypeAdapter
 from bevviz.cli import main
 from bevviz.config import load
 from bevviz.drive import Drive
-from bevviz.evaluate import truth_source
 from bevviz.workbench.page_types import AnyToPage
 from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE, until
@@ -91,8 +90,7 @@ def served(bag: Path, *settings: str) -> Iterator[str]:
     with LabelledSource([bag], config) as source, LabelledSource([bag], config) as again:
 
         def make() -> WorkbenchSession:
-            truth_of = truth_source(source.roles, None, None, len(source.scans))
-            return recorded_session(Drive(source, config), again, [bag], truth_of)
+            return recorded_session(Drive(source, config), again, [bag])
 
         with (
             bound_socket(0) as listening,

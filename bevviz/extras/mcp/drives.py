@@ -65,11 +65,10 @@ class AskedDrive:
             UserError: the bag or the model cannot be used.
         """
         source = LabelledSource(paths, config)
-        truth_of = truth_source(source.roles, *truth, len(source.scans))
         if truth != (None, None):
-            source.truth_of = truth_of
+            source.truth_of = truth_source(source.roles, *truth, len(source.scans))
         drive = Drive(source, config)
-        session = recorded_session(drive, source, paths, truth_of)
+        session = recorded_session(drive, source, paths)
         return cls(words, paths, source, session, drive, truth)
 
     def command(self, command: str, *words: object) -> str:

@@ -69,8 +69,6 @@ function receive(lane) {
       if (held > LIMIT) handlers.full?.();
     }
     announced = null;
-    for (const one of awaited.filter(([, count]) => counted(overlay) >= count)) one[0]();
-    awaited = awaited.filter(([, count]) => counted(overlay) < count);
     if (overlay) follow(overlay);
     if (!lane.startsWith("overlay")) nextPicture(() => { if (socket.readyState === WebSocket.OPEN) socket.send(""); });
   };
@@ -142,15 +140,3 @@ export const isConnected = () => questions?.readyState === WebSocket.OPEN;
  * @param {{ cancelled_by: string }} job
  */
 export const cancelled = ({ cancelled_by: by }) => (by && by !== overlay ? "cancelled on another page" : "cancelled");
-
-/** @type {[() => void, number][]} */
-let awaited = [];
-/**
- * Call a function once the viewer has so many pieces of the overlay.
- * @param {number} count
- * @param {() => void} then
- */
-export function withPieces(count, then) {
-  if (counted(overlay) >= count) then();
-  else awaited.push([then, count]);
-}

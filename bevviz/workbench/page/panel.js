@@ -1,6 +1,6 @@
 // The panel beside Rerun's viewer. It sends clicks to the server, which holds the drive, and shows the answers.
 
-import { connect, isConnected, on, send, want, withPieces } from "./connection.js";
+import { connect, isConnected, on, send, want } from "./connection.js";
 import * as list from "./findings.js";
 import * as jobs from "./jobs.js";
 import * as label from "./label.js";
@@ -10,7 +10,7 @@ import * as parameters from "./parameters.js";
 import * as playback from "./playback.js";
 import * as share from "./share.js";
 import * as timeline from "./timeline.js";
-import { drawnThen, isTried, kind, onViewer, playOrPause, seek, showSide } from "./viewer.js";
+import { isTried, kind, onViewer, playOrPause, seek, showSide } from "./viewer.js";
 
 const REQUESTS = 300; // ms between two requests of frames while the time goes on
 
@@ -371,11 +371,8 @@ function tried(message) {
   if (message.id !== trying) return;
   tryOver();
   valid = message.set;
-  const since = tryingSince;
-  const took = () => (performance.now() - since).toFixed(0);
-  $("effect").dataset.took = took();
+  $("effect").dataset.took = (performance.now() - tryingSince).toFixed(0);
   $("effect").dataset.frame = String(message.frame);
-  withPieces(message.pieces, () => drawnThen(() => { $("effect").dataset.drawn = took(); }));
   const opinions = Object.entries(message.opinions).map(([what, both]) => `${what} ${beforeAfter(both)}`);
   const parts = [[effects(message.effects), ...opinions].filter(Boolean).join("; ") || "changes nothing that is reported"];
   if (message.f1) parts.push(`F1 ${beforeAfter(message.f1)}`);

@@ -84,7 +84,7 @@ function begun(ready) {
   ready();
 }
 // The viewer has drawn its current data once two more pictures have begun.
-export const drawnThen = (/** @type {() => void} */ then) => nextPicture(() => nextPicture(then));
+const drawnThen = (/** @type {() => void} */ then) => nextPicture(() => nextPicture(then));
 /**
  * @param {Command} message
  * @param {DataView[]} [buffers]
