@@ -20,7 +20,7 @@ def page_types() -> str:
     """Return the types of the page's messages and elements in TypeScript, for the page's comments."""
     to_page = TypeAdapter[Any](AnyToPage).json_schema(mode="serialization")
     from_page = FROM_PAGE.json_schema(mode="validation")
-    forms = to_page["$defs"] | from_page["$defs"]
+    forms = from_page["$defs"] | to_page["$defs"]
     unions = [
         f"export type {name} = {' | '.join(map(_type, tree['oneOf']))};\n"
         for name, tree in (("ToPage", to_page), ("FromPage", from_page))

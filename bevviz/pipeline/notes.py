@@ -6,24 +6,32 @@ Where the folder of the bag is read-only, the file is in the folder of the user'
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import TypeAdapter
+from pydantic import PlainSerializer, TypeAdapter
 
 from bevviz.bags.remote import beside
 from bevviz.errors import UserError
 from bevviz.support.files import atomic_write, data_folder, read_text
+from bevviz.support.json_form import message_form
 
 SUFFIX = ".notes.json"
 LONGEST = 2000  # most characters of a note
 STATES = ("done", "ignored")  # of a finding that the user has dealt with
 
 
+# Nanoseconds. A message to the page has them as text, because JavaScript numbers cannot hold them.
+Stamp = Annotated[int, PlainSerializer(str, when_used="json")]
+
+
+@message_form
 @dataclass(frozen=True, slots=True, order=True)
 class Note:
     """One note.
@@ -40,12 +48,12 @@ class Note:
         points_frame: name of that frame.
     """
 
-    stamp: int
-    received: int
+    stamp: Stamp
+    received: Stamp
     text: str
     about: str = ""
     pick: str = ""
-    end: int = 0
+    end: Stamp = 0
     label: str = ""
     box: tuple[float, ...] = ()
     points_frame: str = ""
@@ -54,6 +62,7 @@ class Note:
         return f"{self.about}: {self.text}" if self.about else self.text
 
 
+@message_form
 @dataclass(frozen=True, slots=True)
 class HandledFinding:
     """A finding of the workbench that the user has dealt with.
@@ -68,7 +77,7 @@ class HandledFinding:
         text: reason of the user.
     """
 
-    stamp: int
+    stamp: Stamp
     what: str
     name: str
     pick: str
@@ -184,7 +193,8 @@ class Notes:
         if not notes and not findings:
             self.path.unlink(missing_ok=True)
             return
-        text = _CONTENT.dump_json(_Content(list(notes), list(findings)), indent=1).decode()
+        content = _CONTENT.dump_python(_Content(list(notes), list(findings)))
+        text = json.dumps(content, indent=1, ensure_ascii=False)
         with atomic_write(self.path, "notes") as file:
             try:
                 file.path.write_bytes(f"{text}\n".encode(errors="replace"))

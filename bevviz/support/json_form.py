@@ -19,6 +19,10 @@ json_form = with_config(
         arbitrary_types_allowed=True,  # of fields that are left out
     )
 )
+# For a dataclass that is a message or a part of one. The other side finds all of its keys.
+message_form = with_config(
+    ConfigDict(arbitrary_types_allowed=True, json_schema_serialization_defaults_required=True)
+)
 LEFT_OUT = Field(exclude=True)
 WhereKnown = Annotated[T | SkipJsonSchema[None], Field(exclude_if=lambda value: value is None)]
 """Value of a key that the output lacks where the value is None."""

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bevviz.errors import UserError
-from bevviz.workbench.jobs import Job, Jobs, job_form
+from bevviz.support.json_form import message_form
+from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
     from bevviz.workbench.growing_drive import GrowingDrive
 
 
-@job_form
+@message_form
 @dataclass(slots=True)
 class FixJob(Job):
     """Search of a fix. ``settings`` are those that repair the drive.

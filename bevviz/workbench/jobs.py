@@ -7,18 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Generic, TypeVar
 
-from pydantic import ConfigDict, with_config
-
 from bevviz.errors import UserError, first_line
-from bevviz.support.json_form import LEFT_OUT
-
-# A job is a message to the page, which all of its keys are in.
-job_form = with_config(
-    ConfigDict(arbitrary_types_allowed=True, json_schema_serialization_defaults_required=True)
-)
+from bevviz.support.json_form import LEFT_OUT, message_form
 
 
-@job_form
+@message_form
 @dataclass(slots=True)
 class Job:
     """Work in a thread of its own.

@@ -160,8 +160,6 @@ class PageConnection:
             await self._socket.send_text(json.dumps(message, default=json_tree))
 
     def _notes(self) -> types.Notes:
-        from bevviz.workbench.page_messages import handled_entry, note_entry
-
         try:
             file, error = self._workbench.tools.notes, ""
             notes, findings = list(file), file.handled()
@@ -169,8 +167,8 @@ class PageConnection:
             notes, findings, error = [], [], str(problem)
         return {
             "type": "notes",
-            "notes": [note_entry(note) for note in notes],
-            "findings": [handled_entry(finding) for finding in findings],
+            "notes": notes,
+            "findings": findings,
             "error": error,
         }
 
@@ -455,10 +453,7 @@ class PageConnection:
 
     async def _handle_finding(self, message: types.Handle) -> None:
         """Keep that a finding is done or ignored."""
-        from bevviz.workbench.page_messages import handled_finding
-
-        finding = handled_finding(message)
-        await self._in_turn(message["id"], lambda: self._workbench.handle(finding))
+        await self._in_turn(message["id"], lambda: self._workbench.handle(message["finding"]))
 
     async def _shown(self, message: types.Shown) -> None:
         """Let the run continue: the page has drawn its first frame."""

@@ -6,14 +6,12 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from bevviz.config import Config, Parameter, parameters, values
 from bevviz.errors import UserError
 from bevviz.model.frame import Boxes3D
-from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer
 from bevviz.why.answer_results import AnswerResult
@@ -21,9 +19,7 @@ from bevviz.why.kept_labels import box_of
 from bevviz.workbench.page_types import (
     Chip,
     Control,
-    HandledEntry,
     LabelBox,
-    NoteEntry,
     OtherObject,
     RowRemark,
 )
@@ -62,12 +58,6 @@ def row_remark(answer: Answer) -> RowRemark:
     return {"remark": answer.remark, "chip": chip, "text": answer.verdict.kind.value}
 
 
-def note_entry(note: Note) -> NoteEntry:
-    """Return a note for the page, whose times are text."""
-    times = {"stamp": str(note.stamp), "received": str(note.received), "end": str(note.end)}
-    return cast("NoteEntry", asdict(note) | times)
-
-
 def label_box(label: str, box: Boxes3D) -> LabelBox:
     """Return a label for the page."""
     center, size = ([round(value, 2) for value in row[0].tolist()] for row in (box.center, box.size))
@@ -84,19 +74,6 @@ def label_of_page(box: LabelBox) -> tuple[str, Boxes3D]:
     if not label or len(values) != 7 or not all(map(math.isfinite, values)) or min(box["size"]) <= 0:
         raise UserError("a label has a class, a centre of 3 numbers, a size of 3 above 0, and a yaw")
     return label, box_of(values)
-
-
-def handled_entry(finding: HandledFinding) -> HandledEntry:
-    """Return a finding that the user has dealt with, for the page. Its time is text."""
-    return cast("HandledEntry", asdict(finding) | {"stamp": str(finding.stamp)})
-
-
-def handled_finding(entry: HandledEntry) -> HandledFinding:
-    """Return the finding that a message of the page says is done or ignored."""
-    what, name, pick, distance = entry["what"], entry["name"], entry["pick"], entry["distance"]
-    return HandledFinding(
-        int(entry["stamp"]), what, name, pick, distance, entry["state"], entry["text"].strip()
-    )
 
 
 def opened_values(config: Config) -> str:
@@ -128,17 +105,13 @@ def controls(config: Config, opened: Config | None = None) -> list[Control]:
 
 def _control(declared: Parameter, value: Any) -> Control:
     """Return the control of one parameter as JSON for the page."""
-    control: Control = {
+    return {
         "key": declared.key,
         "value": value,
         "unit": declared.unit,
         "about": declared.text,
         "kind": declared.kind,
+        "low": declared.low,
+        "high": declared.high,
+        "choices": list(declared.choices) if declared.kind in ("choice", "list") else [],
     }
-    if declared.low is not None:
-        control["low"] = declared.low
-    if declared.high is not None:
-        control["high"] = declared.high
-    if declared.choices and declared.kind in ("choice", "list"):
-        control["choices"] = list(declared.choices)
-    return control

@@ -14,6 +14,7 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 
 from bevviz.config.parameters import Kind
 from bevviz.findings.finding_list import Entry
+from bevviz.pipeline.notes import HandledFinding, Note
 from bevviz.support.json_form import json_form
 from bevviz.why.answer_results import AnswerResult, HintResult
 from bevviz.why.robot_questions import RobotSteps
@@ -41,9 +42,9 @@ class Control(TypedDict):
     unit: str
     about: str
     kind: Kind
-    low: NotRequired[float]
-    high: NotRequired[float]
-    choices: NotRequired[list[str]]
+    low: float | None
+    high: float | None
+    choices: list[str]
 
 
 class LabelBox(TypedDict):
@@ -53,32 +54,6 @@ class LabelBox(TypedDict):
     center: list[float]
     size: list[float]
     yaw: float
-
-
-class HandledEntry(TypedDict):
-    """A finding that the user has dealt with."""
-
-    stamp: str
-    what: str
-    name: str
-    pick: str
-    distance: float | None
-    state: str
-    text: str
-
-
-class NoteEntry(TypedDict):
-    """A note of the user."""
-
-    stamp: str
-    received: str
-    text: str
-    about: str
-    pick: str
-    end: str
-    label: str
-    box: list[float]
-    points_frame: str
 
 
 # --- messages to the page ----------------------------------------------------------------------
@@ -116,8 +91,8 @@ class Notes(TypedDict):
     """All notes, and all findings that the user has dealt with."""
 
     type: Literal["notes"]
-    notes: list[NoteEntry]
-    findings: list[HandledEntry]
+    notes: list[Note]
+    findings: list[HandledFinding]
     error: str
 
 
@@ -292,11 +267,12 @@ class Cancel(TypedDict):
     what: Literal["try", "drive", "fix", "report"]
 
 
-class Handle(HandledEntry):
+class Handle(TypedDict):
     """A finding is done or ignored. With an empty state it is open again."""
 
     type: Literal["handle"]
     id: int
+    finding: HandledFinding
 
 
 Remarks = TypedDict("Remarks", {"type": Literal["remarks"], "id": int, "rows": list[Row]})

@@ -185,10 +185,10 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """List the findings of single frames all over the drive."""
         self._overview = NumberedFrames(self.again, overview_order(len(self.again.scans)))
         processor = SingleFrames(self.drive.session)
-        run(self._overview, processor, [_OverviewObserver(self)], stop=self._stop)
+        run(self._overview, processor, [self], stop=self._stop)
         self._overview, self._done = None, 0
 
-    def observe_single(self, result: FrameResult) -> None:
+    def _observe_single(self, result: FrameResult) -> None:
         """List the findings of a frame of the overview. Then wait while a question is being answered.
 
         Missed objects get no reason yet: it would take several times as long as the frame itself. The remark
@@ -207,6 +207,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     def observe(self, result: FrameResult) -> None:
         """Record the next frame of the run. Then wait while a question is being answered."""
+        if self._overview is not None:
+            self._observe_single(result)
+            return
         frame = result.frame
         findings = find_findings(self.explainer(result))
         if self.recording.on_demand:
@@ -448,17 +451,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             attempt.logger.flush()
             attempt.overlay.add_tried(attempt)
         return before, after
-
-
-class _OverviewObserver(Observer[FrameResult]):
-    """Observer of the overview."""
-
-    def __init__(self, drive: RecordedDrive) -> None:
-        self._drive = drive
-
-    def observe(self, result: FrameResult) -> None:
-        """Pass the result on."""
-        self._drive.observe_single(result)
 
 
 class DriveReader(BufferReader):

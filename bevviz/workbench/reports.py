@@ -13,7 +13,8 @@ from bevviz.bags.remote import beside
 from bevviz.config import Config
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
-from bevviz.workbench.jobs import Job, Jobs, job_form
+from bevviz.support.json_form import message_form
+from bevviz.workbench.jobs import Job, Jobs
 
 if TYPE_CHECKING:
     from bevviz.report.make import ReportRequest
@@ -30,7 +31,7 @@ class ReportFile:
     megabytes: float
 
 
-@job_form
+@message_form
 @dataclass(slots=True)
 class ReportJob(Job):
     """A finished report, or the one in progress. ``settings`` are the tried values that it tells of.

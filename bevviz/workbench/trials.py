@@ -24,11 +24,11 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session, check_same_frames
-from bevviz.support.json_form import LEFT_OUT
+from bevviz.support.json_form import LEFT_OUT, message_form
 from bevviz.why import FrameExplainer, Selection
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.growing_drive import Settings, Span
-from bevviz.workbench.jobs import Job, Jobs, job_form
+from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.overview import NumberedFrames
 from bevviz.workbench.recorded_drive import RecordedDrive
 
@@ -52,7 +52,7 @@ class TriedEffects(TypedDict):
     f1: NotRequired[BeforeAfter]
 
 
-@job_form
+@message_form
 @dataclass(slots=True)
 class Trial(Job):
     """A run over the drive with other values, and its effect on each frame.

@@ -9,7 +9,7 @@ const REMARKED = 10; // rows whose hint is searched without a click
 const PAUSE = 200; // ms between two updates of the page
 const DOTS = 3; // most reasons of a severity
 
-/** @import { Entries, HandledEntry, NoteEntry, Notes, Origin, Remark, Row, Span } from "./types" */
+/** @import { Entries, HandledFinding, Note, Notes, Origin, Remark, Row, Span } from "./types" */
 /** @import { Finding, RowSight } from "./triage.js" */
 
 /**
@@ -22,14 +22,14 @@ const DOTS = 3; // most reasons of a severity
  * @property {(span: Span) => void} markSpan
  * @property {(rows: Finding[]) => void} drawn
  * @property {(rows: Row[]) => void} [remarks]
- * @property {(finding: HandledEntry) => void} [handle]
- * @property {(note: NoteEntry) => void} unnote
+ * @property {(finding: HandledFinding) => void} [handle]
+ * @property {(note: Note) => void} unnote
  */
 
 /** @type {Map<number | string, Finding>} */
 const entries = new Map(); // findings by number, notes by stamp and text
 const hidden = new Set(["handled"]); // kinds that the user has switched off
-/** @type {HandledEntry[]} */
+/** @type {HandledFinding[]} */
 let handled = []; // findings that the user has marked as done or ignored
 /** @type {Finding[]} */
 let rows = []; // findings in the table, in order
@@ -139,7 +139,7 @@ const here = (/** @type {Finding} */ entry) => entry.sights.findIndex((one) => M
 const kindOf = (/** @type {Finding} */ entry) => (entry.handled ? "handled" : entry.what);
 
 // A mark belongs to the finding that has its object at its frame.
-const marks = (/** @type {Finding} */ entry) => (/** @type {HandledEntry} */ mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
+const marks = (/** @type {Finding} */ entry) => (/** @type {HandledFinding} */ mark) => mark.what === entry.what && mark.name === entry.name && entry.sights.some((one) => (
   one.stamp === mark.stamp && one.pick === mark.pick && Math.abs((one.distance ?? 0) - (mark.distance ?? 0)) < 0.5));
 
 let waiting = 0;
@@ -306,7 +306,7 @@ function small(text, meaning, action) {
 function mark(entry, became, text = "") {
   const one = entry.sights[entry.best];
   const known = entry.handled ?? { stamp: one.stamp, what: entry.what, name: entry.name, pick: one.pick, distance: one.distance };
-  does.handle?.({ ...known, state: became, text });
+  does.handle?.({ ...known, state: became, text: text.trim() });
 }
 
 function save() {

@@ -59,13 +59,13 @@ export const frameTimes = () => frames.map(({ time }) => time); // sorted
 frameTimes.stamp = (/** @type {number} */ row) => frames[row].stamp;
 frameTimes.number = (/** @type {number} */ row) => frames[row].number;
 const TOLERANCE = 1000; // ns, of the times of a viewer
-const rowAt = (/** @type {string | number | null} */ time) => frames.findLastIndex((frame) => frame.time <= Number(time) + TOLERANCE);
+frameTimes.row = (/** @type {string | number | null} */ time) => frames.findLastIndex((frame) => frame.time <= Number(time) + TOLERANCE);
 // Frames come in any order: the one that is shown first, then all. So the next one in the list need not be the next frame.
 const follows = (/** @type {number} */ row, /** @type {number} */ by) => state.over || frames[row + by]?.number === frames[row]?.number + by;
 
 /** Number of the shown frame. null: the server does not have it yet. */
 export function shownFrame() {
-  const row = rowAt(state.time);
+  const row = frameTimes.row(state.time);
   const isAlone = row >= 0 && (frames[row].time < state.start || !follows(row, 1));
   const isKnown = row >= 0 && (!isAlone || Number(state.time) - frames[row].time <= TOLERANCE);
   return isKnown ? frames[row].number : null;
@@ -76,7 +76,7 @@ export function shownFrame() {
  * @param {number} by
  */
 export function neighbour(by) {
-  const row = rowAt(state.time);
+  const row = frameTimes.row(state.time);
   return shownFrame() !== null && follows(row, by) ? frames[row + by]?.stamp ?? null : null;
 }
 
@@ -121,7 +121,7 @@ export const seconds = (/** @type {string | number | null} */ stamp) => (
  * @param {string | null} stamp
  * @param {number | null} [frame]
  */
-export const at = (stamp, frame) => (state.single ? `frame ${frame ?? frames[rowAt(stamp)]?.number}` : seconds(stamp));
+export const at = (stamp, frame) => (state.single ? `frame ${frame ?? frames[frameTimes.row(stamp)]?.number}` : seconds(stamp));
 
 // Whether a stamp is in the marked span. Without one, all are.
 export const inSpan = (/** @type {string | number | null} */ stamp) => !state.span

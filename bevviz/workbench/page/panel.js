@@ -493,21 +493,20 @@ onViewer({
 
 // --- keys and buttons ---------------------------------------------------------------------------
 
-function undo() {
-  const before = state.undo.pop();
-  if (!before) return;
-  state.redo.push(state.set);
-  state.set = before;
-  changed();
-}
-
-function redo() {
-  const next = state.redo.pop();
+/**
+ * Go to the newest values of one list, and keep the present ones in the other.
+ * @param {string[][]} from
+ * @param {string[][]} to
+ */
+function restore(from, to) {
+  const next = from.pop();
   if (!next) return;
-  state.undo.push(state.set);
+  to.push(state.set);
   state.set = next;
   changed();
 }
+const undo = () => restore(state.undo, state.redo);
+const redo = () => restore(state.redo, state.undo);
 
 // Back and Forward of the browser walk through the subjects.
 window.addEventListener("popstate", (event) => {
@@ -569,7 +568,7 @@ function markHere(isEnd) {
   const times = frameTimes();
   if (kind === "live" || times.length < 2) return;
   const { first, last } = state.span ?? { first: frameTimes.stamp(0), last: frameTimes.stamp(times.length - 1) };
-  const here = frameTimes.stamp(Math.max(0, times.findLastIndex((one) => one <= Number(state.time) + 1000)));
+  const here = frameTimes.stamp(Math.max(0, frameTimes.row(state.time)));
   if (isEnd) markSpan({ first: Number(first) <= Number(here) ? first : here, last: here });
   else markSpan({ first: here, last: Number(last) >= Number(here) ? last : here });
 }
@@ -635,7 +634,7 @@ if (kind === "live") {
 /** @type {Pick<import("./findings.js").Actions, "remarks" | "handle">} */
 const ofDrive = kind === "live" ? {} : {
   remarks: (rows) => send({ type: "remarks", rows }),
-  handle: (finding) => send({ type: "handle", ...finding }),
+  handle: (finding) => send({ type: "handle", finding }),
 };
 list.start({
   ask, tryOut, forget, markSpan, drawn: timeline.show, triedSet: () => jobs.settings() ?? [], ...ofDrive,

@@ -75,8 +75,8 @@ function stage(name, changes) {
 function control(one, changes) {
   const label = element("label", "", one.key);
   const value = changes.get(one.key) ?? (one.value ?? "");
-  const low = one.low === undefined ? "" : `from ${one.low}`;
-  const high = one.high === undefined ? "" : `up to ${one.high}`;
+  const low = one.low === null ? "" : `from ${one.low}`;
+  const high = one.high === null ? "" : `up to ${one.high}`;
   const about = element("small", "", [one.about, one.unit, `${low} ${high}`.trim(), `opened with ${text(one.value ?? "nothing")}`]
     .filter(Boolean).join("; "));
   const set = (/** @type {string} */ written) => change([`${one.key}=${written === "" ? "null" : written}`]);
@@ -113,7 +113,7 @@ function field(value, set) {
  * @param {Write} set
  */
 function choice(one, value, set) {
-  const input = element("select", "", "", ...(one.choices ?? []).map((name) => new Option(name, name, false, name === value)));
+  const input = element("select", "", "", ...one.choices.map((name) => new Option(name, name, false, name === value)));
   input.onchange = () => set(input.value);
   return input;
 }
@@ -162,7 +162,7 @@ function list(one, value, set) {
   const items = typeof value === "string" ? parsed(value) : [...value];
   const write = (/** @type {string[]} */ next) => set(JSON.stringify(next));
   const { choices } = one;
-  if (choices) {
+  if (choices.length) {
     return element("span", "items", "", ...choices.map((name) => {
       const box = onOff(items.includes(name), () => write(choices.filter((other) => (other === name ? box.checked : items.includes(other)))));
       return element("label", "", "", box, ` ${name}`);

@@ -44,12 +44,10 @@ function range() {
   return [rows[0] ?? 0, rows.at(-1) ?? 0];
 }
 
-const rowAt = (/** @type {string | number | null} */ stamp) => frameTimes().findLastIndex((one) => one <= Number(stamp) + 1000);
-
 export function toggle() {
   if (timer) { pause(); return; }
   const [first, last] = range();
-  const row = rowAt(state.time);
+  const row = frameTimes.row(state.time);
   if (frameTimes().length < 2) return;
   go(row < first || row >= last ? first : row);
   timer = setTimeout(tick, AGAIN);
@@ -95,7 +93,7 @@ function tick() {
   if (state.time !== shown) { pause(); return; } // The user has gone elsewhere.
   timer = setTimeout(tick, AGAIN);
   const [first, last] = range();
-  const row = rowAt(shown);
+  const row = frameTimes.row(shown);
   if (!isThere()) return;
   if (row >= last) {
     if (loops) go(first);
@@ -103,7 +101,7 @@ function tick() {
     return;
   }
   const due = begun.stamp + (performance.now() - begun.wall) * 1e6 * Number($("speed").value);
-  const next = Math.min(rowAt(due), last);
+  const next = Math.min(frameTimes.row(due), last);
   if (next <= row) return;
   shown = frameTimes.stamp(next);
   seek(shown);

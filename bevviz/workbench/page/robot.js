@@ -43,7 +43,7 @@ export function progress({ held = [], problems = [] }) {
   $("past").disabled = times.length < 2;
   if (sliding || times.length < 2) return;
   const at = time ?? newest ?? 0;
-  const row = times.findLastIndex((one) => one <= at + 1000);
+  const row = frameTimes.row(at);
   const shown = times[row] < state.start && at > times[row] + 1000 ? -1 : row;
   $("past").max = String(times.length - 1);
   $("past").value = String(Math.max(shown, 0));

@@ -2,7 +2,7 @@
 
 import { seconds } from "./page_state.js";
 
-/** @import { Entry, HandledEntry, NoteEntry, Remark, Sight } from "./types" */
+/** @import { Entry, HandledFinding, Note, Remark, Sight } from "./types" */
 /** @typedef {Omit<Sight, "frame"> & { frame: number | null, chip?: Remark["chip"] }} RowSight a frame of a row */
 
 /**
@@ -15,8 +15,8 @@ import { seconds } from "./page_state.js";
  * @property {number[]} rank key of the order, by the server
  * @property {RowSight[]} sights
  * @property {number} best index of the sight that the row shows
- * @property {HandledEntry | null} handled
- * @property {NoteEntry} [note]
+ * @property {HandledFinding | null} handled
+ * @property {Note} [note]
  */
 /** @typedef {{ words: string, class: string, reason: string, within: string }} Filters empty: all */
 
