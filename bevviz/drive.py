@@ -331,9 +331,10 @@ class Drive(Closable, Tabular):
         """
         from bevviz.evaluate.evaluation import Evaluation
         from bevviz.evaluate.ground_truth import truth_in
-        from bevviz.why.false_objects import false_causes
+        from bevviz.why import RunExplainer
 
-        evaluation = Evaluation(truth_in(self.frames, truth, _path(kitti_labels)), false_causes)
+        truths = truth_in(self.frames, truth, _path(kitti_labels))
+        evaluation = Evaluation(truths, RunExplainer().false_causes)
         self.run([evaluation])
         return evaluation
 

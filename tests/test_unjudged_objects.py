@@ -19,7 +19,8 @@ from bevviz.model.results import Detections, FrameResult
 from bevviz.pipeline.perceive import add_explanations, perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why import FrameExplainer, Selection
-from bevviz.why.false_objects import false_causes
+from bevviz.why.false_objects import false_reasons
+from bevviz.why.frame_index import FrameIndex
 
 MISC = (804.79, 167.34, 995.43, 327.94)  # image box of the label of frame 2
 REGION = (5.0, 229.89, 214.12, 367.61)  # image box of a DontCare region of frame 3
@@ -64,7 +65,7 @@ def test_what_kitti_does_not_judge_is_not_false(
     truth = truth_in(result)
     matches = judge(result.objects, truth, result.cameras)
     assert not matches.false.any() and not matches.true.any()
-    assert not false_causes(result)
+    assert not false_reasons(FrameIndex(result))
     explainer = FrameExplainer(result)
     assert not [finding for finding in find_findings(explainer) if finding.what == "false"]
     (answer,) = explainer.ask(Selection(object=0))
@@ -103,7 +104,7 @@ def test_a_second_box_in_a_labelled_car_is_called_so(shared: Path) -> None:
         seen=None,
     )
     result = replace(result, objects=twice)
-    (row,) = false_causes(result)
+    (row,) = false_reasons(FrameIndex(result))
     assert row == 1
     (answer,) = FrameExplainer(result).ask(Selection(object=1))
     assert answer.verdict.kind is ReasonKind.DUPLICATE

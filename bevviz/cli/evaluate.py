@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from bevviz.model.protocols import Observer
     from bevviz.model.results import FrameResult
     from bevviz.pipeline.session import Session
+    from bevviz.why import RunExplainer
 
 
 DESCRIPTION = """Hold the results to what is really there: precision and recall by class and range, average
@@ -79,16 +80,18 @@ def _evaluate(options: EvaluateOptions) -> int:
     from bevviz.evaluate.ground_truth import truth_in
     from bevviz.evaluate.metrics import parse_limits
     from bevviz.pipeline.session import Session
-    from bevviz.why.false_objects import false_causes
+    from bevviz.why import RunExplainer
 
     truth, limits = options.truth, parse_limits(options.limits.min, options.limits.max)
     config = load_config(options)
     with open_bag(options.drive, options.frames, config) as frames:
-        evaluation = Evaluation(truth_in(frames, truth.truth, truth.kitti_labels), false_causes)
+        lookup = truth_in(frames, truth.truth, truth.kitti_labels)
         if not any(limit.metric.startswith(("ground", "object_points")) for limit in limits):
             _check_detector(config)
-        with Session(config) as session:
-            status = _run(frames, session, evaluation, options)
+        with Session(config, draws=bool(options.output)) as session:
+            explainer = RunExplainer(session.loader, session.stages.class_names)
+            evaluation = Evaluation(lookup, explainer.false_causes)
+            status = _run(frames, session, evaluation, explainer, options)
         if not evaluation.judged:
             raise UserError(
                 f"{options.drive.paths[0]}: there is truth for none of the {evaluation.without} frames"
@@ -107,7 +110,13 @@ def _check_detector(config: Config) -> None:
         )
 
 
-def _run(frames: BagSource, session: Session, evaluation: Evaluation, options: EvaluateOptions) -> int:
+def _run(
+    frames: BagSource,
+    session: Session,
+    evaluation: Evaluation,
+    explainer: RunExplainer,
+    options: EvaluateOptions,
+) -> int:
     """Run the pipeline with an evaluation and return the exit status.
 
     The table is printed before a recording is served.
@@ -121,7 +130,7 @@ def _run(frames: BagSource, session: Session, evaluation: Evaluation, options: E
     config, failures, outputs = session.config, FailureSummary(), options.output
     # The workbench takes stated labels for the frames' own. This run has them apart.
     truth = options.truth
-    keeper = None if truth.truth or truth.kitti_labels else list_keeper(frames, session)
+    keeper = None if truth.truth or truth.kitti_labels else list_keeper(frames, session, explainer)
     checks = InputChecks(frames, config)
     judges: list[Observer[FrameResult]] = [evaluation, failures, checks]
     if keeper is not None:
@@ -136,7 +145,7 @@ def _run(frames: BagSource, session: Session, evaluation: Evaluation, options: E
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
         print_hints(frames.scene, config)
         recorder = Recorder(recording, config, session.stages.provider)
-        marks = MarkRecorder(recording, evaluation.last_truth)
+        marks = MarkRecorder(recording, explainer)
         return [recorder, *judges, EvaluationRecorder(recording, evaluation), marks]
 
     def finish() -> None:

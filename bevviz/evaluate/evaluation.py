@@ -34,7 +34,7 @@ OBJECT_LABELS = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 99, *range(252, 260))
 UNLABELLED = (0, 1)
 
 Row = tuple[str, ...]
-CauseLookup: TypeAlias = "Callable[[FrameResult, Truth], Mapping[int, Reason]]"
+CauseLookup: TypeAlias = "Callable[[FrameResult, Truth, Matches], Mapping[int, Reason]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +117,7 @@ class Evaluation(Observer[FrameResult], Tabular):
         objects = result.objects or Objects.empty()
         matches = self._score.add(objects, truth, result.cameras)
         self.last = result, truth, matches
-        asked = self._causes is not None and matches.false.any()
-        self.causes = self._causes(result, truth) if self._causes is not None and asked else {}
+        self.causes = {} if self._causes is None else self._causes(result, truth, matches)
         self.false_causes.update(cause.kind.value for cause in self.causes.values())
         self.judged.append(_outcome(result.frame, objects, truth, matches, self.causes))
         self._store_positions(objects, truth, matches)
@@ -140,10 +139,6 @@ class Evaluation(Observer[FrameResult], Tabular):
             self._rows.append(("missed", truth.labels[row].lower(), float(truth.boxes.distance[row])))
         for j in np.flatnonzero(matches.false).tolist():
             self._rows.append(("false", objects.names[j].lower(), float(objects.boxes.distance[j])))
-
-    def last_truth(self, frame: Frame) -> Truth | None:
-        """Return the ground truth of the last frame, for observers that see it later; None: it has none."""
-        return None if self.last is None or self.last[0].frame is not frame else self.last[1]
 
     # --- numbers -------------------------------------------------------------------------------
 

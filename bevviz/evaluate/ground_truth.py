@@ -168,7 +168,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"
         for k in np.flatnonzero((boxes.size <= 0).any(axis=1)).tolist()
     ]
-    rules = {label: rule_of(label, frame.label_names) for label in labelled.labels}
+    rules = {label: rule_of(label, frame.label_names) for label in {*labelled.labels}}
     camera = next((camera for camera in frame.cameras if _can_see(camera)), None)
     return Truth(
         boxes,
@@ -189,7 +189,7 @@ def must_be_found(frame: Frame, boxes: Boxes3D, labels: Sequence[str]) -> Bool:
     Its centre lies within 40 m, and in the image of some camera if there is one, and its box holds 10 LiDAR
     points or more. Its label is of a type that detectors know, and no second label of one object.
     """
-    rules = {label: rule_of(label, frame.label_names) for label in labels}
+    rules = {label: rule_of(label, frame.label_names) for label in {*labels}}
     wanted = np.array([rules[label].judged for label in labels], bool)
     must = np.asarray((boxes.distance <= RANGE) & _in_view(frame, boxes) & wanted, bool)
     rows_of: dict[str, list[int]] = {}  # by label in lower case

@@ -207,10 +207,9 @@ def match(objects: Objects, truth: Truth) -> tuple[I32, F64]:
 
 def accepts(truth: Truth, names: list[str]) -> Bool:
     """Return (J, K) whether a name is accepted for a labelled box."""
-    accepted = np.array(
-        [[name.lower() in names_of_label for names_of_label in truth.accepted] for name in names], bool
-    )
-    return accepted.reshape(len(names), len(truth.accepted))
+    lower = [name.lower() for name in names]
+    rows = {name: [name in accepted for accepted in truth.accepted] for name in {*lower}}
+    return np.array([rows[name] for name in lower], bool).reshape(len(names), len(truth.accepted))
 
 
 def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], np.dtype[np.int32]], Bool]:

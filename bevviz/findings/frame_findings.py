@@ -21,7 +21,9 @@ from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.collect import center_of, ground_distance
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex, detection_subject
+from bevviz.why.resolve import object_subject
 from bevviz.why.subject import single_box
+from bevviz.why.verdict import Verdict
 
 # Size of a cluster that may be a person, a bicycle or a car: longer side, shorter side and height in metres,
 # and least number of points. Other clusters without a detection are nothing that a detector should know.
@@ -146,19 +148,26 @@ def _explained(finding: Finding, explainer: FrameExplainer, *, restore: bool) ->
         assert finding.shape is not None
         x, y, z = finding.shape.center[0].tolist()
         return _at(frame, finding, (x, y, z))
+    if finding.selection.object is not None:
+        subject = object_subject(explainer.traces, finding.selection.object)
+        if (verdict := explainer.false_verdict(subject)) is not None:
+            center, points = center_of(subject, explainer.traces.result, -1), explainer.traces.place(subject)
+            distance = ground_distance(center, frame.points[points])
+            return _with_verdict(frame, finding, verdict, distance, len(points), center)
     return _with_answer(frame, finding, explainer.about(finding.selection))
 
 
 def _with_answer(frame: Frame, finding: Finding, answer: Answer) -> Finding:
-    verdict = answer.verdict
+    return _with_verdict(frame, finding, answer.verdict, answer.distance, answer.points, answer.center)
+
+
+def _with_verdict(
+    frame: Frame, finding: Finding, verdict: Verdict, distance: float, points: int, center: Position | None
+) -> Finding:
     explained = replace(
-        finding,
-        distance=answer.distance,
-        reason=verdict.kind.value,
-        text=verdict.text,
-        points=answer.points,
+        finding, distance=distance, reason=verdict.kind.value, text=verdict.text, points=points
     )
-    return explained if answer.center is None else _at(frame, explained, answer.center)
+    return explained if center is None else _at(frame, explained, center)
 
 
 def _at(frame: Frame, finding: Finding, center: Position) -> Finding:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.frame_findings import Finding, findings_of
 from bevviz.model import geometry
 from bevviz.model.frame import F32
@@ -16,7 +15,7 @@ from bevviz.model.results import FrameResult
 from bevviz.recording.addresses import Address
 from bevviz.recording.marks import Mark, MarkState, log_marks
 from bevviz.recording.writer import Writer
-from bevviz.why.frame_index import FrameIndex
+from bevviz.why import RunExplainer
 
 NEAR, UNMATCHED_DEPTH = 0.5, 20.0  # metres to both ends of the frustum of a detection without an object
 STATES: Mapping[str, MarkState] = {  # kind -> state that it is drawn as
@@ -35,16 +34,15 @@ class MarkRecorder(Observer[FrameResult]):
 
     Args:
         recording: target, which also has the frames.
-        truth: returns the ground truth of a frame. None: its own.
+        explainer: explainer of the run, which other observers share.
     """
 
-    def __init__(self, recording: rr.RecordingStream, truth: TruthLookup | None = None) -> None:
-        self._writer, self._truth = Writer(recording), truth
+    def __init__(self, recording: rr.RecordingStream, explainer: RunExplainer | None = None) -> None:
+        self._writer, self._explainer = Writer(recording), explainer or RunExplainer()
 
     def observe(self, result: FrameResult) -> None:
         """Log the marks of a frame."""
-        truth = None if self._truth is None else self._truth(result.frame)
-        self.log(result, findings_of(FrameIndex(result, truth=truth)))
+        self.log(result, findings_of(self._explainer.of(result).traces))
 
     def log(self, result: FrameResult, findings: Sequence[Finding]) -> None:
         """Log the marks of findings that are known already."""

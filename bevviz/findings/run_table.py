@@ -23,7 +23,7 @@ from bevviz.pipeline.session import Session
 from bevviz.recording.provenance import model_path, versions
 from bevviz.support.files import file_hash
 from bevviz.support.onnx_files import with_weights
-from bevviz.why import FrameExplainer
+from bevviz.why import RunExplainer
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,19 +91,18 @@ class ListKeeper(Observer[FrameResult]):
 
     Args:
         table: place of the list.
-        session: session of the run.
+        explainer: explainer of the run.
         scans: number of scans of the drive. The list of a run over fewer is not kept.
     """
 
-    def __init__(self, table: RunTable, session: Session, scans: int) -> None:
-        self._table, self._session, self._scans = table, session, scans
+    def __init__(self, table: RunTable, explainer: RunExplainer, scans: int) -> None:
+        self._table, self._explainer, self._scans = table, explainer, scans
         self._list = FindingList()
         self._frames: list[tuple[int, int]] = []
 
     def observe(self, result: FrameResult) -> None:
         """List the findings of a frame."""
-        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names)
-        self.add(result.frame, find_findings(explainer, restore=False))
+        self.add(result.frame, find_findings(self._explainer.of(result), restore=False))
 
     def add(self, frame: Frame, findings: Iterable[Finding]) -> None:
         """List the findings of a frame."""
@@ -117,12 +116,15 @@ class ListKeeper(Observer[FrameResult]):
             self._table.save(StoredRun(groups, sorted(self._frames)))
 
 
-def list_keeper(source: BagSource, session: Session, config: Config | None = None) -> ListKeeper | None:
+def list_keeper(
+    source: BagSource, session: Session, explainer: RunExplainer, config: Config | None = None
+) -> ListKeeper | None:
     """Return an observer that keeps the list of a run. None: the run leaves scans out, or no list is kept.
 
     Args:
         source: frames of the run.
         session: session of the run.
+        explainer: explainer of the run.
         config: configuration as the user gave it. None: that of the session.
     """
     if len(source.numbers) != len(source.scans):
@@ -130,7 +132,7 @@ def list_keeper(source: BagSource, session: Session, config: Config | None = Non
     files = [file.path for file in source.recording.files]
     config = config or session.config
     table = run_table(files, config, session.stages.provider, (None, None)) if files else None
-    return None if table is None else ListKeeper(table, session, len(source.scans))
+    return None if table is None else ListKeeper(table, explainer, len(source.scans))
 
 
 def run_table(

@@ -36,6 +36,7 @@ class Session(Closable):
         memo: results shared by sessions that run on the same frames. The maker of the frames clears it.
         odometry: estimator of the motion, shared by sessions that run on the same frames.
         sensors: watch of the sensors, shared by sessions that run on the same frames.
+        draws: whether results have a bird's-eye view.
 
     Raises:
         UserError: the detector's model or a user-defined function cannot be used.
@@ -52,9 +53,10 @@ class Session(Closable):
         memo: Memo | None = None,
         odometry: Odometry | None = None,
         sensors: SensorWatch | None = None,
+        draws: bool = True,
     ) -> None:
         self.loader = loader or StageLoader()
-        self._detect, self._memo = detect, memo
+        self._detect, self._memo, self._draws = detect, memo, draws
         self._in_force = config, self.loader.load(config, detect)  # Both are read and replaced together.
         self._odometry = odometry or Odometry()
         self._tracker = Tracker()
@@ -118,7 +120,7 @@ class Session(Closable):
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Add bird's-eye view, explanations and anomalies to a result of ``perceive``."""
-        return self.add_anomalies(add_explanations(result))
+        return self.add_anomalies(add_explanations(result, seen=self._draws))
 
     def add_anomalies(self, result: FrameResult) -> FrameResult:
         """Add the anomalies of the drive to the next result."""

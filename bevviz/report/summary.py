@@ -10,7 +10,8 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
 from bevviz.recording.health import FrameRates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
-from bevviz.why.false_objects import false_causes
+from bevviz.why.false_objects import false_reasons
+from bevviz.why.frame_index import FrameIndex
 
 STRIP_PICTURES = 48  # pictures of all cameras and the bird's-eye view together
 STRIP_WIDTH = 400
@@ -69,7 +70,7 @@ class WindowSummary:
             if explanation.subject != "camera"
         )
         word = "doubtful" if frame.truth is None else "false"
-        for row, reason in false_causes(result).items():
+        for row, reason in false_reasons(FrameIndex(result)).items():
             assert result.objects is not None
             states["object", result.objects.names[row], f"{word}: {reason.kind.value}"] += 1
         self.tracebacks.update(

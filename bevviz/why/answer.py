@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bevviz.evaluate import Truth
+from bevviz.evaluate import Matches, Truth
 from bevviz.model.frame import U8
-from bevviz.model.reasons import ReasonKind
+from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.why.changes import stages_of
@@ -247,6 +247,14 @@ class FrameExplainer:
         """Explain the one subject of a selection that selects a row."""
         return self._answer(select_subjects(self.traces, selection)[0])
 
+    def false_verdict(self, subject: Subject) -> Verdict | None:
+        """Return the verdict on a false object without an answer's evidence and steps, which take longer.
+
+        None: the object is not false, or labels of the user decide about it.
+        """
+        false = false_reasons(self.traces) if self._labelled is None else {}
+        return make_verdict(subject, false[subject.row], reported=True) if subject.row in false else None
+
     def missed(self) -> list[Answer]:
         """Explain the objects that should have been reported and were not, the nearest first."""
         answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported]
@@ -343,6 +351,37 @@ class FrameExplainer:
         step = Step("label", f"{label.name} is kept as truth, so this answer is exact")
         subject = replace(subject, name=label.name, box=label.box)
         return replace(exact, subject=subject, steps=(step, *exact.steps), label=row)
+
+
+class RunExplainer:
+    """Explainer of the frames of a run. The observers of a frame share its ``FrameExplainer``.
+
+    Args:
+        loader: as in ``FrameExplainer``.
+        classes: as in ``FrameExplainer``.
+    """
+
+    def __init__(self, loader: StageLoader | None = None, classes: Sequence[str] = ()) -> None:
+        self._loader, self._classes = loader, classes
+        self._last: FrameExplainer | None = None
+
+    def of(self, result: FrameResult, truth: Truth | None = None) -> FrameExplainer:
+        """Return the explainer of a frame.
+
+        Args:
+            result: result of the frame.
+            truth: its ground truth; None: that of the first call for the frame, or the frame's own.
+        """
+        if self._last is None or self._last.traces.result is not result:
+            self._last = FrameExplainer(result, self._loader, self._classes, truth)
+        return self._last
+
+    def false_causes(self, result: FrameResult, truth: Truth, matches: Matches) -> Mapping[int, Reason]:
+        """Return the causes of the false objects of a frame by row, for an ``Evaluation``."""
+        traces = self.of(result, truth).traces
+        if result.objects is not None:
+            traces.matches = matches
+        return false_reasons(traces) if matches.false.any() else {}
 
 
 def why(

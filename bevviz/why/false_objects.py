@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.evaluate import MAX_DISTANCE, Truth
+from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model import box_overlap, geometry
 from bevviz.model.reasons import Reason, ReasonKind, scored
-from bevviz.model.results import Decision, FrameResult, Objects
+from bevviz.model.results import Decision, Objects
 from bevviz.why.evidence import MOST, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex, detection_subject
-from bevviz.why.subject import points_in_box, single_box
+from bevviz.why.subject import MARGIN, points_in_box, single_box
 from bevviz.why.subject_matches import opinion_on
 
 LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
@@ -21,16 +21,6 @@ BARELY = 2.0  # factor on a limit of the fusion within which it accepts an objec
 DOUBLE = 0.1  # IoU from above from which two objects are one
 INSIDE = 0.6  # share of an object's box in a labelled one from which it is a part of that object
 DEPTH = 3.0  # metres that an object may be nearer than the points in the middle of its 2D box
-
-
-def false_causes(result: FrameResult, truth: Truth | None = None) -> Mapping[int, Reason]:
-    """Return object row -> cause, for the false objects of a result.
-
-    Args:
-        result: result of the frame.
-        truth: ground truth of the frame; None: its own.
-    """
-    return false_reasons(FrameIndex(result, truth=truth))
 
 
 def false_reasons(traces: FrameIndex) -> Mapping[int, Reason]:
@@ -124,12 +114,15 @@ def _holder_of_points(traces: FrameIndex, objects: Objects, row: int) -> int:
     points, cluster = traces.result.frame.points, int(objects.cluster[row])
     has_cluster = cluster >= 0 and traces.origin("objects").ours
     is_own = traces.cluster == cluster if has_cluster else geometry.inside(points, objects.boxes, row)
-    points = points[is_own]
-    shares = [
-        points_in_box(subject.box, points).mean() if subject.box is not None and len(points) else 0.0
-        for subject in traces.truth
-    ]
-    return int(np.argmax(shares)) if shares and max(shares) >= MOST else -1
+    points, truth = points[is_own], traces.labels_in_evaluate
+    if truth is None or not len(points):
+        return -1
+    center, reach = truth.boxes.center[:, :2], np.hypot(*truth.boxes.size[:, :2].T)[:, None] / 2 + MARGIN
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    near = np.flatnonzero(((center + reach >= low) & (center - reach <= high)).all(axis=1)).tolist()
+    shares = {k: float(points_in_box(single_box(truth.boxes, k), points).mean()) for k in near}
+    holder = max(shares, key=lambda k: shares[k], default=-1)
+    return holder if holder >= 0 and shares[holder] >= MOST else -1
 
 
 def _label_around(traces: FrameIndex, objects: Objects, row: int) -> int:

@@ -16,9 +16,9 @@ from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
-from bevviz.stages.visibility import share_in_image
+from bevviz.stages.visibility import image_boxes, share_in_image
 from bevviz.why.detection_fits import Fits, find_fits
-from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, projected_boxes, single_box
+from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, points_in_boxes, single_box
 
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
@@ -94,7 +94,7 @@ class FrameIndex:
         other._places, other._uv, other._in_image = self._places, self._uv, self._in_image
         other._truth_boxes = self._truth_boxes
         other.truth, other.shown, other.labels_in_evaluate = self.truth, self.shown, self.labels_in_evaluate
-        other.directions = self.directions
+        other.directions, other._truth_points = self.directions, self._truth_points
         return other
 
     def with_truth(self, truth: Truth) -> FrameIndex:
@@ -203,7 +203,9 @@ class FrameIndex:
             return subject.points
         points, box = self.result.frame.points, subject.box
         if box is not None:
-            rows = self._near_truth[subject.row] if subject.kind == "truth" else _near(points, box)[0]
+            if subject.kind == "truth":
+                return self._truth_points[subject.row]
+            _, rows = _near(points, box)
             if subject.kind == "point":
                 away = np.linalg.norm(points[rows] - box.center[0], axis=1)
                 return np.asarray(rows[away < box.size[0, 0] / 2])
@@ -216,10 +218,16 @@ class FrameIndex:
         return self._foreground(camera, subject.xyxy, rows) if subject.kind == "detection" else rows
 
     @cached_property
-    def _near_truth(self) -> Sequence[I64]:
-        """Rows of the raw points near each object of the ground truth."""
-        boxes = Boxes3D.joined([subject.box for subject in self.truth if subject.box is not None])
-        return _near(self.result.frame.points, boxes)
+    def _truth_points(self) -> Sequence[I64]:
+        """Rows of the raw points of each object of the ground truth."""
+        truth, points = self.labels_in_evaluate, self.result.frame.points
+        if truth is None or not len(truth.boxes):
+            return ()
+        first, rows = _near(points, truth.boxes)
+        row = np.repeat(np.arange(len(truth.boxes)), np.diff(first))
+        is_inside = points_in_boxes(truth.boxes.chosen(row), points[rows], MARGIN, FOOT)
+        ends = np.searchsorted(row[is_inside], np.arange(1, len(truth.boxes)))
+        return np.split(rows[is_inside], ends)
 
     def _in_frustum(self, camera: CameraResult, xyxy: F32) -> I64:
         """Return the rows of the raw points that project into an image box."""
@@ -388,20 +396,21 @@ class FrameIndex:
             column = [c.camera.name for c in self.result.cameras].index(name)
             whole = np.full((len(self.truth), 4), np.nan, np.float32)
             seen = whole.copy()
-            rows = [
-                row
-                for row in np.flatnonzero(self.shown[:, column] > 0).tolist()
-                if self.truth[row].box is not None
-            ]
-            boxes = [box for row in rows if (box := self.truth[row].box) is not None]
-            for row, around in zip(rows, projected_boxes(boxes, camera.camera), strict=True):
-                if around is None:
-                    continue
-                whole[row] = around
-                uv = self.uv(camera)[self.place(self.truth[row])]
-                inside = uv[_rows_in(uv, around)]
-                if len(inside) >= FEW:
-                    seen[row] = *inside.min(0), *inside.max(0)
+            truth, shown = self.labels_in_evaluate, np.flatnonzero(self.shown[:, column] > 0)
+            if truth is not None and len(shown):
+                around = image_boxes(truth.boxes.chosen(shown), camera.camera)
+                is_whole = np.isfinite(around).all(axis=1)
+                shown = shown[is_whole]
+                whole[shown] = around[is_whole]
+                points = [self._truth_points[row] for row in shown.tolist()]
+                row = np.repeat(shown, [len(rows) for rows in points])
+                uv = self.uv(camera)[np.concatenate([*points, np.zeros(0, np.int64)])]
+                inside = _rows_in(uv, whole[row].T)
+                rows, first, count = np.unique(row[inside], return_index=True, return_counts=True)
+                if len(rows):
+                    low, high = (edge.reduceat(uv[inside], first) for edge in (np.minimum, np.maximum))
+                    enough = count >= FEW
+                    seen[rows[enough]] = np.hstack([low, high])[enough]
             self._truth_boxes[name] = whole, seen
         return self._truth_boxes[name]
 
@@ -419,21 +428,20 @@ class FrameIndex:
 
 
 def _rows_in(uv: F32, box: F32) -> I64:
-    """Return the rows of the pixels inside an image box."""
+    """Return the rows of the pixels inside an image box, or each inside its own: (4, N)."""
     u, v = uv.T
     x0, y0, x1, y1 = box
     with np.errstate(invalid="ignore"):
         return np.flatnonzero((u >= x0) & (u <= x1) & (v >= y0) & (v <= y1))
 
 
-def _near(points: F32, boxes: Boxes3D) -> Sequence[I64]:
-    """Return the ascending rows of the points that may be in each box or in the margin around it."""
+def _near(points: F32, boxes: Boxes3D) -> tuple[I64, I64]:
+    """Find the points that may be in each box or in the margin around it, see ``rows_in_rectangles``."""
     half = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2
     reach = np.column_stack([half + np.float32(MARGIN), half + np.float32(2 * MARGIN)])
     center = boxes.center[:, :2]
     low, high = (center - reach).astype(np.float64), (center + reach).astype(np.float64)
-    first, rows = rows_in_rectangles(points, low, high)
-    return np.split(rows, first[1:-1])
+    return rows_in_rectangles(points, low, high)
 
 
 def truth_subjects(truth: Truth) -> tuple[Subject, ...]:

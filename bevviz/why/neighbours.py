@@ -17,7 +17,8 @@ from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import StageLoader
 from bevviz.pipeline.stage_log import Memo
 from bevviz.why.changes import Change, with_changes
-from bevviz.why.false_objects import false_causes
+from bevviz.why.false_objects import false_reasons
+from bevviz.why.frame_index import FrameIndex
 
 FrameLookup = Callable[[], Iterable[Frame]]
 
@@ -77,4 +78,4 @@ class NeighbourRuns:
             for camera in result.cameras
             if camera.fusion is not None and camera.detections is not None
         )
-        return -unmatched - len(false_causes(result))
+        return -unmatched - len(false_reasons(FrameIndex(result)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,25 +88,20 @@ def single_box(boxes: Boxes3D, row: int) -> Boxes3D:
 
 def points_in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
     """Return (N,) which points are in one upright box, except near or below its bottom."""
-    x, y, z = (points - box.center[0]).T
-    c, s = np.cos(box.yaw[0]), np.sin(box.yaw[0])
-    half = box.size[0] / 2 + np.float32(margin)
-    inside = (np.abs(c * x + s * y) < half[0]) & (np.abs(c * y - s * x) < half[1])
-    return np.asarray(inside & (z > -box.size[0, 2] / 2 + foot) & (z < half[2]), np.bool_)
+    return points_in_boxes(box, points, margin, foot)
+
+
+def points_in_boxes(boxes: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
+    """Return (N,) which points are each in its own upright box, see ``points_in_box``."""
+    x, y, z = (points - boxes.center).T
+    c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
+    half = boxes.size.T / 2
+    reach = half + np.float32(margin)
+    inside = (np.abs(c * x + s * y) < reach[0]) & (np.abs(c * y - s * x) < reach[1])
+    return np.asarray(inside & (z > foot - half[2]) & (z < reach[2]), np.bool_)
 
 
 def projected_box(box: Boxes3D, camera: Camera) -> F32 | None:
     """Return the (4,) image box of a 3D box, cut at the image's edge; None: it is out of view."""
-    return projected_boxes([box], camera)[0]
-
-
-def projected_boxes(boxes: Sequence[Boxes3D], camera: Camera) -> list[F32 | None]:
-    """Return the image box of each single 3D box, see ``projected_box``."""
-    if not boxes:
-        return []
-    center, size, yaw = (
-        np.concatenate([getattr(box, name) for box in boxes]) for name in ("center", "size", "yaw")
-    )
-    projected = image_boxes(Boxes3D(center, size, yaw), camera)
-    is_shown = np.asarray(np.isfinite(projected).all(axis=1), np.bool_).tolist()
-    return [box if shown else None for box, shown in zip(projected, is_shown, strict=True)]
+    around = image_boxes(box, camera)[0]
+    return around if np.isfinite(around).all() else None

@@ -33,8 +33,7 @@ from bevviz.recording.sinks import open_recording
 from bevviz.report.pictures import camera_picture, crop_ahead, jpeg, shrink
 from bevviz.support.files import file_hash, unfinished_files
 from bevviz.support.text import path_text
-from bevviz.why import FrameExplainer
-from bevviz.why.false_objects import false_causes
+from bevviz.why import RunExplainer
 
 PICTURED = 12  # worst frames of a bag that have pictures in the table
 WIDTH, ABOVE = 240, 150  # pixels, width of a camera's picture and of the bird's-eye view's
@@ -95,6 +94,7 @@ def _fill(
     config = _with_threads(job.config, threads)  # used by the stages only
     evaluation: Evaluation | None = None
     with job.selection.source([job.bag], job.config) as source, Session(config) as session:
+        explainer = RunExplainer(session.loader, session.stages.class_names)
         recording.parent.mkdir(parents=True, exist_ok=True)
         with open_recording(
             source.scene,
@@ -109,13 +109,13 @@ def _fill(
                 Recorder(sinks.recording, job.config, session.stages.provider)
             ]
             if job.truth is not None or (source.scene.truth and has_detector(job.config)):
-                evaluation = Evaluation(truth_in(source, job.truth or None), false_causes)
+                evaluation = Evaluation(truth_in(source, job.truth or None), explainer.false_causes)
                 observers += [evaluation, EvaluationRecorder(sinks.recording, evaluation)]
             assert sinks.file is not None
             # The workbench takes stated labels for the frames' own.
-            keeper = None if job.truth else list_keeper(source, session, job.config)
+            keeper = None if job.truth else list_keeper(source, session, explainer, job.config)
             marks = MarkRecorder(sinks.recording)
-            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, session, marks, keeper)
+            collector = _RowCollector(job, rows, sinks.file, on_frame, evaluation, explainer, marks, keeper)
             checks = InputChecks(source, job.config)
             watchers = [*observers, checks, collector, DiskWatch(sinks)]
             if run_frames(source, session, watchers).interrupted:
@@ -154,21 +154,21 @@ class _RowCollector(Observer[FrameResult]):
         recording: Path,
         on_frame: Callable[[], None],
         evaluation: Evaluation | None,
-        session: Session,
+        explainer: RunExplainer,
         marks: MarkRecorder,
         keeper: ListKeeper | None,
     ) -> None:
-        self._session, self._marks, self._keeper = session, marks, keeper
+        self._explainer, self._marks, self._keeper = explainer, marks, keeper
         self._job, self._rows, self._recording = job, rows, recording
         self._on_frame, self._evaluation = on_frame, evaluation
         self._findings = FindingCollector()
         self._worst: list[tuple[float, int, Mapping[str, bytes]]] = []  # a heap of (badness, -row, pictures)
 
     def observe(self, result: FrameResult) -> None:
-        truth = None if self._evaluation is None else self._evaluation.last_truth(result.frame)
-        explainer = FrameExplainer(result, self._session.loader, self._session.stages.class_names, truth)
+        explainer = self._explainer.of(result)
         findings = find_findings(explainer)
-        values = row(result, findings, evaluated=truth is not None)
+        is_evaluated = self._evaluation is not None and self._evaluation.last is not None
+        values = row(result, findings, evaluated=is_evaluated)
         values[FINDINGS] = self._findings.of_frame(explainer.traces, findings)
         rank = values["badness"], -len(self._rows)
         if len(self._worst) < PICTURED or rank > self._worst[0][:2]:

@@ -221,10 +221,10 @@ class AgentTools:
         """Compare all frames with the ground truth: recall, precision, tracks, causes of false objects."""
         from bevviz.evaluate.evaluation import Evaluation
         from bevviz.evaluate.ground_truth import truth_in
-        from bevviz.why.false_objects import false_causes
+        from bevviz.why import RunExplainer
 
         asked = self._drive(drive)
-        evaluation = Evaluation(truth_in(asked.source, *asked.truth), false_causes)
+        evaluation = Evaluation(truth_in(asked.source, *asked.truth), RunExplainer().false_causes)
         asked.run(settings, [evaluation])
         tree = json_tree(evaluation.result())
         tree.pop("limits")
