@@ -17,7 +17,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
-from bevviz.model.frame import F64
+from bevviz.model.frame import F32, F64
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import Detections, FrameResult
 from tests.support.small_bags import frozen_after
@@ -250,6 +250,31 @@ def test_a_detector_without_any_candidate_is_named(results: list[FrameResult]) -
         assert "no candidate with a score of 0.01 or more in 5 of 5 images" in str(finding)
         checks.observe(replace(results[0], config=config))
         assert not [finding for finding in checks.findings if finding.kind == "detector"]
+
+
+def of_boxes(detections: Detections, boxes: F32, name: str = "") -> Detections:
+    names = (name,) * len(detections) if name else detections.names
+    return replace(detections, xyxy=boxes.astype(np.float32), names=names)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda d: of_boxes(d, d.xyxy / 640), "are smaller than two pixels: publish pixels"),
+        (lambda d: of_boxes(d, d.xyxy * 3), "reach far out of the image: publish pixels of the image"),
+        (lambda d: of_boxes(d, d.xyxy, "2"), "have a number for a class"),
+    ],
+)
+def test_boxes_that_do_not_fit_the_images_are_named(
+    results: list[FrameResult], change: Callable[[Detections], Detections], text: str
+) -> None:
+    with bevviz.simulate(1) as drive:
+        checks = InputChecks(drive.frames, load(settings=["detector.model=topic:/detections"]))
+        for result in results:
+            camera = result.cameras[0]
+            assert camera.detections is not None
+            checks.observe(replace(result, cameras=(replace(camera, detections=change(camera.detections)),)))
+    assert any(text in str(finding) for finding in checks.findings if finding.kind == "detector")
 
 
 def test_a_right_drive_has_no_finding(results: list[FrameResult]) -> None:

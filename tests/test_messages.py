@@ -793,6 +793,11 @@ def test_2d_detections_are_decoded() -> None:
     )
 
 
+def test_boxes_without_any_score_count_fully() -> None:
+    msg = array_of(detection_2d(9, 9, 4, 4, result("person", 0.0)), detection_2d(9, 9, 4, 4))
+    assert detections.decode_detections_2d(msg, "/detections", 9).scores.tolist() == [1, 1]
+
+
 def test_3d_detections_are_decoded() -> None:
     half = math.radians(15)
     msg = array_of(

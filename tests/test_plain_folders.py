@@ -366,6 +366,14 @@ def test_images_that_are_not_read_are_told(tmp_path: Path) -> None:
     assert "1 .tif file is not read: save them as PNG or JPEG" in drive_of(tmp_path, ["1"]).warnings
 
 
+@pytest.mark.parametrize("kind", ["labels/1.txt", "annotations/1.json", "ann/1.pcd.json"])
+def test_labels_of_other_tools_are_named(tmp_path: Path, kind: str) -> None:
+    (tmp_path / kind).parent.mkdir()
+    (tmp_path / kind).write_text("{}")
+    (said,) = [text for text in drive_of(tmp_path, ["1"]).warnings if "labels" in text]
+    assert said.startswith(f"{kind}, named as the scans, not read: labels of plain folders")
+
+
 @pytest.mark.parametrize(
     ("lens", "topic"),
     [

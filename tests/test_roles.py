@@ -207,6 +207,9 @@ def test_a_camera_without_calibration_plays_without() -> None:
     roles = find_roles(topics, DEFAULT)
     assert [camera.info_topic for camera in roles.cameras] == [""]
     assert roles.notes["/front/image"].endswith("without CameraInfo")
+    assert roles.camera_infos == ("/rear/camera_info",)
+    roles = find_roles([*topics, Topic("/rear/image", IMAGE, 5, "rear")], DEFAULT)
+    assert not roles.camera_infos, "the calibration of another camera is no remedy"
 
 
 def test_rectified_is_seen_in_the_name_and_can_be_stated() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from bevviz.anomalies import Onsets
 from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks.camera_views import CameraView, view_of
-from bevviz.checks.detector import silent_detector
+from bevviz.checks.detector import count_boxes, misplaced_boxes, silent_detector
 from bevviz.checks.extrinsics import wrong_extrinsics
 from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.config import Config
@@ -37,7 +37,13 @@ def sensor_faults(read: ReadInput) -> Iterator[InputFinding]:
         yield InputFinding(anomaly.kind, anomaly.subject, text)
 
 
-CHECKS: tuple[Check, ...] = (source_warnings, wrong_extrinsics, silent_detector, sensor_faults)
+CHECKS: tuple[Check, ...] = (
+    source_warnings,
+    wrong_extrinsics,
+    silent_detector,
+    misplaced_boxes,
+    sensor_faults,
+)
 
 
 class InputChecks(Observer[FrameResult]):
@@ -89,6 +95,7 @@ class InputChecks(Observer[FrameResult]):
                 if camera.detections is not None:
                     self._read.images += 1
                     self._read.answered += bool(len(camera.detections))
+                    count_boxes(self._read.boxes, camera)
                 sample = self._read.cameras.get(camera.camera.name)
                 if sample is None or _needs_more(sample.views, camera):
                     view = view_of(result, row, result.config.objects.sizes)

@@ -51,6 +51,7 @@ class ReadInput:
         cameras: sample of the images of each placed camera, by name.
         images: images that the detector judged.
         answered: those for which it had a candidate, however weak.
+        boxes: its kept boxes, and those that are odd, see ``bevviz.checks.detector``.
     """
 
     source: Items[object]
@@ -59,6 +60,7 @@ class ReadInput:
     cameras: dict[str, CameraSample] = field(default_factory=dict)
     images: int = 0
     answered: int = 0
+    boxes: Counter[str] = field(default_factory=Counter)
 
     @property
     def bag(self) -> BagSource | None:

@@ -32,6 +32,7 @@ from bevviz.datasets.dataset import (
     subfolders,
 )
 from bevviz.datasets.stamps import MAX_SENSORS, file_times, group_by_sensor, stamps_in
+from bevviz.datasets.sustech_labels import FOLDER as LABELS
 from bevviz.datasets.sustech_labels import truth_streams
 from bevviz.errors import UserError
 from bevviz.messages.images import encoded_size
@@ -178,6 +179,8 @@ class Folder(Dataset):
             streams.append(cloud_stream(f"/{name}/points", name, times, read_row, files))
             if len(lidars) == 1:
                 streams += truth_streams(self.path, name, files, times)
+        if not bare and not any(stream.topic == "/ground_truth" for stream in streams):
+            self._note_unread_labels({cloud.stem for clouds in lidars.values() for cloud in clouds}, read)
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
 
     def _with_found(
@@ -202,6 +205,18 @@ class Folder(Dataset):
             more = f" and {len(files) - 3} more" if len(files) > 3 else ""
             self.warn(f"calibrated by {first}{more}")
         return about, files
+
+    def _note_unread_labels(self, scans: set[str], read: Collection[Path]) -> None:
+        """Warn of a folder with a text file for each scan, as labels of most tools are."""
+        folders = [inner for folder in subfolders(self.path) for inner in (folder, *subfolders(folder))]
+        for folder in folders:
+            files = [f for f in files_in(folder, NOTE_SUFFIXES) if scans & {f.stem, Path(f.stem).stem}]
+            if files and not set(files) & set(read) and "calib" not in folder.name.lower():
+                more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+                self.warn(
+                    f"{files[0].relative_to(self.path)}{more}, named as the scans, not read: labels of "
+                    f"plain folders are SUSTechPOINTS' in {LABELS}/, else a data set's (docs/inputs.md)"
+                )
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
         """Return the LiDARs and the cameras: files by sensor name."""

@@ -241,10 +241,13 @@ def box_columns(
         f"{_why_unusable(rows[number].numbers)}"
         for number in np.flatnonzero(~usable).tolist()
     ]
+    scores = np.array([row.score for row in kept], np.float32)
+    if not scores.any():  # A node that publishes a box does not rate it 0: it left the score unset.
+        scores[:] = 1.0
     return BoxColumns(
         values[usable].astype(np.float64),
         tuple(row.label for row in kept),
-        np.nan_to_num(np.array([row.score for row in kept], np.float32)),
+        np.nan_to_num(scores),
         tuple(row.identity for row in kept),
         tuple(row.frame for row in kept),
         usable,

@@ -55,7 +55,7 @@ class Roles:
         truth: topic of the ground truth; empty: there is none.
         boxes: setting ``source.boxes``.
         around: topic, kind and type of the messages that are shown around perception.
-        camera_infos: all topics of CameraInfo, also unused ones.
+        camera_infos: topics of CameraInfo that no camera uses.
         no_lidar: why there is no LiDAR, and what would help; empty: there is one.
         no_camera: why there is no camera, and what would help; empty: there is one.
         robots: names of the robots, if there are several, which of them is shown, and what shows another one.
@@ -190,6 +190,7 @@ def find_roles(
         camera_role(t, name, topics, config, notes)
         for t, name in zip(images, names[len(lidars) :], strict=True)
     )
+    used_infos = {camera.info_topic for camera in cameras}
     for topic in of_kind(topics, "CameraInfo"):
         used_by = [camera.name for camera in cameras if camera.info_topic == topic.name]
         notes[topic.name] = (
@@ -242,7 +243,7 @@ def find_roles(
         robot_clouds=names_of(obstacles),
         stages=names_of(staged.values()),
         truth=truth[0].name if truth else "",
-        camera_infos=names_of(of_kind(topics, "CameraInfo")),
+        camera_infos=names_of(t for t in of_kind(topics, "CameraInfo") if t.name not in used_infos),
         no_lidar="" if lidars else _no_lidar(topics),
         no_camera="" if images else _no_camera(topics),
         robots=robots,
