@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,42 +75,7 @@ class Selected:
         return Selection(point=self.place)
 
 
-@dataclass(frozen=True, slots=True)
-class _Click:
-    """Raw event of a click."""
-
-    frame: int
-    path: str
-    instance: int | None
-    position: tuple[float, ...]
-
-
-@dataclass(slots=True)
-class _FrameTimes:
-    """Times of each frame on the timelines."""
-
-    numbers: list[int] = field(default_factory=list)
-    at: dict[str, list[int]] = field(default_factory=dict)
-
-    def add(self, result: FrameResult) -> None:
-        """Add a frame."""
-        frame = result.frame
-        self.numbers.append(frame.index)
-        for timeline, value in (
-            (entities.FRAME, frame.index),
-            (entities.STAMP, frame.stamp),
-            (entities.RECEIVED, frame.received),
-        ):
-            self.at.setdefault(timeline, []).append(value)
-
-    def number(self, timeline: str, time: float) -> int | None:
-        """Return the number of the frame that a viewer shows at this time. None: there are no frames."""
-        values = np.array(self.at.get(timeline, ()), np.float64)
-        earlier = np.flatnonzero(values <= time + entities.TIME_TOLERANCE * (timeline != entities.FRAME))
-        if not len(values):
-            return None
-        row = int(earlier[values[earlier].argmax()]) if len(earlier) else int(values.argmin())
-        return self.numbers[row]
+TIMELINES = (entities.FRAME, entities.STAMP, entities.RECEIVED)
 
 
 class NotebookViewer(Recorder):
@@ -137,18 +102,18 @@ class NotebookViewer(Recorder):
         self.config = config
         self.viewer = _viewer(recording, layout)
         self._marker = FrameLogger(recording, config, scene)
-        self._frames = _FrameTimes()
+        self._times: list[tuple[int, int, int]] = []  # of each frame on TIMELINES
         self._tracks: dict[int, Tracks] = {}
         self._rows = RowCache()
         self._timeline, self._time = entities.STAMP, 0.0
-        self._click: _Click | None = None
+        self._click: tuple[int, Any] | None = None  # shown frame, and clicked item
         self.viewer.on_event(self._on_event)
         self.viewer.display()
 
     def observe(self, result: FrameResult) -> None:
         """Log a frame and store its times and tracks."""
         super().observe(result)
-        self._frames.add(result)
+        self._times.append((result.frame.index, result.frame.stamp, result.frame.received))
         self._rows.put(result.frame.index, self.logger.rows)
         if result.tracks is not None:
             no_trail = np.zeros((len(result.tracks), 0, 3), np.float32)
@@ -157,12 +122,17 @@ class NotebookViewer(Recorder):
     @property
     def frame(self) -> int | None:
         """Number of the scan shown. None: none was run."""
-        return self._frames.number(self._timeline, self._time)
+        if not self._times or self._timeline not in TIMELINES:
+            return None
+        values = np.array(self._times, np.float64)[:, TIMELINES.index(self._timeline)]
+        earlier = values <= self._time + entities.TIME_TOLERANCE * (self._timeline != entities.FRAME)
+        row = np.where(earlier, values, -np.inf).argmax() if earlier.any() else values.argmin()
+        return self._times[row][0]
 
     @property
     def clicked(self) -> int | None:
         """Number of the scan that was clicked last. None: there was no click."""
-        return None if self._click is None else self._click.frame
+        return None if self._click is None else self._click[0]
 
     def selected(self, result: FrameResult) -> Selected | None:
         """Return the last click.
@@ -170,17 +140,18 @@ class NotebookViewer(Recorder):
         Args:
             result: of the frame ``clicked``, made with ``config``.
         """
-        click = self._click
-        if click is None:
+        if self._click is None:
             return None
-        rows, tracks = self._rows.get(click.frame) or logged_rows(result), self._tracks.get(click.frame)
-        picked = select_click(result, tracks, rows, click.path, click.instance, click.position)
-        return Selected(click.frame, picked, click.path, _place(result, picked))
+        frame, item = self._click
+        rows, tracks = self._rows.get(frame) or logged_rows(result), self._tracks.get(frame)
+        position = [v for v in item.position or () if v is not None]
+        picked = select_click(result, tracks, rows, item.entity_path, item.instance_id, position)
+        return Selected(frame, picked, item.entity_path, _place(result, picked))
 
     def mark(self, result: FrameResult, answers: Sequence[Answer]) -> None:
         """Mark the objects of answers in the viewer, and show their frame."""
         frame = result.frame
-        if frame.index not in self._frames.numbers:
+        if frame.index not in [number for number, _, _ in self._times]:
             return
         mark_answers(self._marker, frame, answers[:MARKED], result.config.bev)
         self.recording.flush()
@@ -197,10 +168,7 @@ class NotebookViewer(Recorder):
         elif event.type == "selection_change":
             item = next((candidate for candidate in event.items if candidate.type == "entity"), None)
             frame = self.frame
-            self._click = None
-            if item is not None and frame is not None:
-                position = tuple(v for v in item.position or () if v is not None)
-                self._click = _Click(frame, item.entity_path, item.instance_id, position)
+            self._click = None if item is None or frame is None else (frame, item)
 
 
 def _viewer(recording: rr.RecordingStream, layout: Blueprint) -> Viewer:

@@ -134,8 +134,7 @@ def test_the_held_seconds_are_listed(robot: RunningRobot) -> None:
 
 @pytest.mark.long
 def test_a_report_is_cut_from_the_held_seconds(robot: RunningRobot, drive: Drive, tmp_path: Path) -> None:
-    session = WorkbenchSession(robot)
-    session.equip(ReportMaker(robot.news.tell, robot.bag_of, tmp_path))
+    session = WorkbenchSession(robot, ReportMaker(robot.news.tell, robot.bag_of, tmp_path))
     number, stamp = FIRST + 2, drive.results[2].frame.stamp
     (answer, *_) = session.ask(number, (), Selection(object=0))
     identity = session.identity(number, (), Selection(object=0), answer, None)

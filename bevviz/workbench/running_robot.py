@@ -53,11 +53,9 @@ LISTED = tuple(KINDS)
 def robot_session(live: Live) -> WorkbenchSession:
     """Return the workbench session of a live run that has not started."""
     robot = RunningRobot(live)
-    session = WorkbenchSession(robot)
-    if live.raw is not None:
-        folder = Path(live.config.live.flight_folder).absolute()
-        session.equip(ReportMaker(robot.news.tell, robot.bag_of, folder))
-    return session
+    folder = Path(live.config.live.flight_folder).absolute()
+    reports = None if live.raw is None else ReportMaker(robot.news.tell, robot.bag_of, folder)
+    return WorkbenchSession(robot, reports)
 
 
 class RunningRobot(GrowingDrive):

@@ -79,16 +79,19 @@ class WorkbenchSession(Closable):
 
     Args:
         source: source of the frames.
+        reports: maker of reports. None: the frames are not made of messages.
+        tools: tools of a recorded drive. None: the source is a robot.
 
     Attributes:
         notes_version: number that changes with the notes. -1: there are none.
     """
 
-    def __init__(self, source: GrowingDrive) -> None:
-        self.source = source
-        self.notes_version = -1
-        self._tools: DriveTools | None = None
-        self._reports: ReportMaker | None = None
+    def __init__(
+        self, source: GrowingDrive, reports: ReportMaker | None = None, tools: DriveTools | None = None
+    ) -> None:
+        self.source, self._reports, self._tools = source, reports, tools
+        self.notes_version = -1 if tools is None else 0
+        source.kept_labels = self._kept_labels
         self._local = threading.local()  # The explainer of each thread that asks.
         self._lock = threading.Lock()  # guards _answers
         self._answers: OrderedDict[tuple[int, Settings, str], tuple[int, Answer]] = OrderedDict()
@@ -120,13 +123,6 @@ class WorkbenchSession(Closable):
     def notes(self) -> list[Note]:
         """Return the notes. A robot has none."""
         return [] if self._tools is None else list(self._tools.notes)
-
-    def equip(self, reports: ReportMaker, tools: DriveTools | None = None) -> None:
-        """Add the maker of reports, and the tools of a recorded drive."""
-        self._reports = reports
-        if tools is not None:
-            self._tools, self.notes_version = tools, 0
-            self.source.kept_labels = self._kept_labels
 
     def start(self) -> None:
         """Start to make frames."""
@@ -521,12 +517,10 @@ def recorded_session(
     files = [] if recording is None else [file.path for file in recording.files]
     table = run_table(files, drive.config, drive.session.stages.provider, labels) if files else None
     source = RecordedDrive(drive, again, first, table, opened)
-    session = WorkbenchSession(source)
 
     def bag_of(number: int) -> ReportedBag:
         return ReportedBag(paths, drive.config, int(drive.frames.scans[0]))
 
     reports = ReportMaker(source.news.tell, bag_of, folder_beside(paths))
     fix = FixSearch(source, paths, *labels)
-    session.equip(reports, DriveTools(TrialRunner(source), fix, Notes(paths)))
-    return session
+    return WorkbenchSession(source, reports, DriveTools(TrialRunner(source), fix, Notes(paths)))

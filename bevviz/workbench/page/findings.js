@@ -1,7 +1,8 @@
 // Table of all findings of the drive: missed and false objects, differences, anomalies and notes.
 
 import { $, at, element, remember, spanText, state, stated } from "./page_state.js";
-import { away, cause, csv, hasCause, KINDS, level, matches, similar, sorted } from "./triage.js";
+import { KINDS } from "./lanes.js";
+import { away, cause, csv, hasCause, level, matches, similar, sorted } from "./triage.js";
 import { seek, showSide } from "./viewer.js";
 
 const SHOWN = 300; // rows in the page, at most

@@ -120,8 +120,7 @@ function runRow(run) {
   return made;
 }
 
-const KINDS = ["fixed", "broken", "new false", "false gone", "new", "gone"];
-const kindsOf = (/** @type {Trial[]} */ runs) => KINDS.filter((kind) => runs.some((run) => run.counts[kind]));
+const kindsOf = (/** @type {Trial[]} */ runs) => [...new Set(runs.flatMap((run) => Object.keys(run.counts)))];
 
 /** @param {Trial} message */
 function summary(message) {

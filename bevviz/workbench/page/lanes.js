@@ -13,6 +13,7 @@ const LANES = [
   ["anomaly", "--other", ["anomaly"]],
   ["note", "--subject", ["note"]],
 ];
+export const KINDS = LANES.flatMap(([, , kinds]) => kinds); // of the findings
 const [NEAR, FAR] = [5, 40]; // metres: a nearer one has the full colour, a farther one the faintest
 const [FAINTEST, UNKNOWN] = [0.35, 0.7]; // opacities: of the farthest, and where the distance is unknown
 

@@ -141,7 +141,6 @@ function answer(message) {
   $("answer").className = message.empty ? "" : message.reported && message.reason !== "contradicted" ? "reported" : "missed";
   $("answer").dataset.took = took.toFixed(0);
   $("answer").dataset.server = (performance.now() - asked.sent).toFixed(0); // without the time that the viewer took
-  $("answer").dataset.subject = message.pick;
   $("verdict").textContent = message.verdict;
   const parts = [message.name, `frame ${message.frame}`];
   if (message.distance !== null && !message.name.includes(" m")) parts.push(`${message.distance.toFixed(1)} m away`);

@@ -20,8 +20,6 @@ import { seconds } from "./page_state.js";
  */
 /** @typedef {{ words: string, class: string, reason: string, within: string }} Filters empty: all */
 
-export const KINDS = ["missed", "lost", "contradicted", "unmatched", "doubtful", "broken", "new false", "fixed", "false gone", "new",
-  "gone", "unnamed", "false", "anomaly", "note"];
 const ALIKE = 10; // metres that are as much as another kind or class
 
 export const away = (/** @type {RowSight} */ sight) => sight.distance ?? 99;
