@@ -35,7 +35,7 @@ check: $(VENV)/.tested
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The page's scripts: types, rules and tests. It needs Node.js 18 or newer, with npm.
-page-check: $(VENV)/.tested tests/page/node_modules/.installed
+page-check: $(BIN)/python tests/page/node_modules/.installed
 	$(BIN)/python -m tools.make_page_types
 	tests/page/node_modules/.bin/tsc --project tests/page
 	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.js bevviz/workbench/page tests/page tests/support
@@ -85,6 +85,9 @@ $(VENV)/.installed: pyproject.toml $(CONSTRAINTS)
 	$(BIN)/pip install --quiet "uv>=0.9,<1"
 	$(INSTALL) --editable ".[workbench]"
 	touch $@
+
+$(BIN)/python: # An environment of another make serves as well.
+	$(MAKE) $(VENV)/.tested
 
 $(VENV)/.tested: $(VENV)/.installed
 	$(INSTALL) --group dev --editable ".[ros]"
