@@ -277,6 +277,19 @@ def test_boxes_that_do_not_fit_the_images_are_named(
     assert any(text in str(finding) for finding in checks.findings if finding.kind == "detector")
 
 
+def test_labels_where_no_points_are_are_named(results: list[FrameResult]) -> None:
+    with bevviz.simulate(1) as drive:
+        checks = InputChecks(drive.frames, drive.config)
+        for result in results:
+            truth = result.frame.truth
+            assert truth is not None
+            above = replace(truth.boxes, center=truth.boxes.center + np.array([0, 0, 3], np.float32))
+            frame = replace(result.frame, truth=replace(truth, boxes=above))
+            checks.observe(replace(result, frame=frame))
+    (said,) = [str(finding) for finding in checks.findings if finding.kind == "truth"]
+    assert "boxes within 20 m hold no point of the LiDAR: check their frame" in said
+
+
 def test_a_right_drive_has_no_finding(results: list[FrameResult]) -> None:
     with bevviz.simulate(1) as drive:
         checks = InputChecks(drive.frames, drive.config)

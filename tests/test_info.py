@@ -77,7 +77,7 @@ def test_gaps_are_found_in_the_index(tmp_path: Path) -> None:
 def test_missing_inputs_name_their_options(tmp_path: Path) -> None:
     path = write(tmp_path / "drive", "/tf_static", "/tf", bags.INFO)
     text = render_bag_info(describe_bag([path], Config()))
-    assert "camera 'camera' has no CameraInfo, and there is no topic of that kind: record it" in text
+    assert "camera 'camera' has no CameraInfo, and no topic of that kind is free: record it" in text
     assert "--set source.extrinsics='{velodyne camera_optical: [x, y, z, qx, qy, qz, qw]}'" in text
     assert "--set source.fixed_frame=name" in text
     assert "--model FILE.onnx" in text

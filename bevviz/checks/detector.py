@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevviz.checks.read_input import ReadInput
+from bevviz.config.plugins import TOPIC
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import CameraResult
 
@@ -39,6 +40,7 @@ def misplaced_boxes(read: ReadInput) -> Iterator[InputFinding]:
     total = count["kept"]
     if total < ENOUGH:
         return
+    names = "let its node publish names" if model.startswith(TOPIC) else "detector.names names them"
     for kind, what, remedy in (
         ("point", "are smaller than two pixels", "publish pixels, not shares of the image"),
         (
@@ -49,7 +51,7 @@ def misplaced_boxes(read: ReadInput) -> Iterator[InputFinding]:
         (
             "number",
             "have a number for a class, so no size is known",
-            "name them: in the node, or detector.names",
+            names,
         ),
     ):
         if count[kind] > total / 2:

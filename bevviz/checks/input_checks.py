@@ -10,6 +10,7 @@ from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks.camera_views import CameraView, view_of
 from bevviz.checks.detector import count_boxes, misplaced_boxes, silent_detector
 from bevviz.checks.extrinsics import wrong_extrinsics
+from bevviz.checks.labels import count_labels, empty_labels
 from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.config import Config
 from bevviz.model.frame import Frame
@@ -42,6 +43,7 @@ CHECKS: tuple[Check, ...] = (
     wrong_extrinsics,
     silent_detector,
     misplaced_boxes,
+    empty_labels,
     sensor_faults,
 )
 
@@ -91,6 +93,7 @@ class InputChecks(Observer[FrameResult]):
                     key = anomaly.kind, anomaly.subject
                     self._read.faults.first.setdefault(key, anomaly)
                     self._read.faults.count[key] += 1
+            count_labels(self._read.labels, result.frame)
             for row, camera in enumerate(result.cameras):
                 if camera.detections is not None:
                     self._read.images += 1

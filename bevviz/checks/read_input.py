@@ -52,6 +52,7 @@ class ReadInput:
         images: images that the detector judged.
         answered: those for which it had a candidate, however weak.
         boxes: its kept boxes, and those that are odd, see ``bevviz.checks.detector``.
+        labels: boxes of the ground truth near the LiDAR, and those without points.
     """
 
     source: Items[object]
@@ -61,6 +62,7 @@ class ReadInput:
     images: int = 0
     answered: int = 0
     boxes: Counter[str] = field(default_factory=Counter)
+    labels: Counter[str] = field(default_factory=Counter)
 
     @property
     def bag(self) -> BagSource | None:

@@ -357,7 +357,7 @@ def find_missing(roles: Roles, frame: Frame | None, config: Config) -> list[str]
         name = f"camera '{role.name}'"
         is_placed = camera.camera_from_points is not None or camera.image is None
         if not role.info_topic:
-            advice = "and there is no topic of that kind: record it"
+            advice = "and no topic of that kind is free: record it"
             if roles.camera_infos:
                 advice = f"--set source.camera_info_topics='{{{role.topic}: {roles.camera_infos[0]}}}'"
             missing.append(f"{name} has no CameraInfo{': ' if roles.camera_infos else ', '}{advice}")
