@@ -43,7 +43,6 @@ from bevviz.stages.visibility import image_boxes, range_image, visible
 from bevviz.support.colors import OPINION_COLORS as OPINION_COLORS
 from bevviz.why import FrameExplainer, Selection
 from bevviz.why.click import select_click
-from bevviz.why.experiment import Outcome
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.trials import trial_effects
 from tests.support import kept_drives
@@ -618,10 +617,10 @@ def test_effects_of_other_limits_are_counted() -> None:
     assert trial_effects(ours(), result, None)["opinions"]["contradicted"] == {"before": None, "after": 1}
     outcome = SweepOutcome()
     for one in (result, lenient):
-        outcome.add(Outcome("lenient", one))
+        outcome.add(one)
     assert (outcome.metrics["contradicted"], outcome.metrics["confirmed"]) == (0.5, 1.0)
     mine = SweepOutcome()
-    mine.add(Outcome("ours", ours()))
+    mine.add(ours())
     assert "contradicted" not in mine.metrics
     [height] = [one for one in controls(config) if one["key"] == "opinions.min_height"]
     assert (height["unit"], height["low"], height["value"]) == ("pixels", 0, 500.0)

@@ -20,10 +20,13 @@ from bevviz.evaluate.f1_change import f1, f1_change
 from bevviz.evaluate.ground_truth import Truth, truth_source
 from bevviz.model.frame import F64, Frame
 from bevviz.model.reasons import FACTS, facts_of
+from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.session import Variants
 from bevviz.support.json_form import json_form, rounded
-from bevviz.why.experiment import Experiment, Outcome
+from bevviz.why.answer import FrameExplainer
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.parameter_search import Settings, search
+from bevviz.why.selection import Selection
 
 FRAMES = 60  # frames to choose on, and as many to confirm
 TRIALS = 72
@@ -64,12 +67,10 @@ class Sample:
     frames: Sequence[SampleFrame]
     variants: Variants = field(default_factory=Variants)
 
-    def outcomes(self, configs: Sequence[Config]) -> Iterator[tuple[SampleFrame, list[Outcome]]]:
-        """Yield the outcome of each configuration on each frame."""
-        truths = {id(sampled.frame): sampled.truth for sampled in self.frames}
-        experiment = Experiment(lambda frame: truths[id(frame)], self.variants)
+    def results(self, configs: Sequence[Config]) -> Iterator[tuple[SampleFrame, list[FrameResult]]]:
+        """Yield the result of each configuration on each frame."""
         for sampled in self.frames:
-            yield sampled, [experiment.outcome(sampled.frame, config) for config in configs]
+            yield sampled, [self.variants.perceive(sampled.frame, config) for config in configs]
 
     def counts(self, score: ObjectScore) -> F64:
         """Return (F, 3) true, missed and false objects of each frame, by the weight of the frames."""
@@ -78,20 +79,21 @@ class Sample:
     def f1(self, configs: Sequence[Config]) -> list[float]:
         """Run each configuration on each frame. Return the F1 of each, by the weight of the frames."""
         scores = [ObjectScore() for _ in configs]
-        for sampled, outcomes in self.outcomes(configs):
-            for score, outcome in zip(scores, outcomes, strict=True):
-                score.add(outcome.objects, sampled.truth)
+        for sampled, results in self.results(configs):
+            for score, result in zip(scores, results, strict=True):
+                score.add(result.objects or Objects.empty(), sampled.truth)
         return [float(f1(self.counts(score).sum(axis=0))) for score in scores]
 
     def reasons(self, config: Config) -> Counter[str]:
         """Run a configuration. Return the number of missed and false objects by reason."""
-        return Counter(
-            row.reason
-            for _, [outcome] in self.outcomes([config])
-            if outcome.result.objects is not None
-            for row in outcome.rows(reasons=True)
-            if row.state != "found"
-        )
+        reasons: Counter[str] = Counter()
+        for sampled, [result] in self.results([config]):
+            explainer = FrameExplainer(result, truth=sampled.truth)
+            if (matches := explainer.traces.matches) is not None:
+                missed = np.flatnonzero(sampled.truth.must & matches.missed).tolist()
+                reasons.update(explainer.about(Selection(truth=row)).verdict.kind.value for row in missed)
+                reasons.update(reason.kind.value for reason in false_reasons(explainer.traces).values())
+        return reasons
 
 
 F1 = Annotated[float, rounded(6)]
@@ -245,8 +247,8 @@ def _confirmed(
     assert after is not None
     old, new = ObjectScore(), ObjectScore()
     totals: Counter[str] = Counter(cause_fixed=0, cause_missed=0)
-    for sampled, outcomes in sample.outcomes([config, after]):
-        objects, new_objects = (outcome.objects for outcome in outcomes)
+    for sampled, results in sample.results([config, after]):
+        objects, new_objects = (result.objects or Objects.empty() for result in results)
         old.add(objects, sampled.truth)
         new.add(new_objects, sampled.truth)
         change = before_after(objects, new_objects, sampled.truth)

@@ -17,17 +17,16 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError, printable
-from bevviz.evaluate import ObjectScore, Truth
+from bevviz.evaluate import ObjectScore, Truth, judge
 from bevviz.evaluate.f1_change import f1_change
 from bevviz.model import counts
 from bevviz.model.counts import count_results
 from bevviz.model.frame import F64, Frame
 from bevviz.model.results import FrameResult
-from bevviz.pipeline.session import check_same_frames
+from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
 from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
-from bevviz.why.experiment import Experiment, Outcome
 
 MOST = 500  # combinations of values, at most
 
@@ -139,18 +138,17 @@ class SweepOutcome:
     judged: int = 0  # frames with ground truth
     score: ObjectScore = field(default_factory=ObjectScore)
 
-    def add(self, outcome: Outcome) -> None:
-        """Add the outcome of one frame."""
-        result = outcome.result
+    def add(self, result: FrameResult, truth: Truth | None = None) -> None:
+        """Add the result of one frame."""
         self.frames += 1
         self.failures += len(result.failures)
         self.counts.update(count_results(result))
-        self.counts["objects"] += len(outcome.objects)
+        self.counts["objects"] += 0 if result.objects is None else len(result.objects)
         for stage in STAGES:
             self.seconds[stage].append(result.timings.get(stage, 0.0))
-        if outcome.truth is not None and outcome.matches is not None and result.objects is not None:
+        if truth is not None and result.objects is not None:
             self.judged += 1
-            self.score.count(result.objects.names, outcome.truth, outcome.matches)
+            self.score.count(result.objects.names, truth, judge(result.objects, truth, result.cameras))
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -234,22 +232,21 @@ class Sweep:
         self.parameters, self.configs = parameters, configs
         self.outcomes = {values: SweepOutcome() for values in configs}
         self.truth = truth
-        self._experiment = Experiment(truth)
+        self._variants = Variants()
         for config in configs.values():
-            self._experiment.variants.check(config)
+            self._variants.check(config)
 
     def perceive(self, frame: Frame, network: Executor | None = None) -> FrameResult:
         """Run every combination on the frame. Return the result of the first one."""
-        results = []
+        truth, results = None if self.truth is None else self.truth(frame), []
         for values, config in self.configs.items():
-            outcome = self._experiment.outcome(frame, config, network=network)
-            self.outcomes[values].add(outcome)
-            results.append(outcome.result)
+            results.append(self._variants.perceive(frame, config, network))
+            self.outcomes[values].add(results[-1], truth)
         return results[0]
 
     def finish(self, result: FrameResult) -> FrameResult:
         """Finish the result of the first combination in frame order."""
-        return self._experiment.variants.session(next(iter(self.configs.values()))).finish(result)
+        return self._variants.session(next(iter(self.configs.values()))).finish(result)
 
     @property
     def best(self) -> Values | None:

@@ -1,98 +1,17 @@
-"""Experiments: states of objects under several configurations, and which configuration is better."""
+"""Changes of objects between two results, and which configuration is better."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from bevviz.config import load
-from bevviz.evaluate import Truth, truth_of
+from bevviz.evaluate import Truth
 from bevviz.evaluate.differences import before_after
 from bevviz.evaluate.f1_change import f1_change
-from bevviz.model.frame import Boxes3D, Frame
-from bevviz.model.results import FrameResult, Objects
-from bevviz.pipeline.session import Variants
-from bevviz.why.experiment import Experiment
-from tests.support import small_drives
-
-FRAMES = 2
-
-
-@cache
-def drive() -> tuple[list[Frame], small_drives.KnownDetections]:
-    loader, frames = small_drives.KnownDetections(), []
-    for snapshot in small_drives.snapshots(small_drives.source(3, FRAMES), FRAMES):
-        image = snapshot.frame.cameras[0].image
-        assert image is not None
-        loader.add(image.stamp, small_drives.candidates(snapshot))
-        frames.append(snapshot.frame)
-    return frames, loader
-
-
-def truth(frame: Frame) -> Truth:
-    assert frame.truth is not None
-    return truth_of(frame, frame.truth)
-
-
-@pytest.mark.long
-def test_the_table_has_each_object_and_configuration() -> None:
-    frames, loader = drive()
-    configurations = {"default": load(), "strict": load(settings=["detector.conf_threshold=0.9"])}
-    table = Experiment(truth, Variants(loader)).table(frames, configurations, reasons=True)
-    rows = table.to_pylist()
-    for frame in frames:
-        wanted = np.flatnonzero(truth(frame).must).tolist()
-        for name in configurations:
-            of_side = [r for r in rows if (r["frame"], r["configuration"]) == (frame.index, name)]
-            states = {r["object"]: r["state"] for r in of_side if r["state"] != "false"}
-            assert list(states) == [f"truth//{row}" for row in wanted]
-            if name == "strict":  # Every detection has a score of 0.8.
-                assert set(states.values()) == {"missed"} and len(of_side) == len(wanted)
-            else:
-                assert "found" in states.values()
-    lost = [r for r in rows if r["configuration"] == "strict" and r["reason"] == "below threshold"]
-    assert lost and {r["stage"] for r in lost} == {"detector"}
-    assert all(r["reason"] == r["stage"] == "" for r in rows if r["state"] == "found")
-    boxes = truth(frames[0]).boxes
-    for r in rows:
-        if r["frame"] == 0 and r["object"].startswith("truth"):
-            k = int(r["object"].rpartition("/")[2])
-            assert [r["x"], r["y"], r["z"]] == pytest.approx(boxes.center[k].tolist())
-            assert r["distance"] == pytest.approx(np.hypot(r["x"], r["y"]), rel=1e-5)
-
-
-def test_without_ground_truth_objects_are_reported_or_doubtful() -> None:
-    frames, loader = drive()
-    unlabelled = [replace(frame, truth=None) for frame in frames]
-    table = Experiment(variants=Variants(loader)).table(unlabelled, {"default": load()})
-    assert (
-        set(table["state"].to_pylist()) <= {"reported", "doubtful"}
-        and "reported" in table["state"].to_pylist()
-    )
-    assert all(name.startswith("object//") for name in table["object"].to_pylist())
-
-
-def test_a_kept_result_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    (frame, other), loader = drive()
-    runs: list[int] = []
-    perceive = Variants.perceive
-
-    def counted(self: Variants, frame: Frame, *rest: object) -> FrameResult:
-        runs.append(frame.index)
-        return perceive(self, frame, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Variants, "perceive", counted)
-    experiment = Experiment(truth, Variants(loader), kept=2)
-    first = experiment.outcome(frame, load())
-    assert experiment.outcome(frame, load(settings=["voxel.size=0.05"])).result is not first.result
-    assert experiment.outcome(frame, load()).result is first.result and runs == [0, 0]
-    experiment.outcome(other, load())
-    experiment.outcome(frame, load())
-    assert runs == [0, 0, 1, 0]
-
+from bevviz.model.frame import Boxes3D
+from bevviz.model.results import Objects
 
 # --- before and after --------------------------------------------------------------------------
 
