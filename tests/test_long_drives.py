@@ -20,9 +20,9 @@ from bevviz.anomalies.detector import AnomalyDetector
 from bevviz.cli import main
 from bevviz.config import Config, load
 from bevviz.drive import Drive
-from bevviz.findings.finding_list import CELL, FindingFrame, FindingList
+from bevviz.findings.finding_list import CELL, FindingFrame, FindingList, StoredGroup
 from bevviz.findings.frame_findings import Finding, findings_of
-from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun, run_table
+from bevviz.findings.run_table import RunTable, StoredRun, run_table
 from bevviz.model.results import FrameResult
 from bevviz.pipeline import result_store
 from bevviz.pipeline.run import run
@@ -301,13 +301,13 @@ def test_findings_are_ranked_by_reasons_kind_and_distance() -> None:
     findings = FindingList()
     lasting = [frame(distance=10.0, in_way=True), frame(stamp=15 * 10**8, distance=9.0)]
     groups = [
-        ("missed", "second name", [frame(distance=2.0, text="second name")]),
-        ("anomaly", "sync", [frame(distance=float("nan"))]),
-        ("missed", "unknown distance", [frame(distance=float("nan"))]),
-        ("doubtful", "near", [frame(distance=5.0)]),
-        ("fixed", "near", [frame(distance=5.0)]),
-        ("false", "nearer", [frame(distance=4.0)]),
-        ("missed", "lasting", lasting),
+        StoredGroup("missed", "second name", [frame(distance=2.0, text="second name")]),
+        StoredGroup("anomaly", "sync", [frame(distance=float("nan"))]),
+        StoredGroup("missed", "unknown distance", [frame(distance=float("nan"))]),
+        StoredGroup("doubtful", "near", [frame(distance=5.0)]),
+        StoredGroup("fixed", "near", [frame(distance=5.0)]),
+        StoredGroup("false", "nearer", [frame(distance=4.0)]),
+        StoredGroup("missed", "lasting", lasting),
     ]
     findings.restore(groups)
     entries, _ = findings.news({})

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
@@ -111,6 +112,14 @@ class FindingFrame:
             "remark": self.remark,
             "in_way": self.in_way,
         }
+
+
+class StoredGroup(NamedTuple):
+    """Group of findings as it is stored."""
+
+    what: str
+    name: str
+    frames: list[FindingFrame]
 
 
 @dataclass(slots=True)
@@ -253,13 +262,13 @@ class FindingList:
         self._groups[group.number] = group
         return group
 
-    def content(self) -> list[tuple[str, str, list[FindingFrame]]]:
-        """Return kind, name and frames of each group."""
+    def content(self) -> list[StoredGroup]:
+        """Return the groups as they are stored."""
         with self._lock:
             groups = sorted(self._groups.values(), key=lambda group: group.number)
-            return [(group.what, group.name, list(group.frames)) for group in groups]
+            return [StoredGroup(group.what, group.name, list(group.frames)) for group in groups]
 
-    def restore(self, groups: Iterable[tuple[str, str, list[FindingFrame]]], *, stay: bool = True) -> None:
+    def restore(self, groups: Iterable[StoredGroup], *, stay: bool = True) -> None:
         """Add whole groups of an earlier run. Those that do not stay are removed as an overview is."""
         with self._lock:
             for kind, name, frames in groups:

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from bevviz.bags.remote import address_of
 from bevviz.bags.source import BagSource
 from bevviz.config import Config, values
-from bevviz.findings.finding_list import FindingFrame, FindingList
+from bevviz.findings.finding_list import FindingList, StoredGroup
 from bevviz.findings.frame_findings import Finding, find_findings
 from bevviz.model.frame import Frame
 from bevviz.model.protocols import Observer
@@ -24,15 +24,6 @@ from bevviz.recording.provenance import model_path, versions
 from bevviz.support.files import file_hash
 from bevviz.support.onnx_files import with_weights
 from bevviz.why import RunExplainer
-
-
-@dataclass(frozen=True, slots=True)
-class StoredGroup:
-    """Group of findings as it is stored."""
-
-    what: str
-    name: str
-    frames: list[FindingFrame]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +103,7 @@ class ListKeeper(Observer[FrameResult]):
     def end(self) -> None:
         """Keep the list."""
         if len(self._frames) == self._scans:
-            groups = [StoredGroup(*group) for group in self._list.content()]
-            self._table.save(StoredRun(groups, sorted(self._frames)))
+            self._table.save(StoredRun(self._list.content(), sorted(self._frames)))
 
 
 def list_keeper(

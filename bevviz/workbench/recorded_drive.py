@@ -14,7 +14,7 @@ from bevviz.drive import Drive
 from bevviz.errors import UserError, first_line
 from bevviz.findings.frame_findings import Finding, find_findings, findings_of
 from bevviz.findings.marks import log_findings
-from bevviz.findings.run_table import RunTable, StoredGroup, StoredRun
+from bevviz.findings.run_table import RunTable, StoredRun
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
 from bevviz.model.results import FrameResult, Objects, Tracks
@@ -164,8 +164,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         stored = None if self._table is None else self._table.load()
         if stored is None:
             return False
-        groups = ((group.what, group.name, group.frames) for group in stored.groups)
-        self.findings.restore(groups, stay=stored.explained)
+        self.findings.restore(stored.groups, stay=stored.explained)
         with self._lock:
             self._stamps = {number: stamp for stamp, number in stored.frames}
             self._times = sorted((stamp, number) for stamp, number in stored.frames)
@@ -178,8 +177,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     def _save_list(self) -> None:
         """Keep the findings of the whole run."""
         if self._table is not None:
-            groups = [StoredGroup(*group) for group in self.findings.content()]
-            self._table.save(StoredRun(groups, self.frame_times()))
+            self._table.save(StoredRun(self.findings.content(), self.frame_times()))
 
     def _make_overview(self) -> None:
         """List the findings of single frames all over the drive."""
