@@ -76,10 +76,11 @@ def test_a_hidden_person_is_explained(preset: str) -> None:
     (row,) = planted("hidden_person", "person", 16.3)
     answer = of_truth(asked("hidden_person", preset, "person"), row)
     assert answer.verdict.kind is ReasonKind.HIDDEN and not answer.verdict.reported
-    reason = answer.verdict.reason
-    assert reason["points"] == 0 and reason["in_front"] == reason["aimed"] > 0 and reason["front"] >= 0
-    occlusion = numbers(answer, "occlusion")
-    assert occlusion["in_front"] == occlusion["aimed"]
+    evidence, occlusion = answer.evidence, numbers(answer, "occlusion")
+    assert evidence.raw == 0 and evidence.in_front == evidence.aimed > 0 and evidence.front >= 0
+    assert occlusion["in_front"] == occlusion["aimed"] == evidence.aimed
+    returns = f"no points on it, and {evidence.aimed} of the {evidence.aimed} returns in its direction"
+    assert f"{returns} end in front of it, most of them on cluster" in answer.verdict.text
     van = at("hidden_person").point_object[answer.fate == Fate.IN_FRONT]
     (car,) = planted("hidden_person", "car", 11.9)
     assert np.mean(van == at("hidden_person").truth_object[car]) > 0.9
@@ -91,7 +92,8 @@ def test_a_flat_car_removed_as_ground_is_explained() -> None:
     answer = about("flat_car", "reference", row)
     assert answer.verdict.kind is ReasonKind.GROUND
     assert answer.verdict.reason.limit == Limit("ground.distance_threshold", 0.5, "m")
-    assert answer.verdict.reason["removed"] == answer.verdict.reason["voxels"] > 300
+    voxels = answer.evidence.voxels
+    assert voxels > 300 and f"{voxels} of its {voxels} voxels, up to 0." in answer.verdict.text
     assert answer.hints[0].settings[0].startswith("ground.distance_threshold=")
     ground = numbers(answer, "ground")
     assert ground["threshold"] == 0.5 and 0.25 < float(str(ground["highest"])) < 0.5
@@ -121,7 +123,8 @@ def test_two_people_in_one_cluster_are_explained(preset: str) -> None:
     assert 0.1 < float(str(merged["gap"])) < 0.5
     assert 0.1 < float(str(merged["eps_that_parts"])) < 0.5
     reason = lost.verdict.reason
-    assert reason.limit == Limit("clustering.eps", 0.5, "m") and 0.1 < reason["gap"] < 0.5
+    assert reason.limit == Limit("clustering.eps", 0.5, "m")
+    assert f"the gap between them is {lost.evidence.gap:.2f} m and clustering.eps is 0.5 m" in reason.text
 
 
 def test_two_people_split_by_the_camera_are_explained() -> None:
@@ -130,7 +133,7 @@ def test_two_people_split_by_the_camera_are_explained() -> None:
     assert [a.verdict.kind for a in both] == [ReasonKind.REPORTED] * 2
     texts = [e.text for e in run("merged_people", "default").explanations if e.state == "split"]
     assert any(re.fullmatch(r"cluster \d+ split by person 0.\d+: \d+ of [\d,]+ points.*", t) for t in texts)
-    assert any(a.verdict.reason["split_off"] for a in both)
+    assert any("which split it off " in a.verdict.text for a in both)
 
 
 def test_the_hint_that_splits_two_people_is_proved() -> None:
@@ -154,7 +157,7 @@ def test_two_people_are_explained_without_truth() -> None:
     answers = why(blind, Selection(label="person"), CLASSES, hints=0)
     merged = [a for a in answers if a.verdict.kind is ReasonKind.MERGED]
     assert merged and all(a.subject.kind == "detection" for a in merged)
-    assert any(not a.verdict.reported and a.verdict.reason["others"] for a in merged)
+    assert any(not a.verdict.reported and a.evidence.others for a in merged)
 
 
 def test_two_losses_without_truth_are_both_named() -> None:
@@ -179,12 +182,12 @@ def test_a_box_that_names_two_clusters_is_explained() -> None:
     assert of_truth(asked("shared_box", "default", "person"), row).verdict.kind is ReasonKind.REPORTED
     answer = about("shared_box", "reference", row)
     assert answer.verdict.kind is ReasonKind.SHARED_BOX and answer.verdict.reported
-    assert answer.verdict.reason["also"]
+    assert "its box also names cluster" in answer.verdict.text
     assert answer.hints[0].settings == ("fusion.method=frustum",)
     cabinet = Selection(point=(10.0, -3.9, -0.8))
     (other,) = why(run("shared_box", "reference"), cabinet, CLASSES)
     assert other.verdict.kind is ReasonKind.BORROWED
-    assert other.verdict.reason["object"].name == "person"
+    assert "is named person by a box that also names cluster" in other.verdict.text
     assert other.hints[0].text == "it is not named any more"
     (rightly,) = why(run("shared_box", "default"), cabinet, CLASSES, hints=0)
     assert not rightly.verdict.reported
@@ -266,11 +269,10 @@ def test_an_empty_place_is_described() -> None:
     questioner = FrameExplainer(run("flat_car", "default"), classes=CLASSES)
     (road,) = questioner.ask(Selection(point=(-5.0, 1.0, -1.9)))
     assert road.verdict.text.startswith("There is only ground at -5, 1, -1.9 m: ")
-    assert road.verdict.reason["ground_points"] == road.verdict.reason["points"]
-    assert -0.1 < road.verdict.reason["lowest"] <= 0
+    assert f"{road.evidence.raw} points, all ground, -0.0" in road.verdict.text
     (air,) = questioner.ask(Selection(point=(-5.0, 1.0, 5.0)))
     assert air.verdict.kind is ReasonKind.NO_POINTS
-    assert (air.verdict.reason["points"], air.verdict.reason["radius"]) == (0, 0.5)
+    assert ": the LiDAR has no points within 0.5 m, the nearest is " in air.verdict.text
     assert not questioner.candidates(Selection(point=(-5.0, 1.0, 5.0)))
     (pixel,) = questioner.ask(Selection(box=(60.0, 350.0)))
     assert pixel.verdict.text.startswith("There is only ground at pixel 60, 350: ")
@@ -324,7 +326,7 @@ def test_a_row_number_selects_that_row_of_the_result() -> None:
     (thing,) = questioner.ask(Selection(object=0))
     assert thing.verdict.reported and thing.subject.label == result.objects.names[0]
     (cluster,) = questioner.ask(Selection(cluster=int(result.objects.cluster[0])))
-    assert cluster.verdict.reported and cluster.verdict.reason["object"].name == result.objects.names[0]
+    assert cluster.verdict.reported and f" is named {result.objects.names[0]} by " in cluster.verdict.text
     (detection,) = questioner.ask(Selection(detection=int(result.objects.detection[0]), camera="zed"))
     assert detection.verdict.reported and detection.subject.kind == "detection"
     for wrong in (
@@ -375,7 +377,9 @@ def test_without_a_model_no_detector_is_said_to_have_looked() -> None:
     ):
         answers = why(result, Selection(label="person"), CLASSES, hints=1)
         never = [a for a in answers if a.verdict.kind is ReasonKind.NOT_RUN]
-        assert len(never) >= 2 and all(a.verdict.reason["problems"] == (what,) for a in never)
+        assert len(never) >= 2 and all(
+            a.verdict.reason.text == f"the detector never ran: {what}" for a in never
+        )
         assert not any(a.tried for a in never), "no value of a stage gives it an image or a model"
         assert not any(a.verdict.reported or "no candidate" in str(AnswerResult.of(a)) for a in answers)
         assert "the detector never ran" in summary_line(answers)
@@ -392,7 +396,8 @@ def test_a_camera_without_a_place_compares_nothing() -> None:
     answers = why(result, Selection(label="person"), CLASSES, hints=0)
     clustered = [a for a in answers if a.subject.kind == "truth" and a.evidence.main >= 0]
     assert clustered and {a.verdict.kind for a in clustered} == {ReasonKind.NOT_FUSED}
-    assert clustered[0].verdict.reason.values == {"cameras": ("zed",), "problems": ("no transform to zed",)}
+    text = clustered[0].verdict.reason.text
+    assert text == "zed could not be compared with clusters: no transform to zed"
 
 
 def test_weak_detections_are_not_called_suppressed() -> None:
@@ -459,7 +464,7 @@ def test_a_failed_stage_is_the_reason() -> None:
     result = session.run(replace(at("flat_car").frame, points=np.zeros((0, 3), np.float32)))
     answers = why(result, Selection(label="car"), CLASSES, hints=0)
     assert answers and {a.verdict.kind for a in answers} == {ReasonKind.FAILED}
-    assert ("cloud", "the cloud holds no finite point") in answers[0].verdict.reason["failures"]
+    assert "cloud failed: the cloud holds no finite point" in answers[0].verdict.text
 
 
 # --- KITTI -------------------------------------------------------------------------------------
@@ -514,7 +519,7 @@ def kitti(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, l
 def test_kitti_000000_the_pedestrian_is_reported(kitti: dict[str, list[Answer]]) -> None:
     answer = next(a for a in kitti["000000"] if a.subject.label == "Pedestrian")
     assert answer.verdict.kind is ReasonKind.REPORTED
-    assert answer.verdict.reason["object"].name == "person"
+    assert " is named person by person " in answer.verdict.text
     assert int(str(numbers(answer, "raw cloud")["points"])) > 300
 
 
@@ -527,8 +532,8 @@ def test_kitti_000001_each_object_has_its_reason(kitti: dict[str, list[Answer]])
     }
     assert not any(a.verdict.reported for a in by_label.values())
     reasons = {label: a.verdict.reason for label, a in by_label.items()}
-    assert (reasons["Car"]["removed"], reasons["Car"]["voxels"]) == (5, 9)
-    assert reasons["Truck"]["detection"].name == "car" and reasons["Truck"]["detection"].score < 0.02
+    assert "it was taken for ground: 5 of its 9 voxels" in reasons["Car"].text
+    assert reasons["Truck"].text.startswith("its detection is too weak: car 0.01, ")
     assert reasons["Truck"].limit == Limit("detector.conf_threshold", 0.25)
     raw = {label: numbers(a, "raw cloud")["points"] for label, a in by_label.items()}
     assert raw == {"Cyclist": 18, "Car": 9, "Truck": 73}

@@ -12,7 +12,7 @@ from bevviz.config import load
 from bevviz.model.reasons import Reason, ReasonKind
 from bevviz.pipeline.session import Session
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.hints import Hint, HintSearch, TriedChange
+from bevviz.why.answer import Hint, TriedChange
 from bevviz.why.neighbours import NeighbourRuns
 from tests.support.planted_faults import at, run
 
@@ -119,7 +119,7 @@ def test_the_sentence_names_the_changes(
 ) -> None:
     asked = questioner("reference")
     answer = asked.missed()[0]
-    monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: HintSearch((), tried))
+    monkeypatch.setattr(FrameExplainer, "search", lambda self, answer: replace(answer, hints=(), tried=tried))
     assert asked.with_hints(answer).verdict.text == answer.verdict.text.removesuffix(".") + said
 
 

@@ -24,7 +24,6 @@ from bevviz.why.changes import changes_for, other_methods
 from bevviz.why.collect import collect_evidence
 from bevviz.why.ideal import IdealStages
 from bevviz.why.kept_labels import kept_truth
-from bevviz.why.subject import single_box
 from bevviz.why.verdict import ground_lost
 from tests.support.planted_faults import at
 
@@ -145,7 +144,7 @@ def labelled(asked: FrameExplainer, row: int) -> FrameExplainer:
     """Return the explainer without ground truth, but with the label of one object that a user keeps."""
     truth, frame = asked.traces.labels_in_evaluate, asked.traces.result.frame
     assert truth is not None
-    box = single_box(truth.boxes, row)
+    box = truth.boxes.chosen([row])
     values = (*box.center[0].tolist(), *box.size[0].tolist(), float(box.yaw[0]))
     note = Note(
         frame.stamp,

@@ -106,15 +106,15 @@ def test_noise_and_merged_agree_with_the_clustering_alone(asked: dict[str, Asked
         first = dbscan(obstacles, config.eps, config.min_points)
         index = frame.explainer.traces
         for answer in frame.labels:
-            kind, reason, evidence = answer.verdict.kind, answer.verdict.reason, answer.evidence
+            kind, evidence = answer.verdict.kind, answer.evidence
             voxels = frame.result.voxels
             assert voxels is not None
             rows = index.obstacle[np.unique(voxels.inverse[evidence.points])]
             mine = first[rows[rows >= 0]]
             if kind is ReasonKind.NOISE:
-                assert reason["noise"] <= (mine < 0).sum() and reason["neighbours"] < config.min_points
-                assert reason["noise"] >= max(evidence.aside_points, len(evidence.ground))
-            elif kind is ReasonKind.MERGED and reason["joined_by"] is None and reason["others"]:
+                assert evidence.noise <= (mine < 0).sum() and evidence.neighbours < config.min_points
+                assert evidence.noise >= max(evidence.aside_points, len(evidence.ground))
+            elif kind is ReasonKind.MERGED and evidence.joined_by is None and evidence.others:
                 others = [index.truth[row] for row in evidence.mates]
                 theirs = [index.obstacle[np.unique(voxels.inverse[index.place(other)])] for other in others]
                 shared = [np.intersect1d(mine[mine >= 0], first[rows[rows >= 0]]) for rows in theirs]
@@ -130,7 +130,7 @@ def test_the_fusion_is_named_where_it_joined_two_people(asked: dict[str, Asked])
     assert first.verdict.reported and not second.verdict.reported
     assert {first.verdict.kind, second.verdict.kind} == {ReasonKind.MERGED}
     for answer in (first, second):
-        assert answer.verdict.reason["gap"] > 0.5 and answer.verdict.reason["joined_by"].name == "person"
+        assert answer.evidence.gap > 0.5 and " apart for person 0." in answer.verdict.text
 
 
 def test_a_detection_may_fit_two_cars(asked: dict[str, Asked]) -> None:
@@ -147,8 +147,7 @@ def test_a_detection_in_the_verdict_fits_the_object(asked: dict[str, Asked]) -> 
             best = answer.evidence.best
             if answer.verdict.kind in (ReasonKind.BELOW_THRESHOLD, ReasonKind.SUPPRESSED):
                 assert best is not None and best.own and best.overlap >= 0.3 and not best.kept
-                detection = answer.verdict.reason["detection"]
-                assert (detection.name, detection.score) == (best.name, pytest.approx(best.score))
+                assert f"its detection {best.name} " in answer.verdict.text.replace("is too weak: ", "")
                 quoted += 1
     assert quoted >= 10
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -95,7 +96,7 @@ def test_losses_of_a_user_clustering_name_it(here: Path) -> None:
     lost = of(ask(result), ReasonKind.NO_CLUSTER)
     assert lost and not of(ask(result), ReasonKind.NOISE)
     for answer in lost:
-        assert answer.verdict.reason["by"] == "somebody:cells" and not answer.verdict.reason["robot"]
+        assert answer.verdict.reason.by == "somebody:cells" and "robot" not in answer.verdict.text
         assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
 
 
@@ -113,19 +114,19 @@ def test_a_hint_may_be_a_parameter_of_a_user_stage(here: Path) -> None:
 def test_user_ground_and_detector_are_named(here: Path) -> None:
     flat = Session(load(settings=["detector.model=demo", "ground.method=somebody:flat"])).run(frame())
     ground = of(ask(flat), ReasonKind.GROUND)
-    assert ground and all(a.verdict.reason["by"] == "somebody:flat" for a in ground)
+    assert ground and all(a.verdict.reason.by == "somebody:flat" for a in ground)
     assert all(a.verdict.reason.limit is None for a in ground)
     assert not any(parameters_in(a, "ground.") for a in ground)
     blind = Session(load(settings=["detector.model=somebody:blind"])).run(frame())
     unseen = of(ask(blind), ReasonKind.NOT_DETECTED)
-    assert unseen and all(a.verdict.reason["by"] == "somebody:blind" for a in unseen)
+    assert unseen and all(a.verdict.reason.by == "somebody:blind" for a in unseen)
 
 
 def test_a_detector_of_objects_is_not_asked_for_its_clusters(here: Path) -> None:
     result = Session(load(settings=["objects.method=somebody:pillars"])).run(frame())
     answers = ask(result, hints=True)
     missed = of(answers, ReasonKind.NOT_AMONG)
-    assert missed and all(a.verdict.reason["by"] == "somebody:pillars" for a in missed)
+    assert missed and all(a.verdict.reason.by == "somebody:pillars" for a in missed)
     assert not any(parameters_in(a, "fusion.") or a.hints for a in missed)
 
 
@@ -196,17 +197,19 @@ def test_each_of_the_robots_stages_is_blamed_for_what_it_lost() -> None:
     assert objects is not None
     k, d = int(objects.cluster[j]), int(objects.detection[j])
     well = robots_answer(published(), row, *ROBOT)
-    assert well.verdict.reported and well.verdict.reason["by"] == "/fused"
+    assert well.verdict.reported and well.verdict.reason.by == "/fused"
     fusion = robots_answer(published(drop_object=j), row, *ROBOT)
     assert fusion.verdict.kind is ReasonKind.LOST_IN_FUSION
-    owners = [fusion.verdict.reason[section] for section in ("clustering", "detector", "objects")]
-    assert owners == ["/clusters", "/camera_2d", "/fused"]
+    assert re.search(
+        r"cluster \d+ of /clusters and \w+ 0.\d+ of /camera_2d are there, but no object of /fused; ours ",
+        fusion.verdict.text,
+    )
     clustering = robots_answer(published(drop_cluster=k, drop_object=j), row, *ROBOT)
     assert clustering.verdict.kind is ReasonKind.NO_CLUSTER
-    assert clustering.verdict.reason["robot"]
+    assert "the robot's clustering lost it: " in clustering.verdict.text
     detector = robots_answer(published(drop_detection=d, drop_object=j), row, *ROBOT)
     assert detector.verdict.kind is ReasonKind.NOT_DETECTED
-    assert detector.verdict.reason["robot"] and detector.verdict.reason["by"] == "/camera_2d"
+    assert "the robot's detector lost it: /camera_2d has no detection" in detector.verdict.text
     for answer in (well, fusion, clustering, detector):
         assert not parameters_in(answer, "detector.", "fusion."), answer.steps
         assert not parameters_in(answer, "clustering.eps", "clustering.min_points")
@@ -219,5 +222,5 @@ def test_our_fusion_of_the_robots_clusters_and_detections() -> None:
     assert objects is not None
     answer = robots_answer(published(drop_cluster=int(objects.cluster[j])), row, *ROBOT[:2])
     assert answer.verdict.kind is ReasonKind.NO_CLUSTER and not answer.hints
-    assert answer.verdict.reason["robot"]
+    assert "the robot's clustering lost it: " in answer.verdict.text
     assert not parameters_in(answer, "clustering.eps", "clustering.min_points")

@@ -155,7 +155,7 @@ def _unseen(questioner: FrameExplainer, selection: Selection, answers: Sequence[
 def _headline(questioner: FrameExplainer, selection: Selection) -> str:
     """Return one line about the selected objects, or the reason why there are none."""
     from bevviz.why.answer_text import summary_line
-    from bevviz.why.reason_values import not_run
+    from bevviz.why.reason_text import not_run
 
     answers = questioner.ask(selection)
     if selection.one:

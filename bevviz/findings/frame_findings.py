@@ -22,7 +22,6 @@ from bevviz.why.collect import center_of, ground_distance
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex, detection_subject
 from bevviz.why.resolve import object_subject
-from bevviz.why.subject import single_box
 from bevviz.why.verdict import Verdict
 
 # Size of a cluster that may be a person, a bicycle or a car: longer side, shorter side and height in metres,
@@ -211,7 +210,7 @@ def _unexplained(traces: FrameIndex) -> Iterator[Finding]:
         for row in np.flatnonzero(opinions.missed).tolist():
             lost = _of_detection(traces, "lost", fused.camera[row], int(fused.detection[row]))
             if lost is not None:
-                yield replace(lost, shape=single_box(fused.boxes, row))
+                yield replace(lost, shape=fused.boxes.chosen([row]))
     yield from _of_objects(result, "doubtful", false_reasons(traces))
     for camera in result.cameras:
         for row in unmatched_detections(camera).tolist():
@@ -253,7 +252,7 @@ def _of_box(
     result: FrameResult, what: str, selection: Selection, name: str, boxes: Boxes3D, number: str = ""
 ) -> Finding:
     """Return a finding about one of several boxes, whose row is that of the selection."""
-    frame, box = result.frame, single_box(boxes, selection.row)
+    frame, box = result.frame, boxes.chosen([selection.row])
     distance, severity = float(box.distance[0]), KINDS[what]
     return Finding(
         frame.index, frame.stamp, what, name, distance, selection, severity=severity, shape=box, number=number

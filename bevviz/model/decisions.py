@@ -10,7 +10,7 @@ import numpy as np
 from bevviz.config import Config
 from bevviz.model import geometry
 from bevviz.model.frame import I64
-from bevviz.model.reasons import Reason, ReasonKind, kind_of, limit, limit_of, make_reason, owner_of, scored
+from bevviz.model.reasons import Reason, ReasonKind, kind_of, limit, limit_of, owner_of, scored
 from bevviz.model.results import (
     CameraResult,
     Clusters,
@@ -111,38 +111,25 @@ def _problems(result: CameraResult, config: Config) -> Iterator[Explanation]:
 def detection_reason(detections: Detections, row: int, config: Config) -> Reason:
     """Return the reason why the detector stage kept a detection or not."""
     kind = kind_of(DetectionState(int(detections.state[row])))
-    if kind is not ReasonKind.SUPPRESSED:
-        return make_reason(kind, config, detection=scored(detections, row))
+    if (decisive := limit_of(kind, config)) is None:
+        return Reason(kind)
+    if kind is ReasonKind.BELOW_THRESHOLD:
+        return Reason(kind, decisive, f"below {decisive.short}")
     rival = int(detections.suppressed_by[row])
-    return make_reason(
-        kind,
-        config,
-        detection=scored(detections, row),
-        rival=None if rival < 0 else scored(detections, rival),
-        iou=float(detections.overlap[row]),
-    )
+    better = None if rival < 0 else scored(detections, rival)
+    text = f"suppressed by {better}, IoU {float(detections.overlap[row]):.2f} > {decisive.short}"
+    return Reason(kind, decisive, text)
 
 
-def not_kept_text(reason: Reason) -> str:
-    """Return why the detector stage did not keep a detection."""
-    assert reason.limit is not None
-    if reason.kind is ReasonKind.BELOW_THRESHOLD:
-        return f"below {reason.limit.short}"
-    return f"suppressed by {reason['rival']}, IoU {reason['iou']:.2f} > {reason.limit.short}"
-
-
-def pair_reason(fusion: Fusion, config: Config, detection: int, cluster: int) -> Reason:
+def pair_kind(fusion: Fusion, config: Config, detection: int, cluster: int) -> ReasonKind:
     """Return the rule of our fusion that separates a detection and a cluster; MATCHED: none does."""
     pair, decision = fusion.pair(detection, cluster), Decision(int(fusion.detection_decision[detection]))
-    rule = _separating_rule(pair, config)
-    if rule is None:
-        is_matched = decision is Decision.MATCHED
-        rule = ReasonKind.OTHER_CLUSTER if is_matched else ReasonKind.TAKEN
-        if is_matched and fusion.detection_cluster[detection] == cluster:
-            rule = ReasonKind.MATCHED
-        elif decision is Decision.MISFIT:
-            rule = ReasonKind.MISFIT
-    return make_reason(rule, config, cluster=cluster, pair=pair)
+    if (rule := _separating_rule(pair, config)) is not None:
+        return rule
+    if decision is Decision.MATCHED:
+        is_own = fusion.detection_cluster[detection] == cluster
+        return ReasonKind.MATCHED if is_own else ReasonKind.OTHER_CLUSTER
+    return ReasonKind.MISFIT if decision is Decision.MISFIT else ReasonKind.TAKEN
 
 
 def _separating_rule(pair: Pair | None, config: Config) -> ReasonKind | None:
@@ -164,22 +151,15 @@ def _detections(
     for d in range(len(detections)):
         reason = detection_reason(detections, d, config)
         if reason.kind is not ReasonKind.KEPT:
-            text = not_kept_text(reason)
+            text = reason.text
         elif result.fusion is None or clusters is None:
             why = "; ".join(result.camera.problems) or "no clusters in this frame"
             text = f"not compared with clusters: {why}" if lidar else "kept"
         else:
-            reason = _fusion_reason(result.fusion, d, config)
+            kind = kind_of(Decision(int(result.fusion.detection_decision[d])))
+            reason = Reason(kind, limit_of(kind, config))
             text = _detection(reason, d, result, result.fusion, detections, clusters, config)
-        label = reason.values.get("detection") or scored(detections, d)
-        yield Explanation("detection", result.camera.name, d, reason, f"{label}: {text}")
-
-
-def _fusion_reason(fusion: Fusion, d: int, config: Config) -> Reason:
-    """Return the decision of the fusion about a kept detection."""
-    cluster = int(fusion.detection_cluster[d])
-    kind = kind_of(Decision(int(fusion.detection_decision[d])))
-    return make_reason(kind, config, cluster=cluster, pair=fusion.pair(d, cluster))
+        yield Explanation("detection", result.camera.name, d, reason, f"{scored(detections, d)}: {text}")
 
 
 def _detection(
@@ -194,7 +174,9 @@ def _detection(
     """Return the decision of the fusion about detection ``d`` in words."""
     if reason.kind is ReasonKind.NO_CLUSTER:
         return f"no cluster, {_unclustered(d, result, detections, clusters, config)}"
-    k, pair = reason["cluster"], reason["pair"]
+    k = int(fusion.detection_cluster[d])
+    pair = fusion.pair(d, k)
+    assert pair is not None
     if config.fusion.method == "centroid":
         evidence = f"centre of cluster {k} at {pair.depth:.1f} m is {pair.distance:.0f} px from its own"
     else:
@@ -260,7 +242,7 @@ def _unclustered(
 def cluster_reason(clusters: Clusters, row: int, config: Config) -> Reason:
     """Return the reason why a cluster is kept or outside the size limits."""
     kind = kind_of(ClusterState(int(clusters.state[row])))
-    return make_reason(kind, config, cluster=int(row), count=int(clusters.count[row]))
+    return Reason(kind, limit_of(kind, config))
 
 
 def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Config) -> Iterator[Explanation]:
@@ -295,8 +277,8 @@ def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Confi
                 continue
             unseen = False
             d = int(fusion.cluster_detection[k])
-            reason = make_reason(kind, config, detection=d, pair=fusion.pair(d, k))
-            text = _cluster(reason, fusion, detections, config)
+            reason = Reason(kind, limit_of(kind, config))
+            text = _cluster(reason, k, d, fusion, detections, config)
             if kind is not ReasonKind.MATCHED:
                 text = f"in view of {camera}, {text}"
             yield Explanation("cluster", camera, k, reason, f"{head}: {text}")
@@ -305,14 +287,14 @@ def _clusters(cameras: Sequence[CameraResult], clusters: Clusters, config: Confi
             yield Explanation("cluster", "", k, Reason(ReasonKind.OUT_OF_VIEW), text)
 
 
-def _cluster(reason: Reason, fusion: Fusion, detections: Detections, config: Config) -> str:
+def _cluster(reason: Reason, k: int, d: int, fusion: Fusion, detections: Detections, config: Config) -> str:
     """Return the decision of the fusion about a cluster in words."""
     if reason.kind is ReasonKind.NO_DETECTION:
         return "under no detection"
-    d, pair = reason["detection"], reason["pair"]
-    label = scored(detections, d)
+    pair, label = fusion.pair(d, k), scored(detections, d)
     if reason.kind is ReasonKind.MATCHED:
         return f"matched with {label}"
+    assert pair is not None
     if config.fusion.method == "centroid":
         evidence = f"its centre {pair.distance:.0f} px from that of {label}"
     else:
@@ -436,7 +418,7 @@ def _nearest(
     text = f"the nearest is {scored(detections, d)}, IoU {opinions.iou[k]:.2f}"
     reason = detection_reason(detections, d, config)
     if reason.kind is ReasonKind.BELOW_THRESHOLD:
-        return f"{text}, {not_kept_text(reason)}"
+        return f"{text}, {reason.text}"
     if fusion is not None and clusters is not None and fusion.detection_decision[d] == Decision.MATCHED:
         cluster = int(fusion.detection_cluster[d])
         away = clusters.boxes(config.clustering).distance[cluster]

@@ -1,12 +1,12 @@
 """Reasons of decisions: one vocabulary for stages, explanations, state lanes and the answers of ``why``.
 
-A reason holds the values that were compared and the parameter that decided. Sentences are made from these.
+A reason holds the parameter that decided, and the values that were compared in a clause.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
@@ -332,20 +332,14 @@ class Reason:
     Attributes:
         kind: the rule.
         limit: the parameter that decided, None if no parameter of ours did.
-        values: the values that were compared, by name.
+        text: clause with the values that were compared; empty: the explanation of the decision has them.
+        by: user's function or topic of the robot that decided; empty: bevviz.
     """
 
     kind: ReasonKind
     limit: Limit | None = None
-    values: Mapping[str, Any] = field(default_factory=dict)
-
-    def __getitem__(self, name: str) -> Any:
-        return self.values[name]
-
-
-def make_reason(kind: ReasonKind, config: Config, **values: Any) -> Reason:
-    """Return a reason with the parameter that decided it."""
-    return Reason(kind, limit_of(kind, config), values)
+    text: str = ""
+    by: str = ""
 
 
 # --- owners of stages --------------------------------------------------------------------------

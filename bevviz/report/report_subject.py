@@ -10,7 +10,7 @@ from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
 from bevviz.report.facts import AnswerText, Cause, TriedText
 from bevviz.why import Answer, FrameExplainer, Selection
-from bevviz.why.hints import Hint
+from bevviz.why.answer import Hint
 from bevviz.why.log import focus_point
 
 LISTED = 5  # further objects of the frame that are listed

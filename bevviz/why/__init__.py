@@ -1,7 +1,7 @@
 """Explanations of why an object was reported or missed. Imports `evaluate` and below."""
 
-from bevviz.why.answer import Answer, FrameExplainer, RunExplainer, why
-from bevviz.why.hints import Hint
+from bevviz.why.answer import Answer, Hint
+from bevviz.why.explainer import FrameExplainer, RunExplainer, why
 from bevviz.why.selection import Selection
 from bevviz.why.steps import Step
 from bevviz.why.subject import Subject

@@ -11,8 +11,7 @@ from pydantic import ConfigDict, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.support.json_form import WhereKnown, json_form
-from bevviz.why.answer import Answer
-from bevviz.why.hints import Hint, TriedChange
+from bevviz.why.answer import Answer, Hint, TriedChange
 
 
 @with_config(ConfigDict(extra="allow"))

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from bevviz.config import Config, parameters, plugin_of, preset_differences, values
 from bevviz.config.value_types import CLUSTERING, GROUND
 from bevviz.errors import UserError
-from bevviz.model.reasons import Reason, ReasonKind, facts_of
+from bevviz.model.reasons import ReasonKind, facts_of
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
@@ -137,27 +137,26 @@ def stepped_numbers(stage: str, config: Config, factors: Sequence[float]) -> Ite
 
 
 def changes_for(
-    evidence: Evidence, reason: Reason, traces: FrameIndex, *, is_false: bool = False
+    evidence: Evidence, kind: ReasonKind, traces: FrameIndex, *, is_false: bool = False
 ) -> Iterator[Change]:
     """Yield changes that may help: parameters of our stages, or of the user's function.
 
     Args:
         evidence: evidence about the subject.
-        reason: reason why it was lost, or is false.
+        kind: kind of the reason why it was lost, or is false.
         traces: index of the frame.
         is_false: whether it is a false object.
     """
     result = traces.result
-    stage = facts_of(reason.kind).stage
+    stage = facts_of(kind).stage
     section = "objects" if stage == "fusion" else stage
     if stage in _NEAR and not traces.origin(section).ours:
         yield from _function_changes(result, section)
     if not traces.origin("objects").ours:
         return
-    config = result.config
     for change in (
-        *_our_changes(evidence, reason, config, is_false=is_false),
-        *_stated_height(reason, result),
+        *_our_changes(evidence, kind, result, is_false=is_false),
+        *_stated_height(kind, result),
     ):
         if all(_has_effect(key, traces) for key in change):
             yield change
@@ -194,9 +193,12 @@ def _function_changes(result: FrameResult, section: str) -> Iterator[Change]:
                 yield {f"{section}.params.{name}": other}
 
 
-def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false: bool) -> Iterator[Change]:
-    """Yield changes of our parameters that may help against the reason."""
-    kind, clustering, best = reason.kind, config.clustering, evidence.best
+def _our_changes(
+    evidence: Evidence, kind: ReasonKind, result: FrameResult, *, is_false: bool
+) -> Iterator[Change]:
+    """Yield changes of our parameters that may help against a kind of reason."""
+    config, best, named = result.config, evidence.best, evidence.named
+    clustering, count = config.clustering, 0 if evidence.aside is None else evidence.aside.count
     yield from _restored_values(kind, config)
     if kind is ReasonKind.GROUND:
         yield from _ground_changes(config)
@@ -209,16 +211,16 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
             yield {"clustering.eps": round(clustering.eps * factor, 3)}
         yield from _ground_changes(config)
     elif kind is ReasonKind.TOO_SMALL:
-        yield {"clustering.min_cluster_points": max(reason["count"], 1)}
+        yield {"clustering.min_cluster_points": max(count, 1)}
         yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
     elif kind is ReasonKind.TOO_LARGE:
-        yield {"clustering.max_cluster_points": reason["count"]}
-    elif is_false:
-        yield from _changes_against_false(kind, reason["object"].score, config)
+        yield {"clustering.max_cluster_points": count}
+    elif is_false and named is not None and result.objects is not None:
+        yield from _changes_against_false(kind, float(result.objects.score[named.row]), config)
     elif kind is ReasonKind.MISPLACED:
         yield from _regrouped(config, 0.8, 1.5)
     elif kind is ReasonKind.MERGED:
-        if reason["joined_by"] is not None:
+        if evidence.joined_by is not None:
             yield {"fusion.min_rating": round(2 * config.fusion.min_rating, 4)}
             yield {"fusion.split": False}
         if config.fusion.method == "frustum" and not config.fusion.split:
@@ -236,13 +238,13 @@ def _our_changes(evidence: Evidence, reason: Reason, config: Config, *, is_false
         yield from _detection_changes(kind, best, config)
 
 
-def _stated_height(reason: Reason, result: FrameResult) -> Iterator[Change]:
+def _stated_height(kind: ReasonKind, result: FrameResult) -> Iterator[Change]:
     """Yield the height of the sensor above the lowest points, where the ground was estimated.
 
     It helps where a ceiling, a table or a roof was taken for the ground.
     """
     points = result.frame.points
-    if reason.kind is ReasonKind.GROUND and result.config.ground.sensor_height is None and len(points):
+    if kind is ReasonKind.GROUND and result.config.ground.sensor_height is None and len(points):
         height = -round(float(np.percentile(points[:, 2], LOWEST)), 2)
         if height > 0:
             yield {"ground.sensor_height": height}

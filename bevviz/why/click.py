@@ -13,7 +13,7 @@ from bevviz.recording import entities
 from bevviz.recording.addresses import Address, EntityRows
 from bevviz.recording.primitives import CORNER
 from bevviz.why.selection import Selection
-from bevviz.why.subject import points_in_box, single_box
+from bevviz.why.subject import points_in_box
 
 NEAR_BOX = 0.1  # metres from a box that a click on its edge may be off
 
@@ -103,7 +103,7 @@ def _box_at(result: FrameResult, place: F32) -> Selection | None:
         ("cluster", None if clusters is None else clusters.boxes(result.config.clustering)),
     ):
         for row in range(0 if boxes is None else len(boxes)):
-            if boxes is not None and points_in_box(single_box(boxes, row), place[None], NEAR_BOX).any():
+            if boxes is not None and points_in_box(boxes.chosen([row]), place[None], NEAR_BOX).any():
                 return Selection.of(kind, row)
     return None
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bevviz.model.frame import F32, I64, U8
 from bevviz.model.reasons import Scored
 from bevviz.model.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
@@ -39,8 +41,8 @@ class Candidate:
     overlap: float  # how well it fits the subject, 0 to 1; 1 for the subject itself
     decision: Decision
     cluster: int  # the matched cluster, or the best one that was refused, else -1
-    own: bool = True  # whether it is a detection of the subject, and not of another object that it fits, too
-    owner: int = -1  # row of the ground truth object that it is the box of, -1: none
+    own: bool  # whether it is a detection of the subject, and not of another object that it fits, too
+    owner: int  # row of the ground truth object that it is the box of, -1: none
 
     @property
     def label(self) -> Scored:
@@ -135,6 +137,12 @@ class Evidence:
     joined_by: Scored | None
     apart: float
     in_view: bool
+
+    @property
+    def ground_span(self) -> tuple[float, float]:
+        """Lowest and highest known height of its ground voxels; NaN: none is known."""
+        known = self.ground[np.isfinite(self.ground)]
+        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
 
     @property
     def raw(self) -> int:

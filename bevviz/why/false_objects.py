@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,8 @@ from bevviz.model.reasons import Reason, ReasonKind, scored
 from bevviz.model.results import Decision, Objects
 from bevviz.why.evidence import MOST, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex, detection_subject
-from bevviz.why.subject import MARGIN, points_in_box, single_box
+from bevviz.why.reason_text import WITHIN
+from bevviz.why.subject import MARGIN, points_in_box
 from bevviz.why.subject_matches import opinion_on
 
 LARGER = 1.5  # a cluster that is this many times as long as the object's box is no such object
@@ -52,7 +52,6 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
     assert traces.matches is not None
     name, partner = objects.names[row], traces.matches.partner
     owner = _owner(traces, objects, row)
-    values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
     holder = _holder_of_points(traces, objects, row)
     inside = _label_around(traces, objects, row)
     for number in dict.fromkeys((holder, owner, inside)):
@@ -61,45 +60,68 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
         subject = traces.truth[number]
         assert subject.box is not None
         away = float(np.linalg.norm(objects.boxes.center[row, :2] - subject.box.center[0, :2]))
-        values |= {"truth": subject.name, "away": away, "inside": number == inside}
         other = np.flatnonzero(partner == number)
         if len(other) and (number in (holder, inside) or away <= MAX_DISTANCE):
-            values["other"] = scored(objects, int(other[0]))
-            near = away <= MAX_DISTANCE or number in (owner, inside)
-            return Reason(ReasonKind.DUPLICATE if near else ReasonKind.SPLIT, None, values)
+            first = scored(objects, int(other[0]))
+            if number == inside:
+                whole = f"it is inside the box of {subject.name}"
+                text = f"{whole}: a second box of it, which {first} is already"
+            else:
+                text = f"it is a duplicate: {subject.name} is {first} already"
+            if away <= MAX_DISTANCE or number in (owner, inside):
+                return Reason(ReasonKind.DUPLICATE, text=text)
+            text = f"its points are a part of {subject.name}, which {first} is already"
+            return Reason(ReasonKind.SPLIT, text=text)
         if number in (holder, inside) and not subject.accepts(name):
-            return Reason(ReasonKind.MISNAMED, None, values)
+            return Reason(ReasonKind.MISNAMED, text=f"its points are those of {subject.name}")
         if number in (holder, inside):
-            return Reason(ReasonKind.MISPLACED, None, values)
-    values |= {"truth": traces.truth[owner].name if owner >= 0 else "", "off": 0.0}
+            text = f"its points are those of {subject.name}, {away:.1f} m from it ({WITHIN})"
+            return Reason(ReasonKind.MISPLACED, text=text)
+    size = _larger_whole(traces, objects, row)
     if owner >= 0:
-        truth_box = traces.truth[owner].box
-        assert truth_box is not None
-        values["off"] = float(objects.boxes.distance[row] - truth_box.distance[0])
-    if (size := _larger_whole(traces, objects, row)) is not None:
-        return Reason(ReasonKind.WALL, None, {**values, "size": size})
-    if owner >= 0:
-        return Reason(ReasonKind.WRONG_DEPTH, None, values)
+        truth = traces.truth[owner]
+        assert truth.box is not None
+        side = _side(float(objects.boxes.distance[row] - truth.box.distance[0]))
+        if size is not None:
+            return _wall(objects, row, size, f", {side} {truth.name}")
+        text = f"its 2D box is that of {truth.name}, and its cluster {objects.cluster[row]} is {side} it"
+        return Reason(ReasonKind.WRONG_DEPTH, text=text)
+    if size is not None:
+        return _wall(objects, row, size)
+    text = "no label is in reach: it is unlabelled, or the detector's own error"
     opinion = "" if traces.origin("objects").ours else opinion_on(traces.result, row)
-    return Reason(ReasonKind.DETECTOR_ERROR, None, {"object": values["object"], "opinion": opinion})
+    return Reason(ReasonKind.DETECTOR_ERROR, text=f"{text}, and it is {opinion}" if opinion else text)
+
+
+def _side(off: float) -> str:
+    """Say how far an object is before or behind the thing of its 2D box."""
+    return f"{abs(off):.1f} m {'behind' if off > 0 else 'before'}"
+
+
+def _wall(objects: Objects, row: int, size: tuple[float, float], where: str = "") -> Reason:
+    """Return the reason for an object that is a part of something of this length and height."""
+    larger = f"something {size[0]:.1f} m long and {size[1]:.1f} m high in the frustum{where}"
+    text = f"its points (cluster {objects.cluster[row]}) are a part of {larger}"
+    return Reason(ReasonKind.WALL, text=text)
 
 
 def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
     """Return what makes an object doubtful, None if nothing does."""
-    values: dict[str, Any] = {"object": scored(objects, row), "cluster": int(objects.cluster[row])}
     better = np.flatnonzero(objects.score > objects.score[row])
     better = better[[objects.names[other] == objects.names[row] for other in better]]
-    overlap = box_overlap.bev_iou(single_box(objects.boxes, row), objects.boxes)[0]
+    overlap = box_overlap.bev_iou(objects.boxes.chosen([row]), objects.boxes)[0]
     doubles = better[overlap[better] >= DOUBLE]
     if len(doubles):
         other = scored(objects, int(doubles[overlap[doubles].argmax()]))
-        return Reason(ReasonKind.DUPLICATE, None, {**values, "truth": "", "other": other})
+        return Reason(ReasonKind.DUPLICATE, text=f"it is a duplicate: its box overlaps that of {other}")
     size = _larger_whole(traces, objects, row)
     if size is not None and _is_barely_accepted(traces, objects, row):
-        return Reason(ReasonKind.WALL, None, {**values, "truth": "", "size": size})
+        return _wall(objects, row, size)
     off = _off_its_box(traces, objects, row)
     if off < -DEPTH:  # A right object may be behind the points that hide its middle.
-        return Reason(ReasonKind.WRONG_DEPTH, None, {**values, "truth": "", "off": off})
+        middle = "the points in the middle of its 2D box"
+        text = f"its cluster {objects.cluster[row]} is {_side(off)} {middle}"
+        return Reason(ReasonKind.WRONG_DEPTH, text=text)
     return None
 
 
@@ -120,7 +142,7 @@ def _holder_of_points(traces: FrameIndex, objects: Objects, row: int) -> int:
     center, reach = truth.boxes.center[:, :2], np.hypot(*truth.boxes.size[:, :2].T)[:, None] / 2 + MARGIN
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     near = np.flatnonzero(((center + reach >= low) & (center - reach <= high)).all(axis=1)).tolist()
-    shares = {k: float(points_in_box(single_box(truth.boxes, k), points).mean()) for k in near}
+    shares = {k: float(points_in_box(truth.boxes.chosen([k]), points).mean()) for k in near}
     holder = max(shares, key=lambda k: shares[k], default=-1)
     return holder if holder >= 0 and shares[holder] >= MOST else -1
 
@@ -130,7 +152,7 @@ def _label_around(traces: FrameIndex, objects: Objects, row: int) -> int:
     truth = traces.labels_in_evaluate
     if truth is None or not len(truth.boxes):
         return -1
-    box = single_box(objects.boxes, row)
+    box = objects.boxes.chosen([row])
     is_larger = np.prod(truth.boxes.size[:, :2], axis=1) >= np.prod(box.size[:, :2])
     shares = np.where(is_larger, box_overlap.bev_iou_and_share(box, truth.boxes)[1][0], 0)
     return int(shares.argmax()) if shares.max() >= INSIDE else -1

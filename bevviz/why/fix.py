@@ -23,7 +23,7 @@ from bevviz.model.reasons import FACTS, facts_of
 from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.session import Variants
 from bevviz.support.json_form import json_form, rounded
-from bevviz.why.answer import FrameExplainer
+from bevviz.why.explainer import FrameExplainer
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.parameter_search import Settings, search
 from bevviz.why.selection import Selection

@@ -18,7 +18,7 @@ from bevviz.model.reasons import Reason, StageOwner, owner_of
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.visibility import image_boxes, share_in_image
 from bevviz.why.detection_fits import Fits, find_fits
-from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, points_in_boxes, single_box
+from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, points_in_boxes
 
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
@@ -454,7 +454,7 @@ def truth_subjects(truth: Truth) -> tuple[Subject, ...]:
             label,
             truth.accepted[row],
             row,
-            box=single_box(truth.boxes, row),
+            box=truth.boxes.chosen([row]),
         )
         for row, label in enumerate(truth.labels)
     )

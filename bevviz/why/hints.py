@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import islice, product
 from typing import Any
 
 import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
-from bevviz.evaluate.differences import BeforeAfter, before_after
+from bevviz.evaluate.differences import before_after
 from bevviz.model.reasons import Reason, ReasonKind
+from bevviz.why.answer import Answer, Hint, TriedChange
 from bevviz.why.changes import (
     FAR_STEPS,
     STEPS,
@@ -27,10 +28,9 @@ from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.ideal import STAGES, StageSet
 from bevviz.why.neighbours import NeighbourRuns
-from bevviz.why.reason_values import ReasonValues
 from bevviz.why.reruns import FrameRuns
 from bevviz.why.subject import Subject
-from bevviz.why.verdict import FALSE, FLAWED, HOPELESS, find_reason, stage_of
+from bevviz.why.verdict import FLAWED, HOPELESS, find_reason, stage_of
 
 TRIES = 10  # changes for the reason
 LATER = 12  # changes that are tried after one that helps the frame in question alone
@@ -39,120 +39,46 @@ OFFERED = 3  # hints of one answer
 MISSED = "it stays missed"
 
 
-@dataclass(frozen=True, slots=True)
-class _Question:
-    """A subject, and the reason why it was lost or is false."""
-
-    subject: Subject
-    evidence: Evidence
-    reason: Reason
-    reported: bool
-
-    @property
-    def is_false(self) -> bool:
-        """Whether it is a false object."""
-        return self.reason.kind in FALSE and self.subject.kind == "object"
-
-
-@dataclass(frozen=True, slots=True)
-class Hint:
-    """Settings that change the verdict, and their effects, found by running the stages again.
-
-    Attributes:
-        settings: settings as ``--set`` takes them.
-        text: the result for the subject.
-        effects: objects of the frame that change.
-        balance: number of objects that it fixes, the subject included, minus those that it breaks.
-        beside: the same for the frames before and after, None: they are not known.
-    """
-
-    settings: tuple[str, ...]
-    text: str
-    effects: BeforeAfter
-    balance: int = 1
-    beside: int | None = None
-
-    @property
-    def is_good(self) -> bool:
-        """Whether it fixes more than it breaks, and breaks no more in the frames before and after."""
-        return self.balance > 0 and (self.beside or 0) >= 0
-
-    @property
-    def objection(self) -> str:
-        """The result, and what speaks against it."""
-        if self.balance > 0:
-            return f"{self.text}, but it breaks more than it fixes in the frames before and after"
-        return f"{self.text}, but it breaks as much as it fixes: {self.effects.text}"
-
-
-@dataclass(frozen=True, slots=True)
-class TriedChange:
-    """Change of parameters that was run and does not help."""
-
-    settings: tuple[str, ...]
-    """key=value each"""
-    text: str
-    """its result"""
-
-
-@dataclass(frozen=True, slots=True)
-class HintSearch:
-    """Result of the search for hints on one subject.
-
-    Attributes:
-        hints: the best change that changes the verdict; empty: no tried change does.
-        tried: the changes that were run and did not help.
-    """
-
-    hints: tuple[Hint, ...]
-    tried: tuple[TriedChange, ...]
-
-
 class HintFinder:
-    """Finder of changes that help.
+    """Finder of changes that help one subject.
 
     Args:
         traces: index of the frame's result.
         runs: runs of the frame with other parameters.
         neighbours: runs of the frames before and after.
+        answer: the answer about the subject.
     """
 
-    def __init__(self, traces: FrameIndex, runs: FrameRuns, neighbours: NeighbourRuns) -> None:
-        self._traces, self._runs, self._neighbours = traces, runs, neighbours
+    def __init__(
+        self, traces: FrameIndex, runs: FrameRuns, neighbours: NeighbourRuns, answer: Answer
+    ) -> None:
+        self._traces, self._runs, self._neighbours, self._answer = traces, runs, neighbours, answer
+        self._subject, self._verdict = answer.subject, answer.verdict
         self._change_of: dict[tuple[str, ...], Change] = {}  # by settings, of the hints
+        self._hints: list[Hint] = []
+        self._tried: list[TriedChange] = []
+        self._faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
 
-    def search(
-        self,
-        subject: Subject,
-        evidence: Evidence,
-        reason: Reason,
-        reported: bool,
-        restored_by: Sequence[StageSet] = (),
-        likely: Sequence[ReasonKind] = (),
-    ) -> HintSearch:
+    def search(self) -> Answer:
         """Search the mildest change that changes the verdict and makes no other object worse.
 
-        If each helpful change makes another object worse, return those that fix more objects than they break,
-        the best first. The others count as tried in vain. If none does, a missed object that is found with a
-        fault is better than none.
+        If each helpful change makes another object worse, the hints are those that fix more objects than they
+        break, the best first. The others count as tried in vain. If none does, a missed object that is found
+        with a fault is better than none.
         """
-        question = _Question(subject, evidence, reason, reported)
-        is_false = question.is_false
-        hints: list[Hint] = []
-        tried: list[TriedChange] = []
-        faulty: dict[TriedChange, Hint] = {}  # the object is found then, but it has a fault
+        hints, tried, faulty = self._hints, self._tried, self._faulty
         left = 0  # changes that are still tried after one that helps this frame alone
-        for number, change in enumerate(self._changes(question, restored_by, likely)):
-            if number >= TRIES and self._stays_missed(question, change):
+        for number, change in enumerate(self._changes()):
+            if number >= TRIES and self._stays_missed(change):
                 tried.append(TriedChange(_settings(change), MISSED))
                 continue
             after = self._runs.with_change(change)
             if after is None:
                 continue
-            if is_false:
-                self._try_on_false(subject, change, after, hints, tried)
+            if self._answer.false:
+                self._try_on_false(change, after)
             else:
-                self._try_on_missed(question, change, after, hints, tried, faulty)
+                self._try_on_missed(change, after)
             if hints and not hints[-1].effects.harm and hints[-1].balance > 0:
                 hints[-1] = self._with_beside(hints[-1])
                 if hints[-1].beside is None or hints[-1].beside > 0:
@@ -163,7 +89,7 @@ class HintFinder:
                 break
         if not any(hint.balance > 0 for hint in hints):
             hints += [hint for hint in faulty.values() if hint.balance > 0][:1]
-            tried = [
+            tried[:] = [
                 replace(change, text=f"{change.text}, and it breaks as much") if change in faulty else change
                 for change in tried
                 if faulty.get(change) not in hints
@@ -172,7 +98,8 @@ class HintFinder:
         best = [*map(self._with_beside, likely_hints[: 2 * OFFERED]), *likely_hints[2 * OFFERED :]]
         best.sort(key=lambda hint: (-(hint.beside or 0), -hint.balance))
         tried += [TriedChange(hint.settings, hint.objection) for hint in best if not hint.is_good]
-        return HintSearch(tuple(hint for hint in best if hint.is_good)[:OFFERED], tuple(tried))
+        good = tuple(hint for hint in best if hint.is_good)
+        return replace(self._answer, hints=good[:OFFERED], tried=tuple(tried))
 
     def _with_beside(self, hint: Hint) -> Hint:
         """Return a good hint with its effect on the frames before and after."""
@@ -180,12 +107,10 @@ class HintFinder:
             return hint
         return replace(hint, beside=self._neighbours.balance(self._change_of[hint.settings]))
 
-    def _changes(
-        self, question: _Question, restored_by: Sequence[StageSet], likely: Sequence[ReasonKind]
-    ) -> Iterator[Change]:
+    def _changes(self) -> Iterator[Change]:
         """Yield the changes to try, each once: those for the reason, for the stages, then combined ones."""
-        traces, evidence, reason = self._traces, question.evidence, question.reason
-        blamed = stage_of(reason.kind, evidence)
+        traces, evidence, kind = self._traces, self._answer.evidence, self._verdict.kind
+        restored_by, is_false = self._verdict.restored_by, self._answer.false
         stages = tuple(dict.fromkeys(stage for stages in restored_by for stage in stages))
         alone = tuple(stage for (stage,) in (one for one in restored_by if len(one) == 1))
         tried: set[tuple[tuple[str, Any], ...]] = set()
@@ -197,14 +122,13 @@ class HintFinder:
                     tried.add(key)
                     yield change
 
-        values = ReasonValues(question.subject, evidence, traces)
-        for either in (reason, *(values.reason(kind) for kind in likely[1:])):
-            steered = changes_for(evidence, either, traces, is_false=question.is_false)
-            yield from new(islice(steered, TRIES))
-        if question.is_false or not self._is_ours():
+        for cause in (kind, *self._answer.likely[1:]):
+            yield from new(islice(changes_for(evidence, cause, traces, is_false=is_false), TRIES))
+        if is_false or not traces.origin("objects").ours:
             return
+        blamed = stage_of(kind, evidence)
         nearest = alone or stages or tuple(stage for stage in STAGES if stage == blamed)
-        if reason.kind in (*HOPELESS, ReasonKind.NOT_RUN) or not nearest:
+        if kind in (*HOPELESS, ReasonKind.NOT_RUN) or not nearest:
             return
         yield from new(restored_values(traces.result.config))
         config = traces.result.config
@@ -212,14 +136,14 @@ class HintFinder:
             yield from new(stage_changes(stage, config))
         for needed in restored_by:
             if len(needed) > 1:
-                yield from new(self._combined(question.subject, needed))
+                yield from new(self._combined(needed))
         if "detector" in nearest:  # Lower limits of the fusion let weaker detections pass.
             yield from new(stepped_numbers("fusion", config, STEPS[:1]))
         others = [stage for stage in STAGES if stage not in nearest]
         yield from new(change for stage in others for change in stage_changes(stage, config, ()))
         yield from new(change for stage in nearest for change in stepped_numbers(stage, config, FAR_STEPS))
 
-    def _combined(self, subject: Subject, needed: StageSet) -> Iterator[Change]:
+    def _combined(self, needed: StageSet) -> Iterator[Change]:
         """Yield combined changes of several stages.
 
         Each one alone brings the object back if the other stages have their ideal results.
@@ -230,7 +154,7 @@ class HintFinder:
             changes = (
                 change
                 for change in stage_changes(stage, self._traces.result.config)
-                if self._runs.is_found(subject, change, others)
+                if self._runs.is_found(self._subject, change, others)
             )
             helpful.append([*islice(changes, HELPFUL)])
         for changes_of_stages in product(*helpful):
@@ -239,26 +163,14 @@ class HintFinder:
                 combined |= change
             yield combined
 
-    def _is_ours(self) -> bool:
-        """Return whether the objects come from our fusion."""
-        return self._traces.origin("objects").ours
-
-    def _stays_missed(self, question: _Question, change: Change) -> bool:
+    def _stays_missed(self, change: Change) -> bool:
         """Return whether a missed object of the ground truth is missed with a change, too."""
-        subject = question.subject
+        subject = self._subject
         return self._runs.wanted(subject) is not None and not self._runs.is_found(subject, change, ())
 
-    def _try_on_missed(
-        self,
-        question: _Question,
-        change: Change,
-        after: FrameIndex,
-        hints: list[Hint],
-        tried: list[TriedChange],
-        faulty: dict[TriedChange, Hint],
-    ) -> None:
-        """Add the result of a change on a missed object, or on one with a fault, to the hints or the rest."""
-        subject, reason, reported = question.subject, question.reason, question.reported
+    def _try_on_missed(self, change: Change, after: FrameIndex) -> None:
+        """Try a change on a missed object, or on one with a fault."""
+        subject, reason, reported = self._subject, self._verdict.reason, self._verdict.reported
         then = collect_evidence(subject, after)
         new, now_reported = find_reason(subject, then, after)
         text, object_row = _new_outcome(
@@ -266,12 +178,12 @@ class HintFinder:
         )
         if text and _is_sure(subject, change, then):
             row = subject.row if subject.kind == "truth" else -1
-            hints.append(self._hint(change, text, after, row, object_row))
+            self._hints.append(self._hint(change, text, after, row, object_row))
             return
         result = _result_text(subject, reason, new, now_reported, then)
-        tried.append(TriedChange(_settings(change), result))
+        self._tried.append(TriedChange(_settings(change), result))
         if now_reported and not reported and subject.kind == "truth" and then.named is not None:
-            faulty[tried[-1]] = self._hint(change, result, after, subject.row, then.named.row)
+            self._faulty[self._tried[-1]] = self._hint(change, result, after, subject.row, then.named.row)
 
     def _hint(self, change: Change, text: str, after: FrameIndex, asked: int = -1, own: int = -1) -> Hint:
         """Return a hint with its effects on all objects of the frame, as ``evaluate`` counts them."""
@@ -294,10 +206,9 @@ class HintFinder:
         flawed = 1 if right == false == 0 and not changed.harm else 0  # The subject loses a flaw alone.
         return Hint(_settings(change), text, changed, right - false + flawed)
 
-    def _try_on_false(
-        self, subject: Subject, change: Change, after: FrameIndex, hints: list[Hint], tried: list[TriedChange]
-    ) -> None:
-        """Add the result of a change on a false object to the hints or to the tried changes."""
+    def _try_on_false(self, change: Change, after: FrameIndex) -> None:
+        """Try a change on a false object."""
+        subject = self._subject
         objects = after.result.objects
         if objects is None or subject.box is None:
             return
@@ -307,9 +218,9 @@ class HintFinder:
         if away.min(initial=np.inf) <= MAX_DISTANCE:
             text = "it is right then" if self._traces.truth else "nothing about it is doubtful then"
             if int(away.argmin()) in false_reasons(after):
-                tried.append(TriedChange(_settings(change), "it stays false"))
+                self._tried.append(TriedChange(_settings(change), "it stays false"))
                 return
-        hints.append(self._hint(change, text, after))
+        self._hints.append(self._hint(change, text, after))
 
 
 def _new_outcome(

@@ -85,7 +85,7 @@ def log_answers(
     for answer in drawn:
         box = answer.subject.box
         lines = [] if box is None else [edges(geometry.corners(replace(box, size=box.size + _MARGIN))[0])]
-        lines += [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
+        lines += [strip for camera in frame.cameras for strip in _frustums(camera, answer)]
         strips += lines
         widths += [2.5 if answer is drawn[0] else 0.5] * len(lines)
     points, place = entities.WHY_PART.path("points"), entities.WHY_PART.path("place")
@@ -186,7 +186,7 @@ def focus_answer(to: Writer, result: FrameResult, answer: Answer, number: int) -
     frame = result.frame
     boxes, place = _image_boxes(frame, answer), focus_point(frame, answer)
     if place is None:
-        strips = [strip for camera in frame.cameras for strip in _frustums(camera, [answer])]
+        strips = [strip for camera in frame.cameras for strip in _frustums(camera, answer)]
         place = np.concatenate(strips).mean(axis=0) if strips else None
     focus = Focus.on(frame, place, _length(answer), boxes)
     log_focus(to, frame, focus, number)
@@ -211,17 +211,16 @@ def _length(answer: Answer) -> float:
     return _LENGTH if answer.subject.box is None else float(answer.subject.box.size.max())
 
 
-def _frustums(camera: Camera, answers: Sequence[Answer]) -> Iterator[F32]:
-    """Yield the frustums of the camera's subjects as line strips in Frame.points_frame."""
+def _frustums(camera: Camera, answer: Answer) -> list[F32]:
+    """Return the frustum of an answer's image box in a camera as line strips in Frame.points_frame."""
+    subject = answer.subject
     if camera.intrinsics is None or camera.camera_from_points is None:
-        return
-    points_from_camera = geometry.inverse(camera.camera_from_points)
-    for answer in answers:
-        subject = answer.subject
-        if subject.xyxy is not None and subject.camera == camera.name:
-            far = _DEPTH if np.isnan(answer.distance) else answer.distance
-            corners = geometry.frustum(subject.xyxy[None], camera.intrinsics, 0.5, far)[0]
-            yield edges(geometry.apply(points_from_camera, corners))
+        return []
+    if subject.xyxy is None or subject.camera != camera.name:
+        return []
+    far = _DEPTH if np.isnan(answer.distance) else answer.distance
+    corners = geometry.frustum(subject.xyxy[None], camera.intrinsics, 0.5, far)[0]
+    return [edges(geometry.apply(geometry.inverse(camera.camera_from_points), corners))]
 
 
 def _image_layers(camera: Camera, answers: Sequence[Answer]) -> Iterator[Layer]:

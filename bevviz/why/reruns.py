@@ -13,7 +13,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.evaluate import judge
 from bevviz.model.frame import Camera
-from bevviz.model.results import Detections, DetectionState
+from bevviz.model.results import Detections, DetectionState, FrameResult
 from bevviz.pipeline.perceive import perceive
 from bevviz.pipeline.stage_loader import DetectFunction, StageLoader
 from bevviz.pipeline.stage_log import Memo
@@ -54,17 +54,22 @@ class FrameRuns:
         """Run the frame with a change. None: the configuration cannot be run."""
         key = tuple(sorted(change.items()))
         if key not in self._runs:
-            try:
-                config = with_changes(self._result.config, change)
-                stages = self._loader.load(config, self._known_detections(config, change))
-            except (UserError, ValidationError):  # the model file has gone, or the value is out of bounds
-                self._runs[key] = None
-            else:
-                result = perceive(self._result.frame, config, stages, self._memo)
-                self._runs[key] = self._traces.for_result(result)
+            result = self._run(change)
+            self._runs[key] = None if result is None else self._traces.for_result(result)
             while len(self._runs) > RUNS:
                 del self._runs[next(iter(self._runs))]
         return self._runs[key]
+
+    def _run(
+        self, change: Change, ideal: StageSet = (), edits: IdealStages | None = None
+    ) -> FrameResult | None:
+        """Run the frame with a change, and with the ideal results of stages. None: it cannot be run."""
+        try:
+            config = with_changes(self._result.config, change) if change else self._result.config
+            stages = self._loader.load(config, self._known_detections(config, change))
+        except (UserError, ValidationError):  # the model file has gone, or the value is out of bounds
+            return None
+        return perceive(self._result.frame, ideal_config(config, ideal), stages, self._memo, edits=edits)
 
     def is_found(self, subject: Subject, change: Change, ideal: StageSet) -> bool:
         """Return whether a missed object is found with a change, if other stages have their ideal results."""
@@ -80,14 +85,9 @@ class FrameRuns:
         """Return the missed objects that are found with a change and the ideal results of other stages."""
         truth = wanted.traces.labels_in_evaluate
         assert truth is not None
-        try:
-            config = with_changes(self._result.config, change) if change else self._result.config
-            stages = self._loader.load(config, self._known_detections(config, change))
-        except (UserError, ValidationError):
-            return frozenset()
         edits = IdealStages(wanted.traces, wanted.missed, ideal, self._memo)
-        after = perceive(self._result.frame, ideal_config(config, ideal), stages, self._memo, edits=edits)
-        if after.objects is None:
+        after = self._run(change, ideal, edits)
+        if after is None or after.objects is None:
             return frozenset()
         return frozenset(wanted.missed) - {*np.flatnonzero(judge(after.objects, truth).missed).tolist()}
 

@@ -17,7 +17,7 @@ from bevviz.support.text import did_you_mean
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import CORE, FEW, Fate, FrameIndex, detection_subject
 from bevviz.why.selection import Selection
-from bevviz.why.subject import IN_VIEW, LINK, NOISE, Subject, projected_box, single_box
+from bevviz.why.subject import IN_VIEW, LINK, NOISE, Subject, projected_box
 from bevviz.why.subject_matches import OVERLAP
 
 PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
@@ -34,7 +34,8 @@ def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
     """
     result = traces.result
     if selection.truth is not None:
-        return [_subject_of_row(traces.truth, selection.truth, "object in the ground truth of this frame")]
+        _check_row(selection.truth, len(traces.truth), "object in the ground truth of this frame of number")
+        return [traces.truth[selection.truth]]
     if selection.object is not None:
         return [object_subject(traces, selection.object)]
     if selection.cluster is not None:
@@ -43,11 +44,8 @@ def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
         return [track_subject(traces, selection.track)]
     if selection.detection is not None:
         camera = camera_of(traces, selection.camera)
-        number = 0 if camera.detections is None else len(camera.detections)
-        if not 0 <= selection.detection < number:
-            raise UserError(
-                f"there is no detection {selection.detection} in {camera.camera.name}: it has {number}"
-            )
+        number, where = len(camera.detections or ()), f" in {camera.camera.name}"
+        _check_row(selection.detection, number, "detection", where)
         return [detection_subject(result, camera, selection.detection)]
     if selection.point or selection.cell:
         return [_surroundings(traces, selection)]
@@ -78,11 +76,10 @@ def _is_called(subject: Subject, name: str) -> bool:
     return subject.kind == "truth" and subject.accepts(name)
 
 
-def _subject_of_row(subjects: tuple[Subject, ...], row: int, what: str) -> Subject:
-    """Return the subject of a row, or raise a UserError."""
-    if not 0 <= row < len(subjects):
-        raise UserError(f"there is no {what} of number {row}: it has {len(subjects)}")
-    return subjects[row]
+def _check_row(row: int, number: int, what: str, where: str = "") -> None:
+    """Check that there is a row, else raise a UserError."""
+    if not 0 <= row < number:
+        raise UserError(f"there is no {what} {row}{where}: it has {number}")
 
 
 def object_subject(traces: FrameIndex, row: int) -> Subject:
@@ -92,10 +89,9 @@ def object_subject(traces: FrameIndex, row: int) -> Subject:
         UserError: the frame has no such object.
     """
     objects = traces.result.objects
-    number = 0 if objects is None else len(objects)
-    if objects is None or not 0 <= row < number:
-        raise UserError(f"there is no object {row} in this frame: it has {number}")
-    box, name = single_box(objects.boxes, row), objects.names[row]
+    _check_row(row, len(objects or ()), "object", " in this frame")
+    assert objects is not None
+    box, name = objects.boxes.chosen([row]), objects.names[row]
     away = float(box.distance[0])
     cluster = int(objects.cluster[row])
     points = np.flatnonzero(traces.cluster == cluster) if cluster >= 0 else None
@@ -110,11 +106,10 @@ def cluster_subject(traces: FrameIndex, row: int) -> Subject:
         UserError: the frame has no such cluster.
     """
     clusters = traces.result.clusters
-    number = 0 if clusters is None else len(clusters)
-    if clusters is None or not 0 <= row < number:
-        raise UserError(f"there is no cluster {row} in this frame: it has {number}")
+    _check_row(row, len(clusters or ()), "cluster", " in this frame")
+    assert clusters is not None
     points = np.flatnonzero(traces.cluster == row)
-    box = single_box(clusters.boxes(traces.result.config.clustering), row)
+    box = clusters.boxes(traces.result.config.clustering).chosen([row])
     name = f"cluster {row} at {box.distance[0]:.1f} m"
     return Subject("cluster", name, row=row, box=box, points=points)
 
@@ -133,7 +128,7 @@ def track_subject(traces: FrameIndex, number: int) -> Subject:
         known = ", ".join(map(str, tracks.id[:10].tolist())) or "none"
         raise UserError(f"there is no track {number} in this frame; there are {known}")
     row = int(rows[0])
-    box, name, cluster = single_box(tracks.boxes, row), tracks.names[row], int(tracks.cluster[row])
+    box, name, cluster = tracks.boxes.chosen([row]), tracks.names[row], int(tracks.cluster[row])
     if tracks.absolute:
         box = geometry.transform_boxes(box, geometry.inverse(frame.pose))
     title = f"track {number}{f' ({name})' if name else ''} at {float(box.distance[0]):.1f} m"

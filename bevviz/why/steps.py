@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from bevviz.model.decisions import detection_reason, not_kept_text
+from bevviz.model.decisions import detection_reason
 from bevviz.model.reasons import ReasonKind, kind_of, limit, limit_of, scored
 from bevviz.model.results import Decision, DetectionState, Opinion
 from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
 from bevviz.why.frame_index import FrameIndex
-from bevviz.why.reason_values import detector_ran, name_of, not_run
+from bevviz.why.reason_text import detector_ran, name_of, not_run
 from bevviz.why.subject import Subject, projected_box
 from bevviz.why.subject_matches import find_fused, opinion_on
 
@@ -98,12 +98,12 @@ def _camera_steps(subject: Subject, traces: FrameIndex) -> Iterator[Step]:
 
 def _ground_step(evidence: Evidence, traces: FrameIndex) -> Step:
     """Return the step of the ground removal."""
-    known = evidence.ground[np.isfinite(evidence.ground)]
+    lowest, highest = evidence.ground_span
     text = f"{len(evidence.ground)} of {evidence.voxels} voxels removed as ground"
     numbers: dict[str, Any] = {"removed": len(evidence.ground)}
-    if len(known):
-        text += f", {float(known.min()):z.2f} to {float(known.max()):z.2f} m above the local ground"
-        numbers |= {"lowest": round(float(known.min()), 3), "highest": round(float(known.max()), 3)}
+    if np.isfinite(highest):
+        text += f", {lowest:z.2f} to {highest:z.2f} m above the local ground"
+        numbers |= {"lowest": round(lowest, 3), "highest": round(highest, 3)}
     config, owner = traces.result.config, traces.origin("ground")
     if not owner.ours:
         return Step("ground", f"{text} ({owner.name})", {**numbers, "by": owner.name})
@@ -198,8 +198,7 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) ->
         }
         if candidate.state == DetectionState.SUPPRESSED:
             numbers["suppressed_by"] = int(detections.suppressed_by[candidate.row])
-        reason = detection_reason(detections, candidate.row, config)
-        state = "kept" if candidate.kept else not_kept_text(reason)
+        state = "kept" if candidate.kept else detection_reason(detections, candidate.row, config).text
         if not candidate.own and candidate.owner >= 0:
             state += f", the box of {traces.truth[candidate.owner].name}"
         yield Step("detector", f"{candidate.label}{by}, overlap {candidate.overlap:.2f}: {state}", numbers)

@@ -81,11 +81,6 @@ def count(number: int, noun: str) -> str:
 # --- boxes -------------------------------------------------------------------------------------
 
 
-def single_box(boxes: Boxes3D, row: int) -> Boxes3D:
-    """Return one box of several."""
-    return Boxes3D(boxes.center[[row]], boxes.size[[row]], boxes.yaw[[row]])
-
-
 def points_in_box(box: Boxes3D, points: F32, margin: float = 0.0, foot: float = 0.0) -> Bool:
     """Return (N,) which points are in one upright box, except near or below its bottom."""
     return points_in_boxes(box, points, margin, foot)

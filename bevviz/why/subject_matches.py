@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from bevviz.model.reasons import Scored, scored
 from bevviz.model.results import CameraResult, Decision, DetectionState, FrameResult, Fusion
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.frame_index import FEW, PART, FrameIndex
-from bevviz.why.subject import LINK, Subject, points_in_box, projected_box, single_box
+from bevviz.why.subject import LINK, Subject, points_in_box, projected_box
 
 SURE = 0.5  # overlap from which a detection surely belongs to its object
 COVERED = 0.8  # share of a cluster's image box that a detection of it covers
@@ -32,9 +31,8 @@ def find_candidates(
         rows, overlap = _rows_of_subject(subject, traces, camera, parts)
         fits = traces.fits(camera)
         for row in rows.tolist():
-            candidate, owner = _candidate(camera, row, float(overlap[row])), int(fits.owner[row])
             own = subject.kind != "truth" or fits.belongs(row, subject.row)
-            candidates.append(replace(candidate, own=own, owner=owner))
+            candidates.append(_candidate(camera, row, float(overlap[row]), own, int(fits.owner[row])))
     return tuple(candidates)
 
 
@@ -119,7 +117,7 @@ def sort_candidates(
     return tuple(sorted(candidates, key=rank))
 
 
-def _candidate(result: CameraResult, row: int, overlap: float) -> Candidate:
+def _candidate(result: CameraResult, row: int, overlap: float, own: bool, owner: int) -> Candidate:
     """Return a detection with the decisions about it."""
     detections, fusion = result.detections, result.fusion
     assert detections is not None
@@ -135,6 +133,8 @@ def _candidate(result: CameraResult, row: int, overlap: float) -> Candidate:
         overlap,
         decision,
         cluster,
+        own,
+        owner,
     )
 
 
@@ -287,7 +287,7 @@ def _objects_at_place(subject: Subject, traces: FrameIndex) -> Iterator[int]:
     if subject.kind in ("detection", "pixel"):
         camera = traces.camera(subject.camera)
         for row in range(len(objects)):
-            box = projected_box(single_box(objects.boxes, row), camera.camera) if camera is not None else None
+            box = projected_box(objects.boxes.chosen([row]), camera.camera) if camera is not None else None
             if box is None or subject.xyxy is None:
                 continue
             if subject.kind == "pixel" or geometry.iou(box[None], subject.xyxy[None])[0, 0] >= LINK:
@@ -296,7 +296,7 @@ def _objects_at_place(subject: Subject, traces: FrameIndex) -> Iterator[int]:
     mine = points[traces.place(subject)]
     share = np.array(
         [
-            points_in_box(single_box(objects.boxes, row), mine).mean() if len(mine) else 0
+            points_in_box(objects.boxes.chosen([row]), mine).mean() if len(mine) else 0
             for row in range(len(objects))
         ]
     )

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.evaluate import MAX_DISTANCE
-from bevviz.model.decisions import pair_reason
-from bevviz.model.reasons import Reason, ReasonKind, facts_of
+from bevviz.model.decisions import pair_kind
+from bevviz.model.reasons import Reason, ReasonKind, facts_of, kind_of
 from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.ideal import StageSet
-from bevviz.why.reason_values import ReasonValues, cameras_of, detector_ran
+from bevviz.why.reason_text import cameras_of, detector_ran, reason_of
 from bevviz.why.subject import Subject
 from bevviz.why.subject_matches import find_fused, first_name
 
@@ -36,15 +36,6 @@ FALSE = {  # causes of false objects
 }
 FLAWED = {ReasonKind.SHARED_BOX, ReasonKind.MERGED, ReasonKind.SPLIT}
 HOPELESS = {ReasonKind.OUT_OF_VIEW, ReasonKind.HIDDEN, ReasonKind.NO_POINTS}
-
-_REFUSED = {
-    Decision.LOW_OVERLAP: ReasonKind.LOW_OVERLAP,
-    Decision.TOO_FEW_POINTS: ReasonKind.TOO_FEW_POINTS,
-    Decision.TOO_FAR: ReasonKind.TOO_FAR,
-    Decision.TAKEN: ReasonKind.TAKEN,
-    Decision.MISFIT: ReasonKind.MISFIT,
-    Decision.NO_CLUSTER: ReasonKind.TOO_FEW_POINTS,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +85,9 @@ def find_reason(
     decider = _Decider(subject, evidence, traces)
     kind, reported = decider.decide()
     stages = [stage for stages in restored_by for stage in stages]
-    if stages and not reported and decider.stage_of(kind) not in stages:
+    if stages and not reported and stage_of(kind, evidence) not in stages:
         kind = next(filter(None, map(decider.kind_at, stages)), kind)
-    return ReasonValues(subject, evidence, traces).reason(kind), reported
+    return reason_of(kind, subject, evidence, traces), reported
 
 
 def stage_of(kind: ReasonKind, evidence: Evidence) -> str:
@@ -214,10 +205,6 @@ class _Decider:
         flaw = self._flaw(named)
         return flaw if flaw in (ReasonKind.MERGED, ReasonKind.SPLIT) else ReasonKind.MISPLACED
 
-    def stage_of(self, kind: ReasonKind) -> str:
-        """Return the stage that a reason blames, empty for none."""
-        return stage_of(kind, self.evidence)
-
     def kind_at(self, stage: str) -> ReasonKind | None:
         """Return how a stage lost the subject; None: it shows no loss there."""
         evidence = self.evidence
@@ -239,8 +226,10 @@ class _Decider:
         if fusion is None:
             return ReasonKind.NOT_FUSED
         if evidence.main < 0:
-            return _REFUSED.get(best.decision)
-        kind = pair_reason(fusion, self.result.config, best.row, evidence.main).kind
+            if best.decision is Decision.NO_CLUSTER:
+                return ReasonKind.TOO_FEW_POINTS
+            return None if best.decision is Decision.MATCHED else kind_of(best.decision)
+        kind = pair_kind(fusion, self.result.config, best.row, evidence.main)
         return None if kind is ReasonKind.MATCHED else kind
 
     def _clustering_loss(self) -> ReasonKind | None:
@@ -319,7 +308,7 @@ class _Decider:
         _, fusion = camera_and_fusion(self.result, best.camera)
         if fusion is None:
             return ReasonKind.NOT_FUSED
-        kind = pair_reason(fusion, self.result.config, best.row, evidence.main).kind
+        kind = pair_kind(fusion, self.result.config, best.row, evidence.main)
         if kind is ReasonKind.MATCHED:  # the object counts for another one in the cluster
             return ReasonKind.MERGED if self.subject.kind == "truth" else ReasonKind.REPORTED
         main = evidence.part(evidence.main)
@@ -375,7 +364,7 @@ class _Decider:
         if lost:
             return self._unclustered()
         is_merged = best.decision is Decision.TAKEN and evidence.mates
-        return ReasonKind.MERGED if is_merged else _REFUSED[best.decision]
+        return ReasonKind.MERGED if is_merged else kind_of(best.decision)
 
     # --- objects that our fusion did not make --------------------------------------------------
 

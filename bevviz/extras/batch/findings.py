@@ -24,7 +24,7 @@ from bevviz.model.results import FrameResult
 from bevviz.support.files import atomic_write
 from bevviz.why import Selection
 from bevviz.why.frame_index import FrameIndex
-from bevviz.why.subject import projected_box, single_box
+from bevviz.why.subject import projected_box
 
 FINDINGS = "findings"  # name of the table of all bags, and of the column in a table of frames
 
@@ -174,7 +174,7 @@ def _boxes(result: FrameResult, boxes: Boxes3D, rows: Sequence[int]) -> Iterator
             "points": float(count),
             "gap_m": float(gaps.min(initial=np.inf)),
         }
-        yield values | _place_in_image(result, single_box(boxes, row))
+        yield values | _place_in_image(result, boxes.chosen([row]))
 
 
 def _place_in_image(result: FrameResult, box: Boxes3D) -> Row:
