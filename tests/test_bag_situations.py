@@ -308,6 +308,20 @@ def read(path: Path, *settings: str) -> tuple[Frame, Sequence[str]]:
         return frames[-1], source.doubts
 
 
+def test_a_later_part_of_a_bag_names_the_first(tmp_path: Path) -> None:
+    items = bags.small_items(scans=4)
+    parts = ([i for i in items if i.topic == "/tf_static"], [i for i in items if i.topic != "/tf_static"])
+    folders = [bags.write(tmp_path / f"part{number}", part) for number, part in enumerate(parts)]
+    first, later = (
+        next(folder.glob("*.mcap")).rename(tmp_path / f"drive_{number}.mcap")
+        for number, folder in enumerate(folders)
+    )
+    with BagSource([later], load()) as source:
+        assert any("begins with drive_0.mcap: give both, or their folder" in said for said in source.warnings)
+    with BagSource([first, later], load()) as source:
+        assert not any("drive_0.mcap" in said for said in source.warnings)
+
+
 def again(topic: str, pose: F64, count: int = 1) -> list[bags.Item]:
     """Return the mounting of the camera, stated again with another pose."""
     times = [bags.START + 1 + i * bags.PERIOD // 2 for i in range(count)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -54,6 +55,7 @@ from bevviz.support.text import path_text
 
 ATTACHED = "lidar_calibration"  # name prefix of an attached calibration; the topic and the file name follow
 METADATA = "metadata.yaml"
+PART = re.compile(r"_[1-9]\d*(?=\.(mcap|db3|bag)(\.zstd)?$)")  # number of a later part of a bag
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 STAMPED = ["timestamp", "frame_id"]  # first fields of Foxglove messages whose layout is that of a Header
 MAX_ENCAPSULATION = 3  # of CDR and of parameter lists in CDR
@@ -201,6 +203,8 @@ class Recording(Closable):
             for topic, msgtype in described
             if (used := self._types_by_topic.get(topic, msgtype)) != msgtype
         ]
+        if not any(name.endswith("tf_static") and count for name, count in counts.items()):
+            self._note_first_part()
         duration = (self.end - self.start) / 1e9
         self._aside |= {name: why for name in first if (why := self._lacks(first[name]))}
         return tuple(
@@ -220,6 +224,16 @@ class Recording(Closable):
             )
             for name in sorted(first)
         )
+
+    def _note_first_part(self) -> None:
+        """Note that the static transforms may be in the first part of a bag, of which this is a later one."""
+        for path in self.paths:
+            first = path.with_name(PART.sub("_0", path.name))
+            if first not in self.paths and not address_of(path) and first.is_file():
+                self._notes.append(
+                    f"{path.name}: no static transforms in it, but it is a later part of a bag that begins "
+                    f"with {first.name}: give both, or their folder"
+                )
 
     def publishers(self, topic: str) -> str:
         """Return the names of the nodes that published a topic. Empty: the recording does not say them."""
