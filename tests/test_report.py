@@ -41,6 +41,7 @@ from bevviz.report.report_subject import cause_of, explain_subject
 from bevviz.stages.detector import Detector
 from bevviz.support.onnx_files import network_hash
 from bevviz.why import FrameExplainer, Selection
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.subject import projected_box
 from tests.support import bags, planted_faults
 from tests.support.commands import Capture, error_of
@@ -210,7 +211,7 @@ def test_a_report_opens_on_a_false_object_and_on_nothing() -> None:
     """What is false is called false with ground truth and doubtful without; good frames have no cause."""
     result = planted_faults.run("shared_box", "reference")
     explainer = FrameExplainer(result)
-    (answer, *_) = explain_subject(explainer, Selection(object=explainer.false_objects()[0].subject.row))
+    (answer, *_) = explain_subject(explainer, Selection(object=next(iter(false_reasons(explainer.traces)))))
     cause = cause_of(result, 7.0, answer)
     assert cause.what.startswith("False: the ")
     assert cause.why == explainer.about(answer.selection or Selection()).verdict.text

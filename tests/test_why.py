@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from bevviz.model.frame import Boxes3D, LabelledBoxes3D
 from bevviz.model.reasons import Limit, ReasonKind
 from bevviz.model.results import DetectionState, FrameResult
 from bevviz.pipeline.session import Session
-from bevviz.why import Answer, FrameExplainer, Selection, why
+from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.answer_results import AnswerResult
 from bevviz.why.answer_text import summary_line
 from bevviz.why.collect import collect_evidence
@@ -37,6 +38,17 @@ from tests.support.recordings import Recording
 CLASSES = ("car", "person", "cyclist")
 Capture = pytest.CaptureFixture[str]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+
+
+def why(
+    result: FrameResult,
+    selection: Selection,
+    classes: Sequence[str] = (),
+    hints: int = 5,
+    *,
+    everything: bool = False,
+) -> list[Answer]:
+    return FrameExplainer(result, classes=classes).explain(selection, hints, everything=everything)
 
 
 def config_of(preset: str, *settings: str) -> Config:

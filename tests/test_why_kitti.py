@@ -21,6 +21,7 @@ from bevviz.stages.clustering import dbscan
 from bevviz.support.json_form import json_tree
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.answer_results import AnswerResult
+from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import Fate
 
 NAMES = {"Car": "car", "Van": "car", "Truck": "truck", "Tram": "train"}  # any other label is a person
@@ -76,7 +77,10 @@ def asked(shared: Path) -> dict[str, Asked]:
                     rows = range(len(frame.truth.labels))
                     labels = [explainer.ask(Selection(truth=row))[0] for row in rows]
                     name = f"{folder}/{index}/{detector}"
-                    frames[name] = Asked(name, result, explainer, labels, explainer.false_objects())
+                    false = [
+                        explainer.about(Selection(object=row)) for row in false_reasons(explainer.traces)
+                    ]
+                    frames[name] = Asked(name, result, explainer, labels, false)
     return frames
 
 
@@ -181,7 +185,7 @@ def test_without_ground_truth_doubtful_objects_are_false_ones(asked: dict[str, A
         if name.endswith("network"):
             partner, result = partner_of(frame), frame.result
             blind = FrameExplainer(replace(result, frame=replace(result.frame, truth=None)))
-            rows = [answer.subject.row for answer in blind.false_objects()]
+            rows = [*false_reasons(blind.traces)]
             doubtful += len(rows)
             right += sum(partner[row] >= 0 for row in rows)
     assert doubtful >= 3 and right <= 1

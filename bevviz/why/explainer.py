@@ -20,7 +20,7 @@ from bevviz.why.ideal import StageSet
 from bevviz.why.kept_labels import label_of
 from bevviz.why.neighbours import FrameLookup, NeighbourRuns
 from bevviz.why.reruns import FrameRuns
-from bevviz.why.resolve import object_subject, select_subjects, subjects_at_place
+from bevviz.why.resolve import select_subjects, subjects_at_place
 from bevviz.why.selection import Selection
 from bevviz.why.sentences import make_verdict, untried_text
 from bevviz.why.steps import Step, steps_of
@@ -134,11 +134,6 @@ class FrameExplainer:
         answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported]
         return sorted(answers, key=_sort_distance)
 
-    def false_objects(self) -> list[Answer]:
-        """Explain the objects that no ground truth explains; without ground truth, the doubtful ones."""
-        rows = false_reasons(self.traces)
-        return [self._answer(object_subject(self.traces, row)) for row in rows]
-
     def search(self, answer: Answer) -> Answer:
         """Search changes that would change the verdict. This runs other configurations and takes a while."""
         return HintFinder(self.traces, self._runs, self._neighbours, answer).search()
@@ -247,19 +242,6 @@ class RunExplainer:
         if result.objects is not None:
             traces.matches = matches
         return false_reasons(traces) if matches.false.any() else {}
-
-
-def why(
-    result: FrameResult,
-    selection: Selection,
-    classes: Sequence[str] = (),
-    hints: int = 5,
-    loader: StageLoader | None = None,
-    *,
-    everything: bool = False,
-) -> list[Answer]:
-    """Answer one question about a result; see ``FrameExplainer.explain``."""
-    return FrameExplainer(result, loader, classes).explain(selection, hints, everything=everything)
 
 
 def _once_by_label(answers: Sequence[Answer]) -> list[Answer]:
