@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -32,4 +33,12 @@ def test_a_label_without_its_class_is_refused_with_its_file(tmp_path: Path) -> N
     file = tmp_path / "000001.json"
     file.write_text(f'[{{"psr": {{"position": {corner}, "scale": {corner}}}}}]'.replace("'", '"'))
     with pytest.raises(UserError, match=r"000001\.json: no boxes with psr and obj_type"):
+        read_labels(file)
+
+
+def test_rotations_in_degrees_are_refused(tmp_path: Path) -> None:
+    file, corner = tmp_path / "000001.json", {"x": 0, "y": 0, "z": 0}
+    psr = {"position": corner, "scale": corner, "rotation": {**corner, "z": 90}}
+    file.write_text(json.dumps([{"psr": psr, "obj_type": "Car"}]))
+    with pytest.raises(UserError, match=r"000001\.json: a rotation of 90 is no angle in radians"):
         read_labels(file)

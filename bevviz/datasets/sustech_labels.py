@@ -58,6 +58,9 @@ def read_labels(file: Path) -> LabelledBoxes3D:
         array = np.array(values, np.float64).reshape(-1, 3, 3)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserError(f"{file}: no boxes with psr and obj_type: {error!r}") from None
+    largest = np.abs(array[:, 2]).max(initial=0)
+    if largest > 2 * np.pi:
+        raise UserError(f"{file}: a rotation of {largest:.0f} is no angle in radians: is it in degrees?")
     boxes = Boxes3D(
         array[:, 0].astype(np.float32), array[:, 1].astype(np.float32), array[:, 2, 2].astype(np.float32)
     )
