@@ -2,9 +2,11 @@
 
 Opens the drive in an empty store and waits for the complete list. The ten worst findings are the first rows
 of the page's table. One counts as listed early if a row of the same kind and name has a frame within 64
-frames of one of its frames.
+frames of one of its frames. With ``--browser``, a browser shows the drive from the start to the end. Its
+memory, the server's and the size of temporary files are printed each minute. Once a minute, and twenty times
+at the end, it jumps to a random place of the drive: printed is the time until the page has that frame.
 
-    python -m benchmarks.worst_findings long.mcap --model yolox_nano.onnx --after 10 20 60
+    python -m benchmarks.worst_findings long.mcap --model yolox_nano.onnx --after 10 20 60 --browser
 """
 
 from __future__ import annotations
@@ -12,22 +14,32 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import tempfile
+import threading
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+import numpy as np
+import psutil
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from benchmarks.measure import peak_memory
 from bevviz.findings.finding_list import CELL
-from tests.support.workbench_pages import serving
+from tests.support.workbench_pages import chromium, serving, watched_page
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 WORST = 10
+MINUTE = 60.0  # seconds between two looks at memory
+JUMPS = 20  # once the list is complete
 
 Entries = dict[int, dict[str, Any]]
 
@@ -39,13 +51,22 @@ def main() -> None:
     parser.add_argument("bag", type=Path)
     parser.add_argument("--model", required=True)
     parser.add_argument("--after", type=float, nargs="+", default=[10, 20, 30, 60], help="seconds")
+    parser.add_argument("--browser", action="store_true", help="with a page that is looked at")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["BEVVIZ_STORE"] = folder
+    with (
+        tempfile.TemporaryDirectory() as store,
+        tempfile.TemporaryDirectory() as temporary,
+        ExitStack() as stack,
+    ):
+        os.environ |= {"BEVVIZ_STORE": store, "TMPDIR": temporary}
         start = time.monotonic()
-        with serving("open", str(options.bag.resolve()), model=options.model) as (address, server):
-            early, whole = watch(address, start, options.after)
-            seconds, memory = time.monotonic() - start, peak_memory(server.pid)
+        bag = str(options.bag.resolve())
+        address, server = stack.enter_context(serving("open", bag, model=options.model))
+        page = LookedAt(address, server.pid, Path(temporary)) if options.browser else None
+        early, whole = watch(address, start, options.after)
+        seconds, memory = time.monotonic() - start, peak_memory(server.pid)
+        if page is not None:
+            page.end()
     worst = sorted(whole.values(), key=itemgetter("rank"))[:WORST]
     print(
         "the worst:",
@@ -78,6 +99,79 @@ def watch(address: str, start: float, times: list[float]) -> tuple[dict[float, E
                     entries[one["number"]] = {**one, "sights": known["sights"] + one["sights"]}
             if message["type"] == "progress" and message["over"]:
                 return early, entries
+
+
+class LookedAt:
+    """Page in a browser, in a thread of its own.
+
+    Args:
+        address: address of the page.
+        server: process of the server.
+        temporary: folder of the server's temporary files.
+    """
+
+    def __init__(self, address: str, server: int, temporary: Path) -> None:
+        self._address, self._server, self._temporary = address, psutil.Process(server), temporary
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Jump a last few times, and close the browser."""
+        self._over.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        start, places = time.monotonic(), random.Random(0)
+        with chromium() as browser:
+            page = watched_page(browser, 1000, 700)
+            page.goto(self._address)
+            page.locator("#events").wait_for()
+            print("|  min | server, MB | browser, MB | temporary, MB | jump, s | run |")
+            print("| ---: | ---------: | ----------: | ------------: | ------: | --- |")
+            while not self._over.is_set():
+                jump = _jump(page, places.random())
+                server, browser_memory = _memory(self._server), sum(map(_memory, _browsers()))
+                files = sum(file.stat().st_size for file in self._temporary.rglob("*") if file.is_file())
+                print(
+                    f"| {(time.monotonic() - start) / 60:4.0f} | {server:10.0f} | {browser_memory:11.0f} "
+                    f"| {1e-6 * files:13.1f} | {jump:7.2f} | {page.inner_text('#run').strip()} |",
+                    flush=True,
+                )
+                deadline = time.monotonic() + MINUTE
+                while time.monotonic() < deadline and not self._over.is_set():
+                    page.wait_for_timeout(1000)
+            jumps = [_jump(page, places.random()) for _ in range(JUMPS)]
+            p50, most = np.percentile(jumps, [50, 100])
+            print(f"{JUMPS} jumps at the end: {p50:.2f} s (median), {most:.2f} s (longest)")
+
+
+def _jump(page: Page, share: float) -> float:
+    """Click a place of the drive, and return the seconds until the page has its frame."""
+    box = page.locator("#events").bounding_box()
+    assert box is not None
+    before = page.inner_text("#shown")
+    start = time.monotonic()
+    page.mouse.click(box["x"] + 2 + share * (box["width"] - 4), box["y"] + box["height"] - 2)
+    while time.monotonic() - start < MINUTE:
+        shown = page.inner_text("#shown")
+        if shown != before and "..." not in shown:
+            break
+        page.wait_for_timeout(10)
+    return time.monotonic() - start
+
+
+def _browsers() -> list[psutil.Process]:
+    """Return the processes of the browser."""
+    return [one for one in psutil.Process().children(recursive=True) if one.name().startswith("chrom")]
+
+
+def _memory(process: psutil.Process) -> float:
+    """Return the MB that a process alone has, 0 where it has ended."""
+    try:
+        return 1e-6 * float(process.memory_full_info().uss)
+    except psutil.NoSuchProcess:
+        return 0.0
 
 
 def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
