@@ -192,8 +192,8 @@ function offerFilters(entries) {
     select.replaceChildren(new Option(first, ""), ...options.map((name) => new Option(name, name)));
     select.value = chosen;
   };
-  offer($("class"), "any class", objects.map((entry) => entry.name));
-  offer($("reason"), "any reason", objects.map(cause));
+  offer($("class"), "class", objects.map((entry) => entry.name));
+  offer($("reason"), "reason", objects.map(cause));
 }
 
 /**
