@@ -22,7 +22,6 @@ from bevviz.errors import UserError
 from bevviz.evaluate.differences import (
     Change,
     ImageBoxes,
-    SideResult,
     compare_images,
     compare_objects,
     differences,
@@ -32,12 +31,13 @@ from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.geometry import transform
-from bevviz.model.results import FrameResult
+from bevviz.model.results import FrameResult, Objects
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Session, Variants, check_same_frames, without_motion_compensation
 from bevviz.pipeline.stage_log import Memo
 from bevviz.recording import entities
 from bevviz.stages import detector
+from bevviz.stages.user_stages import make_objects
 from tests.support import bags, documented_json, kept_drives
 from tests.support.recordings import Recording, verify
 
@@ -58,15 +58,16 @@ def result() -> FrameResult:
     return session.run(frame())
 
 
-def objects(*rows: tuple[str, float, float]) -> SideResult:
+def objects(*rows: tuple[str, float, float]) -> Objects:
     """Objects of 2 x 1 m: class, x, y."""
     centre = np.array([(x, y, 0) for _, x, y in rows], np.float32).reshape(-1, 3)
     size = np.tile(np.array([2, 1, 1.5], np.float32), (len(rows), 1))
     boxes = Boxes3D(centre, size, np.zeros(len(rows), np.float32))
-    return SideResult(boxes, tuple(name for name, _, _ in rows), np.ones(len(rows), np.float32))
+    names = tuple(name for name, _, _ in rows)
+    return make_objects(boxes, names, np.ones(len(rows), np.float32), None, None)
 
 
-def changed(a: SideResult, b: SideResult) -> list[tuple[Change, int, int]]:
+def changed(a: Objects, b: Objects) -> list[tuple[Change, int, int]]:
     return [(d.change, d.row_a, d.row_b) for d in compare_objects(a, b)]
 
 
@@ -107,7 +108,7 @@ def test_planted_differences_are_found(a: Any, b: Any, expected: list[tuple[Chan
 def test_each_object_once_and_the_sides_are_alike(seed: int, count_a: int, count_b: int) -> None:
     rng = np.random.default_rng(seed)
 
-    def random(count: int) -> SideResult:
+    def random(count: int) -> Objects:
         names = rng.choice(["car", "person"], count)
         return objects(*zip(names, rng.uniform(-5, 5, count), rng.uniform(-5, 5, count), strict=True))
 
@@ -138,10 +139,10 @@ def test_detections_are_paired_in_the_image() -> None:
 
 def test_a_run_does_not_differ_from_itself() -> None:
     ours = seen(result())
-    assert len(ours.names) > 3
-    found = differences(0, 0, ours, ours)
+    assert len(ours.objects) > 3
+    found = differences(ours, ours)
     assert found.number == 0
-    assert len(found.objects) == len(ours.names)
+    assert len(found.objects) == len(ours.objects)
     assert len(found.images["zed"]) == len(ours.images["zed"].names) > 0
 
 
@@ -236,14 +237,14 @@ def test_the_robots_boxes_are_compared_in_our_frame() -> None:
     )
     robot = published_result(replace(frame(), robot_boxes=(stated,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
-    assert {d.change for d in compare_objects(seen(result()), seen(robot))} == {Change.SAME}
+    assert {d.change for d in compare_objects(ours, seen(robot).objects)} == {Change.SAME}
     world = np.asarray(frame().world_from_points)
     shifted = replace(
         stated, world_from_boxes=world @ transform(np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]))
     )
     robot = published_result(replace(frame(), robot_boxes=(shifted,)), "/detection/fused_3d", DEFAULT)
     assert robot is not None
-    moved = [d for d in compare_objects(seen(result()), seen(robot)) if d.change is Change.MOVED]
+    moved = [d for d in compare_objects(ours, seen(robot).objects) if d.change is Change.MOVED]
     assert len(moved) > len(ours) / 2
     np.testing.assert_allclose(np.median([d.distance for d in moved]), 1.0, atol=1e-3)
     assert published_result(frame(), "/detection/fused_3d", DEFAULT) is None

@@ -182,7 +182,7 @@ def test_a_perfect_result_is_perfect(drive: Path) -> None:
         for result in opened:
             truth = result.frame.truth
             assert truth is not None
-            boxes = in_points_frame(result.frame, truth)
+            boxes = in_points_frame(result.frame.pose, truth)
             none = np.full(len(boxes), -1, np.int32)
             objects = Objects(boxes, truth.labels, truth.scores, none, ("",) * len(boxes), none)
             evaluation.observe(replace(result, objects=objects))

@@ -202,7 +202,7 @@ def test_boxes_are_upright_where_the_points_are(
         (frame,) = source
         assert not [warning for warning in source.warnings if "/objects" in warning]
     (found,) = frame.robot_boxes
-    boxes = in_points_frame(frame, found)
+    boxes = in_points_frame(frame.pose, found)
     np.testing.assert_allclose(boxes.center, [BOX[:3, 3]] * len(frames), atol=1e-5)
     np.testing.assert_allclose(boxes.size, [BOX_SIZE] * len(frames), rtol=1e-6)
     np.testing.assert_allclose(boxes.yaw, [0.5] * len(frames), atol=1e-6)

@@ -184,7 +184,7 @@ def test_boxes_of_a_scene_are_in_the_frames_of_their_entities(tmp_path: Path) ->
         first, last = source
         assert not source.warnings  # a scene of nothing has neither stamp nor frame
     assert [len(boxes.boxes) for boxes in first.robot_boxes] == [0]
-    boxes = in_points_frame(last, last.robot_boxes[0])
+    boxes = in_points_frame(last.pose, last.robot_boxes[0])
     assert last.robot_boxes[0].ids == tuple(stated)
     np.testing.assert_allclose(boxes.center, [box[:3, 3]] * 3, atol=1e-5)
     np.testing.assert_allclose(boxes.size, [[4.5, 1.8, 1.5]] * 3, rtol=1e-6)

@@ -57,18 +57,16 @@ def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0
 def test_boxes_may_arrive_before_or_after_the_result(first: Frame) -> None:
     against = RobotComparison("", CONFIG.live)
     (with_it,) = against.compare(result(first, 0, robot=10.1))
-    assert [d.change for d in with_it.differences.objects] == [Change.SAME] and against.topic == TOPIC
+    assert [d.change for d in with_it.objects] == [Change.SAME] and against.topic == TOPIC
     assert against.compare(result(first, 1)) == []
     early = result(first, 3)  # the robot has said so before our result is there
     late = [(result(first, 1).frame.stamp, theirs(first, 11.0)), (early.frame.stamp, theirs(first, 10.4))]
     (after,) = against.compare(result(first, 2), late)
-    assert after.differences.index == 1 and after.differences.objects[0].change is Change.MOVED
-    assert after.differences.objects[0].distance == pytest.approx(1.0, abs=1e-4)
+    assert after.a.index == 1 and after.objects[0].change is Change.MOVED
+    assert after.objects[0].distance == pytest.approx(1.0, abs=1e-4)
     (before,) = against.compare(early)
-    assert before.differences.index == 3 and (against.frames, against.differing) == (
-        3,
-        1,
-    )  # 0.4 m is no difference yet
+    # 0.4 m is no difference yet.
+    assert before.a.index == 3 and (against.frames, against.differing) == (3, 1)
 
 
 def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
@@ -85,10 +83,10 @@ def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
     old = result(first, 0).frame
     assert against.compare(result(first, 1), [(old.stamp, detections(old, camera))]) == []
     (after,) = against.compare(result(first, 2), [(old.stamp, theirs(old, 10.0))])
-    assert after.differences.index == 0 and after.differences.b.images[camera].names == ("car",)
+    assert after.a.index == 0 and after.b.images[camera].names == ("car",)
     assert against.late_images == 0
     (direct,) = against.compare(result(first, 3, robot=10.0))
-    assert direct.differences.b.images == {}
+    assert direct.b.images == {}
     known = result(first, 3).frame
     against.compare(result(first, 4), [(known.stamp, detections(known, camera))])
     assert against.late_images == 1
@@ -114,14 +112,14 @@ def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
     assert against.compare(both) == [] and "which of its topics" in against.problem
     for index in range(1, 3 * WAITING):
         against.compare(result(first, index), [(index, theirs(first, 1, "/a"))])
-    assert len(against._waiting) == WAITING and len(against._late) <= WAITING
+    assert len(against._waiting) == WAITING and len(against._boxes) <= WAITING
 
 
 def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None:
     """Nothing was found and nothing was looked for are two things: a failed stage is no difference."""
     against = RobotComparison("", CONFIG.live)
     (before,) = against.compare(result(first, 0, robot=11.0))
-    assert before.differences.counts[Change.MOVED] == 1
+    assert before.counts[Change.MOVED] == 1
     for index in range(1, 9):
         failed = replace(result(first, index, robot=11.0), objects=None)
         assert against.compare(failed) == []
@@ -130,9 +128,9 @@ def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None
     assert against.compare(result(first, 9)) == []
     late = [(result(first, 9).frame.stamp, theirs(first, 10.0))]
     (after,) = against.compare(replace(result(first, 10), objects=None), late)
-    assert after.differences.index == 9 and after.differences.counts == {Change.SAME: 1}
+    assert after.a.index == 9 and after.counts == {Change.SAME: 1}
     nobody = Objects(
         Boxes3D.empty(), (), np.zeros(0, np.float32), np.zeros(0, np.int32), (), np.zeros(0, np.int32)
     )
     (nothing,) = against.compare(replace(result(first, 11, robot=10.0), objects=nobody))
-    assert nothing.differences.counts == {Change.ONLY_B: 1}
+    assert nothing.counts == {Change.ONLY_B: 1}

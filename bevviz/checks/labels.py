@@ -33,7 +33,7 @@ def count_labels(labels: Counter[str], frame: Frame) -> None:
     """Count the near boxes of the ground truth of a frame, and those without points."""
     if frame.truth is None or not len(frame.points) or labels["near"] >= MOST:
         return
-    boxes = in_points_frame(frame, frame.truth)
+    boxes = in_points_frame(frame.pose, frame.truth)
     boxes = boxes.chosen(boxes.distance < NEAR)
     foot = boxes.size[:, 2:] * FOOT * np.array([0, 0, 1], np.float32)  # (K, 3)
     boxes = replace(boxes, center=boxes.center + foot / 2, size=boxes.size - foot)

@@ -117,7 +117,8 @@ def _run(
     options: CompareOptions,
 ) -> int:
     from bevviz.checks import InputChecks
-    from bevviz.compare.sides import ComparisonRecorder, FirstSide, SideFailures
+    from bevviz.compare.log import ComparisonRecorder
+    from bevviz.compare.sides import FirstSide, SideFailures
     from bevviz.compare.summary import ComparisonSummary
     from bevviz.config import changes
 

@@ -7,6 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 import numpy as np
 import rerun as rr
 
+from bevviz.compare.sides import ComparedFrame
+from bevviz.compare.summary import ComparisonSummary
+from bevviz.config import Config
 from bevviz.evaluate.differences import (
     DIFFERENT,
     WORST_FIRST,
@@ -15,8 +18,11 @@ from bevviz.evaluate.differences import (
     Difference,
     FrameDifferences,
 )
+from bevviz.evaluate.ground_truth import Truth
 from bevviz.model.frame import F64
+from bevviz.model.protocols import Items, Observer
 from bevviz.recording import entities
+from bevviz.recording.frame_logger import FrameLogger
 from bevviz.recording.labels import choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, draw
 from bevviz.recording.primitives import document, transform
@@ -70,21 +76,16 @@ class DifferenceLogger(Writer):
         super().refresh(known)
         self._lanes.states = {}
 
-    def log(self, differences: FrameDifferences, received: int, world_from_points: F64) -> None:
-        """Log the differences of one frame.
-
-        Args:
-            differences: of the frame.
-            received: receive time in nanoseconds; 0: unknown.
-            world_from_points: (4, 4) pose of the points in the fixed frame.
-        """
-        self.begin(differences.index, differences.stamp, received)
+    def log(self, differences: FrameDifferences) -> None:
+        """Log the differences of one frame."""
+        frame = differences.a
+        self.begin(frame.index, frame.stamp, frame.received)
         for change in DIFFERENT:
             changed_objects = [d for d in differences.objects if d.change is change]
             if changed_objects:
-                self._log_boxes(change, changed_objects, differences, world_from_points)
-        if differences.judged is not None:
-            self._log_judged(differences.judged, world_from_points)
+                self._log_boxes(change, changed_objects, differences)
+        if differences.effects.truth is not None:
+            self._log_judged(differences.effects, differences.effects.truth, frame.pose)
         for camera, pairs in differences.images.items():
             self._log_image(camera, pairs, differences)
         for name, value in _counts(differences).items():
@@ -100,31 +101,27 @@ class DifferenceLogger(Writer):
         )
         self.end()
 
-    def _log_boxes(
-        self, change: Change, objects: list[Difference], differences: FrameDifferences, world_from_points: F64
-    ) -> None:
-        side, rows = (differences.a, [d.row_a for d in objects])
+    def _log_boxes(self, change: Change, objects: list[Difference], differences: FrameDifferences) -> None:
+        effects = differences.effects
+        side, rows = effects.a, [d.row_a for d in objects]
         if change is not Change.ONLY_A:
-            side, rows = (differences.b, [d.row_b for d in objects])
+            side, rows = effects.b, [d.row_b for d in objects]
+        boxes = side.boxes.chosen(rows)
         path = entities.DIFFERENCE.path(change)
         # If the ground truth is known, only objects that one side alone finds get a name. They matter more.
-        is_named = choose_named_in_3d(side.boxes.center[rows], height=HEIGHT)
-        labels = [
-            _label(d) if differences.judged is None and is_named[i] else "" for i, d in enumerate(objects)
-        ]
-        style, pose = Style(COLORS[change], 2.5, labels=True), transform(world_from_points)
-        draw(self, Layer(path, side.boxes.chosen(rows), style, labels, frame=pose))
+        is_named = choose_named_in_3d(boxes.center, height=HEIGHT)
+        labels = [_label(d) if effects.truth is None and is_named[i] else "" for i, d in enumerate(objects)]
+        style, pose = Style(COLORS[change], 2.5, labels=True), transform(differences.a.pose)
+        draw(self, Layer(path, boxes, style, labels, frame=pose))
         if change is Change.MOVED:
-            start = differences.a.boxes.center[[d.row_a for d in objects]]
-            end = differences.b.boxes.center[rows]
-            arrows = rr.Arrows3D(origins=start, vectors=end - start, colors=[COLORS[change]])
+            start = effects.a.boxes.center[[d.row_a for d in objects]]
+            arrows = rr.Arrows3D(origins=start, vectors=boxes.center - start, colors=[COLORS[change]])
             self.put(entities.FROM_A, arrows)
 
-    def _log_judged(self, judged: BeforeAfter, world_from_points: F64) -> None:
-        assert judged.truth is not None
-        labels_of, all_boxes = judged.truth.labels, judged.truth.boxes
-        rows = np.array([*judged.broken, *judged.fixed], np.int64)
-        is_broken = np.arange(len(rows)) < len(judged.broken)
+    def _log_judged(self, effects: BeforeAfter, truth: Truth, world_from_points: F64) -> None:
+        labels_of, all_boxes = truth.labels, truth.boxes
+        rows = np.array([*effects.broken, *effects.fixed], np.int64)
+        is_broken = np.arange(len(rows)) < len(effects.broken)
         is_named = choose_named_in_3d(all_boxes.center[rows], is_broken, HEIGHT)
         for outcome, selected in (("broken", is_broken), ("fixed", ~is_broken)):
             names = [f"{outcome}: {labels_of[row]}" for row in rows[selected].tolist()]
@@ -149,6 +146,42 @@ class DifferenceLogger(Writer):
             draw(self, Layer(path, boxes, style, [_label(d) for d in selected], frame=camera))
 
 
+class ComparisonRecorder(Observer[ComparedFrame]):
+    """Observer that logs both sides and their differences.
+
+    Entities of A have the same paths as in a single run. Those of B are under ``/b``.
+
+    Args:
+        recording: target.
+        a, b: the configurations.
+        summary: of the same comparison.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, a: Config, b: Config, summary: ComparisonSummary
+    ) -> None:
+        self._recording, self._configs, self._summary = recording, (a, b), summary
+
+    def begin(self, items: Items[object]) -> None:
+        """Log the static entities of both sides."""
+        a, b = self._configs
+        self._loggers = (
+            FrameLogger(self._recording, a, items.scene),
+            FrameLogger(self._recording, b, items.scene, entities.B),
+        )
+        for logger in self._loggers:
+            logger.log_static()
+        self._differences = DifferenceLogger(self._recording, self._summary.names, self._summary.about)
+
+    def observe(self, compared: ComparedFrame) -> None:
+        """Log both sides and their differences for a frame."""
+        for logger, result in zip(self._loggers, (compared.a, compared.b), strict=True):
+            if result is not None:
+                logger.log(result)
+        if compared.found is not None:
+            self._differences.log(compared.found)
+
+
 def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]:
     """Return the worst change of each class of either side. A missing object is worse than one that moved."""
     worst: dict[str, Change] = {}
@@ -160,12 +193,10 @@ def worst_of_each_class(objects: tuple[Difference, ...]) -> Mapping[str, Change]
 
 def differences_page(differences: FrameDifferences) -> str:
     """Return the differences of one frame as Markdown."""
-    lines = [f"### Frame {differences.index}", "", table.markdown([("", "A", "B"), *_totals(differences)])]
-    if (judged := differences.judged) is not None:
-        for title, objects in (("Broken by B", judged.broken), ("Fixed by B", judged.fixed)):
-            lines += _section(
-                f"{title}: {len(objects)}", [markdown(judged.label_text(row)) for row in objects]
-            )
+    head, effects = f"### Frame {differences.a.index}", differences.effects
+    lines = [head, "", table.markdown([("", "A", "B"), *_totals(differences)])]
+    for title, objects in (("Broken by B", effects.broken), ("Fixed by B", effects.fixed)):
+        lines += _section(f"{title}: {len(objects)}", [markdown(effects.label_text(row)) for row in objects])
     for change in (*DIFFERENT, Change.SAME):
         selected = [d for d in differences.objects if d.change is change]
         title = f"{change[0].upper()}{change[1:]}: {len(selected)}"
@@ -184,15 +215,15 @@ def _section(title: str, items: Sequence[str]) -> list[str]:
 def _totals(differences: FrameDifferences) -> Iterator[tuple[str, str, str]]:
     """Yield table rows: title, number in A, number in B."""
     a, b = differences.a, differences.b
-    yield "objects", str(len(a.names)), str(len(b.names))
+    yield "objects", str(len(a.objects)), str(len(b.objects))
     if a.clusters is not None or b.clusters is not None:
         yield (
             "clusters",
             "-" if a.clusters is None else str(a.clusters),
             "-" if b.clusters is None else str(b.clusters),
         )
-    if (judged := differences.judged) is not None:
-        there, *found = judged.found
+    if differences.effects.truth is not None:
+        there, *found = differences.effects.found
         yield f"found of {there} that are there", str(found[0]), str(found[1])
     for camera in differences.images:
         yield f"detections, {camera}", str(len(a.images[camera].names)), str(len(b.images[camera].names))
@@ -215,7 +246,7 @@ def _label(difference: Difference) -> str:
 def _counts(differences: FrameDifferences) -> dict[str, int]:
     counts: dict[str, int] = {change: differences.counts[change] for change in DIFFERENT}
     for side_name, side in (("a", differences.a), ("b", differences.b)):
-        counts[f"objects_{side_name}"] = len(side.names)
+        counts[f"objects_{side_name}"] = len(side.objects)
         if side.clusters is not None:
             counts[f"clusters_{side_name}"] = side.clusters
     return counts

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from bevviz.compare.sides import published_result, robot_topic
+from bevviz.compare.sides import robot_objects, robot_topic
 from bevviz.config import LiveConfig
 from bevviz.errors import UserError
 from bevviz.evaluate.differences import (
@@ -21,33 +19,11 @@ from bevviz.evaluate.differences import (
     differences,
     seen,
 )
-from bevviz.model import geometry
-from bevviz.model.frame import F64, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.frame import LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import FrameResult
 
 SECOND = 1_000_000_000
 WAITING = 50  # frames that may wait for the robot's boxes
-
-
-@dataclass(frozen=True, slots=True)
-class OurFrame:
-    """Our result of one frame, reduced to the data for the comparison."""
-
-    index: int
-    stamp: int
-    received: int
-    world_from_points: F64
-    seen: SideResult
-    images: Mapping[str, ImageBoxes]  # by camera, the robot's image boxes that came with the frame
-
-
-@dataclass(frozen=True, slots=True)
-class TimedDifferences:
-    """Differences in one frame, with its time of receipt and its pose."""
-
-    differences: FrameDifferences
-    received: int
-    world_from_points: F64
 
 
 class RobotComparison:
@@ -71,9 +47,9 @@ class RobotComparison:
         self.late_images = 0  # image boxes of the robot that came after the comparison of their frame
         self._asked = asked
         self._topics: set[str] = set()
-        self._waiting: dict[int, OurFrame] = {}  # stamp -> frame that waits for the robot's boxes
-        self._late: dict[int, LabelledBoxes3D] = {}  # stamp of the frame -> boxes that wait for our result
-        self._images: dict[int, dict[str, ImageBoxes]] = {}  # stamp -> camera -> boxes
+        self._waiting: dict[int, SideResult] = {}  # stamp -> our result that waits for the robot's boxes
+        self._boxes: dict[int, LabelledBoxes3D] = {}  # stamp of the frame -> boxes that wait for our result
+        self._images: dict[int, dict[str, ImageBoxes]] = {}  # stamp of the frame -> camera -> boxes
         self._compared: deque[int] = deque(maxlen=WAITING)  # stamps
         self._since: int | None = None  # stamp since which both differ in every frame
         self._fired = False
@@ -86,7 +62,7 @@ class RobotComparison:
 
     def compare(
         self, result: FrameResult, late: Sequence[tuple[int, LabelledBoxes2D | LabelledBoxes3D]] = ()
-    ) -> list[TimedDifferences]:
+    ) -> list[FrameDifferences]:
         """Take in a frame.
 
         Args:
@@ -97,35 +73,29 @@ class RobotComparison:
             The comparisons that are possible now.
         """
         frame = result.frame
-        in_space = {stamp: boxes for stamp, boxes in late if isinstance(boxes, LabelledBoxes3D)}
-        for labelled in (*frame.robot_boxes, *in_space.values()):
-            self._choose(labelled.topic)
-        images = {
-            labelled_boxes.camera: _image_boxes(labelled_boxes)
-            for labelled_boxes in frame.robot_detections
-            if labelled_boxes.camera
-        }
+        published: list[tuple[int, LabelledBoxes2D | LabelledBoxes3D]]
+        published = [(frame.stamp, boxes) for boxes in frame.robot_boxes]
+        published += [(frame.stamp, boxes) for boxes in frame.robot_detections if boxes.camera]
+        published += late
+        for _, boxes in published:
+            if isinstance(boxes, LabelledBoxes3D):
+                self._choose(boxes.topic)
         if result.objects is None:
             self.without_ours += 1
         else:
-            about = frame.index, frame.stamp, frame.received, frame.pose
-            self._waiting[frame.stamp] = OurFrame(*about, seen(result), images)
-        for stamp, labelled_boxes in late:
-            if isinstance(labelled_boxes, LabelledBoxes2D):
-                self._add_images(stamp, labelled_boxes)
-        self._late |= {stamp: boxes for stamp, boxes in in_space.items() if boxes.topic == self.topic}
-        compared = []
-        theirs = published_result(frame, self.topic, result.config) if self.topic else None
-        if theirs is not None and frame.stamp in self._waiting:
-            compared.append(self._compare(self._waiting.pop(frame.stamp), seen(theirs)))
-        for stamp in sorted(self._late.keys() & self._waiting.keys()):
-            ours, boxes = self._waiting.pop(stamp), self._late.pop(stamp)
-            compared.append(self._compare(ours, _placed(boxes, ours.world_from_points)))
+            self._waiting[frame.stamp] = seen(result)
+        for stamp, boxes in published:
+            if isinstance(boxes, LabelledBoxes2D):
+                self._add_images(stamp, boxes)
+            elif boxes.topic == self.topic:
+                self._boxes[stamp] = boxes
+        stamps = sorted(self._boxes.keys() & self._waiting.keys())
+        compared = [self._compare(self._waiting.pop(stamp), self._boxes.pop(stamp)) for stamp in stamps]
         waiting: dict[int, Any]
-        for waiting in (self._waiting, self._late, self._images):
+        for waiting in (self._waiting, self._boxes, self._images):
             while len(waiting) > WAITING:
                 del waiting[next(iter(waiting))]
-        return sorted(compared, key=lambda one: one.differences.stamp)
+        return compared
 
     def reason(self) -> str | None:
         """Return the reason to save the flight recorder, or None.
@@ -136,11 +106,11 @@ class RobotComparison:
         return reason or None
 
     def _add_images(self, stamp: int, boxes: LabelledBoxes2D) -> None:
-        """Keep late image boxes, or count them if their frame is compared already."""
+        """Keep image boxes, or count them if their frame is compared already."""
         if stamp in self._compared or not boxes.camera:
             self.late_images += 1
         else:
-            self._images.setdefault(stamp, {})[boxes.camera] = _image_boxes(boxes)
+            self._images.setdefault(stamp, {})[boxes.camera] = ImageBoxes(boxes.xyxy, boxes.labels)
 
     def _choose(self, topic: str) -> None:
         """Choose the topic to compare with, after a new topic has appeared."""
@@ -152,11 +122,11 @@ class RobotComparison:
         except UserError as error:
             self.topic, self.problem = "", str(error)
 
-    def _compare(self, ours: OurFrame, theirs: SideResult) -> TimedDifferences:
+    def _compare(self, ours: SideResult, boxes: LabelledBoxes3D) -> FrameDifferences:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
-        images = {**ours.images, **theirs.images, **self._images.pop(ours.stamp, {})}
-        frame_differences = differences(ours.index, ours.stamp, ours.seen, replace(theirs, images=images))
+        objects, images = robot_objects(ours.pose, boxes), self._images.pop(ours.stamp, {})
+        frame_differences = differences(ours, replace(ours, objects=objects, images=images, clusters=None))
         different = [d for d in frame_differences.objects if self._differs(d)]
         self.frames += 1
         self.differing += bool(different)
@@ -171,7 +141,7 @@ class RobotComparison:
                 words = ", ".join(f"{_words(d)} {frame_differences.position_of(d)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
-        return TimedDifferences(frame_differences, ours.received, ours.world_from_points)
+        return frame_differences
 
     def _differs(self, difference: Difference) -> bool:
         """Return whether a difference is large enough to count."""
@@ -188,15 +158,3 @@ def _words(difference: Difference) -> str:
     if difference.change is Change.CLASS:
         return f"our {difference.name_a} is the robot's {difference.name_b}"
     return f"{difference.name_a} {difference.distance:.2f} m apart"
-
-
-def _image_boxes(boxes: LabelledBoxes2D) -> ImageBoxes:
-    """Return the robot's image boxes for the comparison."""
-    return ImageBoxes(boxes.xyxy, boxes.labels)
-
-
-def _placed(labelled: LabelledBoxes3D, world_from_points: F64) -> SideResult:
-    """Move the robot's boxes to the points frame of an earlier frame."""
-    world = np.eye(4) if labelled.world_from_boxes is None else labelled.world_from_boxes
-    boxes = geometry.transform_boxes(labelled.boxes, geometry.inverse(world_from_points) @ world)
-    return SideResult(boxes, labelled.labels, labelled.scores)

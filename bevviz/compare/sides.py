@@ -7,23 +7,17 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-import rerun as rr
-
 from bevviz.anomalies import FailureSummary
-from bevviz.compare.log import DifferenceLogger
-from bevviz.compare.summary import ComparisonSummary
 from bevviz.config import Config
 from bevviz.errors import UserError
-from bevviz.evaluate.differences import FrameDifferences, before_after, differences, seen
+from bevviz.evaluate.differences import FrameDifferences, differences, seen
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
-from bevviz.model.frame import Camera, Frame, LabelledBoxes3D
-from bevviz.model.protocols import Items, Observer
+from bevviz.model.frame import F64, Camera, Frame, LabelledBoxes3D
+from bevviz.model.protocols import Observer
 from bevviz.model.results import CameraResult, FrameResult, Objects
 from bevviz.pipeline.session import Variants, check_same_frames
-from bevviz.recording import entities
-from bevviz.recording.frame_logger import FrameLogger
 from bevviz.stages.robot_results import detections_of, in_points_frame
+from bevviz.stages.user_stages import make_objects
 
 
 @dataclass(frozen=True)
@@ -43,11 +37,7 @@ class ComparedFrame:
     @cached_property
     def found(self) -> FrameDifferences | None:
         """Differences of the sides. None: a side has no result."""
-        a, b = self.a, self.b
-        if b is None:
-            return None
-        judged = None if self.truth is None else before_after(a.objects, b.objects, self.truth)
-        return differences(a.frame.index, a.frame.stamp, seen(a), seen(b), judged)
+        return None if self.b is None else differences(seen(self.a), seen(self.b), self.truth)
 
 
 class FirstSide(Observer[ComparedFrame]):
@@ -112,43 +102,6 @@ class Comparison:
         return replace(compared, a=a, b=others[0].finish(b) if others and b is not None else b)
 
 
-class ComparisonRecorder(Observer[ComparedFrame]):
-    """Observer that logs both sides and their differences.
-
-    Entities of A have the same paths as in a single run. Those of B are under ``/b``.
-
-    Args:
-        recording: target.
-        a, b: the configurations.
-        summary: of the same comparison.
-    """
-
-    def __init__(
-        self, recording: rr.RecordingStream, a: Config, b: Config, summary: ComparisonSummary
-    ) -> None:
-        self._recording, self._configs, self._summary = recording, (a, b), summary
-
-    def begin(self, items: Items[object]) -> None:
-        """Log the static entities of both sides."""
-        a, b = self._configs
-        self._loggers = (
-            FrameLogger(self._recording, a, items.scene),
-            FrameLogger(self._recording, b, items.scene, entities.B),
-        )
-        for logger in self._loggers:
-            logger.log_static()
-        self._differences = DifferenceLogger(self._recording, self._summary.names, self._summary.about)
-
-    def observe(self, compared: ComparedFrame) -> None:
-        """Log both sides and their differences for a frame."""
-        for logger, result in zip(self._loggers, (compared.a, compared.b), strict=True):
-            if result is not None:
-                logger.log(result)
-        if compared.found is not None:
-            frame = compared.a.frame
-            self._differences.log(compared.found, frame.received, frame.pose)
-
-
 # --- the robot ---------------------------------------------------------------------------------
 
 
@@ -180,14 +133,13 @@ def published_result(frame: Frame, topic: str, config: Config) -> FrameResult | 
     if labelled is None:
         return None
     cameras = tuple(_published_2d(frame, camera) for camera in frame.cameras)
-    return replace(FrameResult.unprocessed(frame, config, cameras), objects=_objects(labelled, frame))
+    objects = robot_objects(frame.pose, labelled)
+    return replace(FrameResult.unprocessed(frame, config, cameras), objects=objects)
 
 
-def _objects(labelled: LabelledBoxes3D, frame: Frame) -> Objects:
-    """Return the robot's boxes in the frame of the points."""
-    boxes = in_points_frame(frame, labelled)
-    unmatched = np.full(len(boxes), -1, np.int32)
-    return Objects(boxes, labelled.labels, labelled.scores, unmatched, ("",) * len(boxes), unmatched)
+def robot_objects(pose: F64, labelled: LabelledBoxes3D) -> Objects:
+    """Return the robot's boxes as objects, for the (4, 4) pose of the points."""
+    return make_objects(in_points_frame(pose, labelled), labelled.labels, labelled.scores, None, None)
 
 
 def _published_2d(frame: Frame, camera: Camera) -> CameraResult:

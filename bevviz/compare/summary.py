@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from io import StringIO
 from operator import attrgetter
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from bevviz.compare.sides import ComparedFrame
 from bevviz.config import ParameterChange
 from bevviz.errors import printable
 from bevviz.evaluate import ObjectScore
@@ -121,15 +121,7 @@ class ComparisonResult:
     frames: Sequence[DifferingFrame]
 
 
-class FrameComparison(Protocol):
-    """Frame of a comparison."""
-
-    @property
-    def found(self) -> FrameDifferences | None:
-        """Differences of the frame. None: a side has no result."""
-
-
-class ComparisonSummary(Observer[FrameComparison]):
+class ComparisonSummary(Observer[ComparedFrame]):
     """Observer that counts differences over all frames.
 
     Args:
@@ -155,7 +147,7 @@ class ComparisonSummary(Observer[FrameComparison]):
         """Differences of the configurations, in Markdown."""
         return fenced("\n".join(parameters(self.config)))
 
-    def observe(self, compared: FrameComparison) -> None:
+    def observe(self, compared: ComparedFrame) -> None:
         """Count a frame, or note that a side has no result."""
         if compared.found is None:
             self.without += 1
@@ -176,17 +168,16 @@ class ComparisonSummary(Observer[FrameComparison]):
                 self._clusters[key] += side.clusters
         self._other_clusters += differences.a.clusters != differences.b.clusters
         self._detected |= bool(differences.a.images or differences.b.images)
-        judged = differences.judged
-        if judged is not None:
-            self._judge(judged, differences)
+        effects = differences.effects
+        self._judge(effects)
         differing = [d for d in differences.objects if d.change is not Change.SAME]
         self.frames.append(
             DifferingFrame(
-                frame=differences.index,
-                stamp=differences.stamp,
+                frame=differences.a.index,
+                stamp=differences.a.stamp,
                 number=differences.number,
-                fixed=[] if judged is None else [*map(judged.label_text, judged.fixed)],
-                broke=[] if judged is None else [*map(judged.label_text, judged.broken)],
+                fixed=[*map(effects.label_text, effects.fixed)],
+                broke=[*map(effects.label_text, effects.broken)],
                 objects=[_row(d, differences) for d in differing],
                 detections=[
                     ImageDifference(d.change.value, d.name_a, d.name_b, camera, d.text, f"in {camera}")
@@ -197,14 +188,13 @@ class ComparisonSummary(Observer[FrameComparison]):
             )
         )
 
-    def _judge(self, judged: BeforeAfter, differences: FrameDifferences) -> None:
-        sides = (("A", differences.a, judged.before), ("B", differences.b, judged.after))
-        truth = judged.truth
-        assert truth is not None
-        for side, result, matches in sides:
+    def _judge(self, effects: BeforeAfter) -> None:
+        if (truth := effects.truth) is None:
+            return
+        for side, objects, matches in (("A", effects.a, effects.before), ("B", effects.b, effects.after)):
             assert matches is not None
-            self._scores[side].count(result.names, truth, matches)
-        for outcome, rows in (("fixed", judged.fixed), ("broke", judged.broken)):
+            self._scores[side].count(objects.names, truth, matches)
+        for outcome, rows in (("fixed", effects.fixed), ("broke", effects.broken)):
             for row in rows:
                 self._changes[truth.labels[row].lower()][outcome] += 1
 
@@ -345,8 +335,7 @@ def _rows(counts: Mapping[str, Counter[str]], which: Sequence[str] = COLUMNS) ->
 
 
 def _row(difference: Difference, differences: FrameDifferences) -> ObjectDifference:
-    side, row = differences.side_with(difference)
-    x, y, z = (round(v, 3) for v in side.boxes.center[row].tolist())
+    x, y, z = (round(v, 3) for v in differences.box_of(difference).center[0].tolist())
     pair = difference.row_a >= 0 and difference.row_b >= 0
     return ObjectDifference(
         change=difference.change.value,

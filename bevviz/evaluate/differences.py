@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -46,13 +46,15 @@ class ImageBoxes:
 
 @dataclass(frozen=True, slots=True)
 class SideResult:
-    """Results of one side in a frame. Boxes are in ``Frame.points_frame``."""
+    """Results of one side in a frame, without its points and images."""
 
-    boxes: Boxes3D
-    names: tuple[str, ...]
-    scores: F32
-    images: Mapping[str, ImageBoxes] = field(default_factory=dict)  # by camera; only cameras with detections
-    clusters: int | None = None  # None: unknown
+    index: int  # number of the scan
+    stamp: int  # of the scan, in nanoseconds
+    received: int  # receive time in nanoseconds; 0: unknown
+    pose: F64  # (4, 4) of the points in the fixed frame
+    objects: Objects
+    images: Mapping[str, ImageBoxes]  # by camera; only cameras with detections
+    clusters: int | None  # None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,27 +83,29 @@ class Difference:
 class FrameDifferences:
     """Differences of two sides in one frame."""
 
-    index: int
-    stamp: int
     a: SideResult
     b: SideResult
-    objects: tuple[Difference, ...]
+    effects: BeforeAfter  # pairs of their objects, and the ground truth
     images: Mapping[str, tuple[Difference, ...]]  # by camera
-    judged: BeforeAfter | None = None  # None: no ground truth
+
+    @property
+    def objects(self) -> tuple[Difference, ...]:
+        """Every object of both sides."""
+        return self.effects.pairs
 
     @property
     def counts(self) -> Counter[Change]:
         """Number of objects of each kind of difference."""
         return Counter(difference.change for difference in self.objects)
 
-    def side_with(self, difference: Difference) -> tuple[SideResult, int]:
-        """Return a side that has the object, and the object's row there. B comes first."""
-        return (self.a, difference.row_a) if difference.row_b < 0 else (self.b, difference.row_b)
+    def box_of(self, difference: Difference) -> Boxes3D:
+        """Return the box of the object, B's if B has it."""
+        side, row = (self.a, difference.row_a) if difference.row_b < 0 else (self.b, difference.row_b)
+        return side.objects.boxes.chosen([row])
 
     def position_of(self, difference: Difference) -> str:
         """Return the position of the object relative to the points' origin, as ``at 12.3 m, 4° left``."""
-        side, row = self.side_with(difference)
-        return position_text(side.boxes, row)
+        return position_text(self.box_of(difference), 0)
 
     @property
     def number(self) -> int:
@@ -119,42 +123,19 @@ def seen(result: FrameResult) -> SideResult:
             images[camera.camera.name] = ImageBoxes(
                 detections.xyxy[kept], tuple(detections.names[d] for d in kept)
             )
-    clusters = None
-    if result.clusters is not None:
-        clusters = int(result.clusters.kept.sum())
-    return replace(side_of(result.objects or Objects.empty()), images=images, clusters=clusters)
+    clusters = None if result.clusters is None else int(result.clusters.kept.sum())
+    frame, objects = result.frame, result.objects or Objects.empty()
+    return SideResult(frame.index, frame.stamp, frame.received, frame.pose, objects, images, clusters)
 
 
-def side_of(objects: Objects) -> SideResult:
-    """Return objects as one side of a comparison."""
-    return SideResult(objects.boxes, objects.names, objects.score)
-
-
-def differences(
-    index: int, stamp: int, a: SideResult, b: SideResult, judged: BeforeAfter | None = None
-) -> FrameDifferences:
-    """Return the differences of two sides in a frame.
-
-    Args:
-        index: number of the scan.
-        stamp: stamp of the scan, in nanoseconds.
-        a: side A.
-        b: side B.
-        judged: both sides compared with the ground truth. None: it is unknown.
-    """
+def differences(a: SideResult, b: SideResult, truth: Truth | None = None) -> FrameDifferences:
+    """Return the differences of two sides in a frame. Without ``truth``, the ground truth is unknown."""
     both = [camera for camera in a.images if camera in b.images]
-    return FrameDifferences(
-        index,
-        stamp,
-        a,
-        b,
-        compare_objects(a, b) if judged is None else judged.pairs,
-        {camera: compare_images(a.images[camera], b.images[camera]) for camera in both},
-        judged,
-    )
+    images = {camera: compare_images(a.images[camera], b.images[camera]) for camera in both}
+    return FrameDifferences(a, b, before_after(a.objects, b.objects, truth), images)
 
 
-def compare_objects(a: SideResult, b: SideResult) -> tuple[Difference, ...]:
+def compare_objects(a: Objects, b: Objects) -> tuple[Difference, ...]:
     """Pair the objects of two sides. Each object of either side occurs once.
 
     Two boxes may be one object if they have the same class and their centres are within 2 m in the
@@ -238,8 +219,8 @@ class BeforeAfter:
         doubtful: number of doubtful objects that there are more after the change. Ground truth makes it 0.
     """
 
-    a: SideResult
-    b: SideResult
+    a: Objects
+    b: Objects
     pairs: tuple[Difference, ...]
     truth: Truth | None = None
     before: Matches | None = None
@@ -380,9 +361,9 @@ def _rows_by_label(matches: Matches | None) -> dict[int, int]:
     return {label: row for row, label in enumerate(matches.partner.tolist()) if label >= 0}
 
 
-def _object_text(side: SideResult, row: int) -> str:
+def _object_text(objects: Objects, row: int) -> str:
     """Return class and distance of an object."""
-    return f"{side.names[row]} at {side.boxes.distance[row]:.1f} m"
+    return f"{objects.names[row]} at {objects.boxes.distance[row]:.1f} m"
 
 
 def before_after(
@@ -406,10 +387,9 @@ def before_after(
         own: see ``BeforeAfter``.
         doubtful: see ``BeforeAfter``.
     """
-    before, after = before or Objects.empty(), after or Objects.empty()
-    a, b = side_of(before), side_of(after)
+    a, b = before or Objects.empty(), after or Objects.empty()
     pairs = compare_objects(a, b)
     if truth is None:
         return BeforeAfter(a, b, pairs, own=own, doubtful=doubtful)
-    judged = judge(before, truth, cameras[0]), judge(after, truth, cameras[1])
+    judged = judge(a, truth, cameras[0]), judge(b, truth, cameras[1])
     return BeforeAfter(a, b, pairs, truth, *judged, asked, own)

@@ -162,7 +162,7 @@ def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:
         labelled: boxes in any frame, with its pose. A label of a data set accepts the names that detectors
             of COCO's classes use for it (``rule_of``). Any other label accepts its own name only.
     """
-    boxes = in_points_frame(frame, labelled)
+    boxes = in_points_frame(frame.pose, labelled)
     must = must_be_found(frame, boxes, labelled.labels)
     flat = [
         f"{box_name(k, labelled.labels[k], '')}: a side of it is 0 m long"

@@ -18,8 +18,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevviz.compare.log import DifferenceLogger
-from bevviz.compare.robot_comparison import RobotComparison, TimedDifferences
+from bevviz.compare.robot_comparison import RobotComparison
 from bevviz.config import Config
+from bevviz.evaluate.differences import FrameDifferences
 from bevviz.model.frame import I64, LateBoxes, Scene
 from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints
@@ -168,7 +169,7 @@ class Encoder:
         notes: Sequence[tuple[str, str]],
         late: Sequence[LateBoxes] = (),
         states: Mapping[str, str] = MappingProxyType({}),
-        compared: Sequence[TimedDifferences] = (),
+        compared: Sequence[FrameDifferences] = (),
     ) -> Packet:
         """Encode one frame, with changes of the configuration or scene since the last. See ``FrameLogger``.
 
@@ -224,7 +225,7 @@ class Encoder:
         self._config, self._scene = config, scene
         self._logger.reconfigure(config, scene)
 
-    def _log_differences(self, compared: Sequence[TimedDifferences], whole: bool) -> None:
+    def _log_differences(self, compared: Sequence[FrameDifferences], whole: bool) -> None:
         """Log differences from the robot's results."""
         if self._against is None or not (compared or self._differences):
             return
@@ -234,7 +235,7 @@ class Encoder:
         if whole:
             self._differences.refresh()
         for comparison in compared:
-            self._differences.log(comparison.differences, comparison.received, comparison.world_from_points)
+            self._differences.log(comparison)
 
     def prelude(self, context: RecordingContext, *, blueprint: bool = True) -> bytes:
         """Return the beginning of a recording whose first packet has this context. Any thread may call it."""

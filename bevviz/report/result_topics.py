@@ -36,7 +36,7 @@ def _message(frame: Frame, labelled: Labelled) -> MadeMessage:
     """Return the boxes of a frame as a message that is received with its scan."""
     hypotheses = [[pair] for pair in zip(labelled.labels, labelled.scores.tolist(), strict=True)]
     if isinstance(labelled, LabelledBoxes3D):
-        kind, boxes = BOXES_3D, in_points_frame(frame, labelled)
+        kind, boxes = BOXES_3D, in_points_frame(frame.pose, labelled)
         message = encode_boxes_3d(frame.stamp, frame.points_frame, boxes, hypotheses)
     else:
         frames = [c.image.frame_id for c in frame.cameras if c.image and c.name == labelled.camera]

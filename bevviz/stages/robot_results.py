@@ -9,7 +9,7 @@ import numpy as np
 from bevviz.errors import StageError
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
-from bevviz.model.frame import F32, Bool, Boxes3D, Camera, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.frame import F32, F64, Bool, Boxes3D, Camera, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.model.results import Clusters, ClusterState, Detections, DetectionState, Ground, Objects
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.user_stages import heights_above_ground, make_objects
@@ -42,7 +42,7 @@ def cluster(points: F32, frame: Frame, topic: str) -> Clusters:
     Raises:
         StageError: the robot published no boxes at this time.
     """
-    boxes = in_points_frame(frame, _boxes(frame, topic))
+    boxes = in_points_frame(frame.pose, _boxes(frame, topic))
     labels = np.full(len(points), -1, np.int32)
     nearest = np.full(len(points), np.inf, np.float32)
     centroid = boxes.center.astype(np.float32)
@@ -87,7 +87,7 @@ def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clus
     """
     labelled = _boxes(frame, topic)
     return make_objects(
-        in_points_frame(frame, labelled), labelled.labels, labelled.scores, obstacles, clusters
+        in_points_frame(frame.pose, labelled), labelled.labels, labelled.scores, obstacles, clusters
     )
 
 
@@ -101,11 +101,11 @@ def detections_of(labelled: LabelledBoxes2D) -> Detections:
     return Detections(labelled.xyxy[order], labelled.scores[order], zero, names, kept, zero - 1, overlap)
 
 
-def in_points_frame(frame: Frame, labelled: LabelledBoxes3D) -> Boxes3D:
-    """Move labelled 3D boxes into the frame of the points."""
+def in_points_frame(pose: F64, labelled: LabelledBoxes3D) -> Boxes3D:
+    """Move labelled 3D boxes into the frame of the points, which has this (4, 4) pose."""
     points_from_boxes = np.eye(4)
     if labelled.world_from_boxes is not None:
-        points_from_boxes = geometry.inverse(frame.pose) @ labelled.world_from_boxes
+        points_from_boxes = geometry.inverse(pose) @ labelled.world_from_boxes
     return geometry.transform_boxes(labelled.boxes, points_from_boxes)
 
 

@@ -160,7 +160,7 @@ def _find_truth(identity: Identity, result: FrameResult) -> tuple[Selection | No
         return None, f"the ground truth has no {identity.label} of id {identity.id} there"
     if truth is None or abs(result.frame.index - identity.frame) > GAP:
         return None, f"without an id it cannot be followed from frame {identity.frame}"
-    boxes = in_points_frame(result.frame, truth)
+    boxes = in_points_frame(result.frame.pose, truth)
     named = [row for row, label in enumerate(truth.labels) if label.lower() == identity.label]
     row = _nearest(identity.at, result, boxes, named)
     return (

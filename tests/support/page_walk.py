@@ -170,7 +170,7 @@ class Oracle:
         assert truth is not None
         if answer.subject.kind == "truth" or answer.center is None:
             return truth.ids[answer.subject.row] if answer.subject.kind == "truth" else ""
-        away = np.hypot(*(in_points_frame(frame, truth).center[:, :2] - np.array(answer.center)[:2]).T)
+        away = np.hypot(*(in_points_frame(frame.pose, truth).center[:, :2] - np.array(answer.center)[:2]).T)
         return truth.ids[int(away.argmin())] if away.min() < 0.4 else ""
 
     def same(self, one: Asked, other: Asked) -> bool:
