@@ -31,12 +31,10 @@ class UndecodedImage:
     """Image that is not decoded yet.
 
     Attributes:
-        stamp: stamp of the header, nanoseconds.
         frame_id: frame of the header.
         load: decodes the image.
     """
 
-    stamp: int
     frame_id: str
     load: Callable[[], Image]
 
@@ -86,7 +84,7 @@ class Cameras:
         """Add an image. Return whether it replaces an image with the same stamp."""
         self.frames[topic] = frame_id = self._optical_frame(topic, frame_id)
         self._image_counts[topic] += 1
-        return self.images[topic].add(stamp, UndecodedImage(stamp, frame_id, load))
+        return self.images[topic].add(stamp, UndecodedImage(frame_id, load))
 
     def _optical_frame(self, topic: str, frame_id: str) -> str:
         """Return the frame of an image: the stated one, or that of its CameraInfo if that fits better."""

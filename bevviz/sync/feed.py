@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from bevviz.drivers.video import decode_packet
 from bevviz.messages.camera_info import decode_camera_info
@@ -26,7 +26,7 @@ from bevviz.messages.transforms import (
 )
 from bevviz.model.frame import Cloud, LabelledBoxes3D
 from bevviz.sync.synchronizer import Synchronizer
-from bevviz.sync.video import Rewind, Video, VideoLoader
+from bevviz.sync.video import Rewind, Video
 
 
 class Message(TypedMessage, Protocol):
@@ -44,26 +44,6 @@ M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 P = ParamSpec("P")
 Handler = Callable[[M], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Loader(Generic[M, T]):
-    """Function that decodes a message when a frame takes it. It can be pickled.
-
-    Attributes:
-        message: serialised message.
-        decode: makes an object with the fields of the message.
-        read: makes the result from this object, its topic and its time of receipt.
-    """
-
-    message: M
-    decode: Callable[[M], Any]
-    read: Callable[[Any, str, int], T]
-
-    def __call__(self) -> T:
-        """Decode the message."""
-        message = self.message
-        return guard(message, self.read, self.decode(message), message.topic, message.received)
 
 
 def make_handlers(
@@ -84,9 +64,12 @@ def make_handlers(
     def read(message: M, decoder: Callable[Concatenate[Any, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         return guard(message, decoder, decode(message), *args, **kwargs)
 
+    def read_received(message: M, decoder: Callable[[Any, str, int], T]) -> T:
+        return read(message, decoder, message.topic, message.received)
+
     def read_cloud(message: M) -> Cloud:
         decoder = decode_laser_scan if message.type.endswith("LaserScan") else decode_cloud
-        return read(message, decoder, message.topic, message.received)
+        return read_received(message, decoder)
 
     def add_transforms(message: M, static: bool) -> None:
         for transform in read(message, decode_transforms, message.topic, sync.tf.refuse):
@@ -101,15 +84,17 @@ def make_handlers(
     def add_image(message: M, camera: CameraRole) -> None:
         stamp, frame_id = message.header()
         decoder = decode_compressed_image if camera.kind == "CompressedImage" else decode_image
-        sync.add_image(message.topic, stamp, frame_id, message.received, Loader(message, decode, decoder))
+        sync.add_image(
+            message.topic, stamp, frame_id, message.received, partial(read_received, message, decoder)
+        )
 
     def add_packet(message: M) -> None:
-        packet = read(message, decode_packet, message.topic, message.received)
+        packet = read_received(message, decode_packet)
         video = sync.videos[packet.topic]
         if video.add(packet):
             sync.report.untold[packet.topic, packet.codec] += 1
         if not packet.is_header:
-            load = VideoLoader(video, packet.place)
+            load = partial(video.image, packet.place)
             sync.add_image(packet.topic, packet.stamp, packet.frame_id, packet.received, load)
 
     def add_info(message: M, rectified: bool) -> None:
@@ -143,7 +128,7 @@ def make_handlers(
             sync.add_truth(topic, boxes.stamp, received, partial(replace, boxes))
         else:
             stamp, _ = message.header()
-            sync.add_truth(topic, stamp, received, Loader(message, decode, decode_detections_3d))
+            sync.add_truth(topic, stamp, received, partial(read_received, message, decode_detections_3d))
 
     def read_boxes(message: M) -> LabelledBoxes3D:
         stated = roles.boxes if roles.boxes.get("topic") == message.topic else {}
@@ -171,7 +156,7 @@ def make_handlers(
     for topic in roles.robot_clouds:
         handlers[topic] = lambda m: sync.add_robot_cloud(read_cloud(m))
     for topic in roles.robot_detections_2d:
-        handlers[topic] = lambda m: sync.add_detections(read(m, decode_detections_2d, m.topic, m.received))
+        handlers[topic] = lambda m: sync.add_detections(read_received(m, decode_detections_2d))
     for topic in roles.robot_detections_3d:
         handlers[topic] = lambda m: sync.add_boxes(read_boxes(m))
     if roles.truth:

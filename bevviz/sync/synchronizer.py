@@ -6,8 +6,8 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +42,7 @@ from bevviz.sync.video import Video
 FAR = 500.0  # metres; no LiDAR has half of its points farther away
 OVERTAKEN = 64  # late results, and frames to compare them with, that are kept
 
-
-@dataclass(frozen=True, slots=True)
-class _UndecodedBoxes:
-    """Boxes that are not decoded yet.
-
-    Attributes:
-        stamp: nanoseconds.
-        load: decodes the boxes.
-    """
-
-    stamp: int
-    load: Callable[[], LabelledBoxes3D]
+T = TypeVar("T")
 
 
 class Synchronizer:
@@ -116,8 +105,15 @@ class Synchronizer:
             *roles.robot_detections_2d
         )
         self._robot_clouds: dict[str, TopicBuffer[Cloud]] = self._make_buffers(*roles.robot_clouds)
-        self._truth: dict[str, TopicBuffer[_UndecodedBoxes]] = self._make_buffers(
+        # Functions that decode the ground truth.
+        self._truth: dict[str, TopicBuffer[Callable[[], LabelledBoxes3D]]] = self._make_buffers(
             *filter(None, [roles.truth])
+        )
+        self._results: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
+            self._boxes,
+            self._detections,
+            self._robot_clouds,
+            self._truth,
         )
         self._beside = frozenset(beside)
         self._overtaken: deque[LateBoxes] = deque(maxlen=OVERTAKEN)
@@ -291,8 +287,12 @@ class Synchronizer:
                 boxes are ignored.
         """
         stamp = self._arrived(topic, stamp, received)
-        buffer = self._truth.setdefault(topic, TopicBuffer(self._horizon))
-        self.report.repeated[topic] += buffer.add(stamp, _UndecodedBoxes(stamp, load))
+        self._keep(self._truth, topic, stamp, lambda: replace(load(), stamp=stamp))
+
+    def _keep(self, buffers: dict[str, TopicBuffer[T]], topic: str, stamp: int, message: T) -> None:
+        """Keep a message until a frame takes it."""
+        buffer = buffers.setdefault(topic, TopicBuffer(self._horizon))
+        self.report.repeated[topic] += buffer.add(stamp, message)
 
     def _add_result(
         self, buffers: dict[str, TopicBuffer[Any]], result: LabelledBoxes2D | LabelledBoxes3D
@@ -302,8 +302,7 @@ class Synchronizer:
         if result.topic in self._beside and self._is_past(stamp):
             self._add_late_result(result)
         else:
-            buffer = buffers.setdefault(result.topic, TopicBuffer(self._horizon))
-            self.report.repeated[result.topic] += buffer.add(stamp, result)
+            self._keep(buffers, result.topic, stamp, result)
 
     def _is_past(self, stamp: int) -> bool:
         """Return whether the frame nearest to a stamp has been delivered."""
@@ -388,15 +387,9 @@ class Synchronizer:
 
     def _buffers(self) -> Iterator[tuple[str, TopicBuffer[Any]]]:
         """Iterate over all topics and their buffers."""
-        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
-            self._partners,
-            self.cameras.images,
-            self._boxes,
-            self._detections,
-            self._robot_clouds,
-            self._truth,
-        )
-        for group in groups:
+        yield from self._partners.items()
+        yield from self.cameras.images.items()
+        for group in self._results:
             yield from group.items()
 
     def lacking(self) -> Iterator[str]:
@@ -464,12 +457,7 @@ class Synchronizer:
         waited = [buffer for topic, buffer in self._buffers() if topic not in beside]
         if any(buffer.newest is None or buffer.newest < stamp for buffer in waited):
             return False
-        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
-            self._boxes,
-            self._detections,
-            self._robot_clouds,
-            self._truth,
-        )
+        groups = self._results
         results = [buffer for group in groups for topic, buffer in group.items() if topic not in self._beside]
         if len(self._clouds) == 1 and any(self._may_be_of_next(buffer, stamp) for buffer in results):
             return False
@@ -527,12 +515,11 @@ class Synchronizer:
         in_place = reference.upright is None and cloud.frame_id.lstrip("/") == reference.points_frame
         points, fields = _merge(clouds, poses, in_place)
         cameras = tuple(self.cameras.at(role, reference) for role in self._roles.cameras)
-        first, last = self._window(cloud.stamp)
-        boxes = [buffer.take(cloud.stamp, first, last) for buffer in self._boxes.values()]
-        posed_boxes = [self.placing.placed(b, reference, problems) for b in boxes if b is not None]
+        boxes = self._take(self._boxes, cloud.stamp)
+        posed_boxes = [self.placing.placed(b, reference, problems) for b in boxes]
         for robot_boxes in posed_boxes:
             self.report.note_boxes(robot_boxes)
-        truth = self._taken_truth(cloud.stamp, first, last)
+        truth = self._taken_truth(cloud.stamp)
         frame = Frame(
             index=self._index,
             stamp=cloud.stamp,
@@ -548,8 +535,8 @@ class Synchronizer:
             points_from_clouds=poses,
             cameras=cameras,
             robot_boxes=tuple(posed_boxes),
-            robot_detections=self._robot_detections(cameras, cloud.stamp, first, last),
-            robot_clouds=self._taken_clouds(reference, first, last, problems),
+            robot_detections=self._robot_detections(cameras, cloud.stamp),
+            robot_clouds=self._taken_clouds(reference, problems),
             truth=None if truth is None else self.placing.placed(truth, reference, problems),
             label_names=self._config.source.labels,
             tf_age=reference.tf_age,
@@ -560,16 +547,8 @@ class Synchronizer:
 
     def _pass_over(self, stamp: int) -> None:
         """Drop what the frame of a neighbour takes."""
-        first, last = self._window(stamp)
-        groups: tuple[Mapping[str, TopicBuffer[Any]], ...] = (
-            self._boxes,
-            self._detections,
-            self._robot_clouds,
-            self._truth,
-        )
-        for group in groups:
-            for buffer in group.values():
-                buffer.take(stamp, first, last)
+        for group in self._results:
+            self._take(group, stamp)
         self.around.take(lambda name: None)
         self._last = stamp
         for _, buffer in self._buffers():
@@ -631,38 +610,35 @@ class Synchronizer:
             last = min(last, (stamp + self._clouds[0].stamp) // 2)
         return first, last
 
-    def _taken_truth(self, stamp: int, first: int, last: int) -> LabelledBoxes3D | None:
-        for topic, buffer in self._truth.items():
-            while (undecoded := buffer.take(stamp, first, last)) is not None:
-                try:
-                    truth = undecoded.load()
-                except UserError as error:
-                    self.report.damage.add(topic, str(error))
-                else:
-                    self.report.note_boxes(truth)
-                    return replace(truth, stamp=undecoded.stamp)
+    def _take(self, buffers: Mapping[str, TopicBuffer[T]], stamp: int) -> list[T]:
+        """Remove and return the message of each topic that is nearest to the cloud at a stamp."""
+        first, last = self._window(stamp)
+        nearest = [buffer.take(stamp, first, last) for buffer in buffers.values()]
+        return [message for message in nearest if message is not None]
+
+    def _taken_truth(self, stamp: int) -> LabelledBoxes3D | None:
+        while loads := self._take(self._truth, stamp):
+            try:
+                truth = loads[0]()
+            except UserError as error:
+                self.report.damage.add(self._roles.truth, str(error))
+            else:
+                self.report.note_boxes(truth)
+                return truth
         return None
 
-    def _robot_detections(
-        self, cameras: tuple[Camera, ...], stamp: int, first: int, last: int
-    ) -> tuple[LabelledBoxes2D, ...]:
+    def _robot_detections(self, cameras: tuple[Camera, ...], stamp: int) -> tuple[LabelledBoxes2D, ...]:
         """Return the robot's image boxes of this time, with the camera that has their frame."""
         names = {c.image.frame_id: c.name for c in cameras if c.image is not None}
-        nearest = (buffer.take(stamp, first, last) for buffer in self._detections.values())
-        messages = [detections for detections in nearest if detections is not None]
+        messages = self._take(self._detections, stamp)
         for detections in messages:
             self.report.note_boxes(detections)
         return tuple(d if d.camera else replace(d, camera=names.get(d.frame_id, "")) for d in messages)
 
-    def _taken_clouds(
-        self, reference: ReferenceFrames, first: int, last: int, problems: list[str]
-    ) -> tuple[Cloud, ...]:
+    def _taken_clouds(self, reference: ReferenceFrames, problems: list[str]) -> tuple[Cloud, ...]:
         """Return the robot's clouds of this time, in the frame of the points."""
         clouds = []
-        for buffer in self._robot_clouds.values():
-            cloud = buffer.take(reference.stamp, first, last)
-            if cloud is None:
-                continue
+        for cloud in self._take(self._robot_clouds, reference.stamp):
             try:
                 pose, _ = self.placing.moved(reference, cloud.stamp, cloud.frame_id)
             except TransformError as error:

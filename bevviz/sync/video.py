@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
@@ -31,18 +30,6 @@ UNNUMBERED = ("av1", "vp8", "vp9")  # codecs without a number by which a missing
 STEPS = 9  # steps between packets that a longer step is compared with
 _DECODERS = {"h265": "hevc", "av1": "libdav1d"}
 LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: return the picture of each packet at once
-
-
-@dataclass(frozen=True, slots=True)
-class VideoLoader:
-    """Function that decodes a picture when a frame takes it."""
-
-    video: Video
-    place: tuple[int, int]
-
-    def __call__(self) -> Image:
-        """Decode the picture."""
-        return self.video.image(self.place)
 
 
 class Video:
