@@ -280,16 +280,11 @@ def boxes_3d(columns: BoxColumns, topic: str, received: int, stamp: int, frame_i
 
 
 def _why_unusable(row: Sequence[float]) -> str:
-    """Return why centre, size and quaternion of a box cannot be used; empty if they can."""
-    is_finite = math.isfinite(sum(row)) and max(row) < LARGEST and min(row) > -LARGEST
-    if is_finite and min(row[3:6]) >= 0:  # a tenth of the time of the tests that find the reason
-        return ""
+    """Return why centre, size and quaternion of an unusable box cannot be used."""
     for name, values in (("centre", row[:3]), ("size", row[3:6]), ("orientation", row[6:])):
         if not all(abs(value) < LARGEST for value in values):  # false for NaN, too
             return f"its {name} is not finite: {_numbers(values)}"
-    if min(row[3:6]) < 0:
-        return f"its size is negative: {_numbers(row[3:6])}"
-    return ""
+    return f"its size is negative: {_numbers(row[3:6])}"
 
 
 def box_name(number: int, label: str, identity: str) -> str:

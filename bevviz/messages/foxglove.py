@@ -43,7 +43,6 @@ _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 _AXES = ("x", "y", "z")
 # Keys of metadata; the first that exists is the class.
 _LABELS = ("category", "label", "class", "class_name", "type", "name")
-_MODELS = {"kannala_brandt": "equidistant"}
 
 
 def foxglove_type(msgtype: str) -> str:
@@ -203,9 +202,8 @@ def _calibration(message: Any) -> Any:
     d, k, p = (_matrix_of(message, name) for name in "DKP")
     if k.size != 9:
         raise ValueError("K has not the nine numbers of a matrix")
-    model = str(message.distortion_model or "")
     size = _integer(message, "width"), _integer(message, "height")
-    return encode_camera(_header(message), size, _MODELS.get(model, model), d, k, p)
+    return encode_camera(_header(message), size, str(message.distortion_model or ""), d, k, p)
 
 
 def _matrix_of(message: Any, name: str) -> F64:
