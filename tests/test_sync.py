@@ -258,7 +258,7 @@ def test_undecodable_image_is_a_problem_of_its_camera() -> None:
     (frame,) = feed.sync.ready()
     assert frame.cameras[0].image is None
     assert frame.cameras[0].problems == ("/zed/image: encoding 'yuv9' is not known",)
-    assert feed.sync.report.undecodable == {"zed": 1}
+    assert feed.sync.report.undecodable.counts == {"zed": 1}
     said = "could not be decoded once, the first: /zed/image: encoding 'yuv9' is not known"
     assert feed.sync.report.warnings()[0] == f"camera 'zed': an image {said}"
 

@@ -157,7 +157,7 @@ class BagSource(Closable):
         """Yield a sentence for each large loss among the messages read so far that should make frames."""
         if self._state is None:
             return
-        report, damaged = self._state.sync.report, self._state.damage.count(self._driver)
+        report, damaged = self._state.sync.report, self._state.damage.counts[self._driver]
         read = report.queued + damaged
         heard = f"of the first {read} {self.noun}s"
         if report.stale > LARGE_LOSS * read:

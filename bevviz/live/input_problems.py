@@ -243,8 +243,8 @@ class InputProblems:
         )
         self._follow(
             "image",
-            report.undecodable,
-            lambda name: f"camera '{name}': an image could not be decoded: {report.first_undecodable[name]}",
+            report.undecodable.counts,
+            lambda name: f"camera '{name}': an image could not be decoded: {report.undecodable.first[name]}",
             lambda name: f"camera '{name}': its images can be decoded again",
         )
         self._follow(

@@ -210,8 +210,7 @@ class Cameras:
             self._report.images += 1
             return image, nearest[0]
         except UserError as error:
-            self._report.undecodable[role.name] += 1
-            self._report.first_undecodable.setdefault(role.name, str(error))
+            self._report.undecodable.add(role.name, str(error))
             problems.append(str(error))
             return None, stamp
 

@@ -24,12 +24,16 @@ class UnusableMessages:
 
     Args:
         noun: name of the counted things.
+
+    Attributes:
+        counts: number by topic; of images, by camera.
+        first: reason for the first one.
     """
 
     def __init__(self, noun: str = "message(s)") -> None:
         self._noun = noun
-        self._counts: Counter[str] = Counter()
-        self._first: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.first: dict[str, str] = {}
 
     def add(self, topic: str, reason: str) -> int:
         """Count a message. Return the count of its topic.
@@ -38,20 +42,16 @@ class UnusableMessages:
             topic: topic of the message.
             reason: a sentence that names the topic.
         """
-        self._counts[topic] += 1
-        self._first.setdefault(topic, reason)
-        return self._counts[topic]
-
-    def count(self, topic: str) -> int:
-        """Return the count of a topic."""
-        return self._counts[topic]
+        self.counts[topic] += 1
+        self.first.setdefault(topic, reason)
+        return self.counts[topic]
 
     @property
     def sentences(self) -> list[str]:
         """A sentence for each topic."""
         return [
-            f"{count} {self._noun} of {topic} could not be used, the first: {self._first[topic]}"
-            for topic, count in self._counts.items()
+            f"{count} {self._noun} of {topic} could not be used, the first: {self.first[topic]}"
+            for topic, count in self.counts.items()
         ]
 
 
@@ -78,7 +78,6 @@ class SyncReport:
         without_image: frames without an image, by camera.
         images: decoded images of all cameras.
         undecodable: images that cannot be decoded, by camera.
-        first_undecodable: reason for the first such image, by camera.
         untold: gaps in video whose packets do not tell if one is lost, by topic and codec.
         damage: ground truth that cannot be decoded.
         boxes: boxes of ground truth and robot that cannot be used.
@@ -109,8 +108,7 @@ class SyncReport:
     repeated: Counter[str] = field(default_factory=Counter)
     without_image: Counter[str] = field(default_factory=Counter)
     images: int = 0
-    undecodable: Counter[str] = field(default_factory=Counter)
-    first_undecodable: dict[str, str] = field(default_factory=dict)
+    undecodable: UnusableMessages = field(default_factory=UnusableMessages)
     untold: Counter[tuple[str, str]] = field(default_factory=Counter)
     damage: UnusableMessages = field(default_factory=UnusableMessages)
     boxes: UnusableMessages = field(default_factory=partial(UnusableMessages, "box(es)"))
@@ -154,8 +152,8 @@ class SyncReport:
 
     def losses(self) -> Iterator[InputFinding]:
         """Yield a finding for each camera and topic with content that could not be used."""
-        for camera, n in self.undecodable.items():
-            first = self.first_undecodable[camera]
+        for camera, first in self.undecodable.first.items():
+            n = self.undecodable.counts[camera]
             text = f"camera '{camera}': an image could not be decoded {_times(n)}, the first: {first}"
             yield InputFinding("image", camera, text)
         for text in (*self.damage.sentences, *self.boxes.sentences):
@@ -241,7 +239,7 @@ def why_no_images(config: Config, roles: Roles, report: SyncReport | None) -> li
         return [f"detector.model {model} sees nothing: {roles.no_camera}"]
     if report is None or not report.frames or report.images:
         return []
-    reasons = [*report.first_undecodable.values(), "no image at the time of any scan"]
+    reasons = [*report.undecodable.first.values(), "no image at the time of any scan"]
     return [f"detector.model {model} has seen nothing in {report.frames} frames: {reasons[0]}"]
 
 
