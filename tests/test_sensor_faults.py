@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import bevviz
 from bevviz.anomalies import AnomalyDetector
-from bevviz.anomalies.calibration_drift import LEAST_PAST, find_error, score_rotations
+from bevviz.anomalies.calibration_drift import LEAST_PAST, PlacementWatch, find_error, score_rotations
 from bevviz.anomalies.sensor_faults import ImageWatch
 from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import AnomaliesConfig
@@ -205,6 +207,20 @@ def test_transform_that_was_always_wrong_is_told(drive: Results, axis: int, degr
     row, anomaly = seen[MISPLACED]
     assert row <= 24
     assert anomaly.text == f"{MISPLACED} since 0.0 s, by about 3 degrees against {LIDAR}"
+
+
+@pytest.mark.parametrize(("flip", "name"), [(-1, "image upside down"), (1, "mirrored image")])
+def test_flipped_image_is_told(drive: Results, flip: int, name: str) -> None:
+    faults_now = []
+    with ThreadPoolExecutor(1) as worker:
+        watch = PlacementWatch(worker)
+        for result in drive[:-4]:
+            frame = with_image(result, np.asarray(cv2.flip(pixels(result), flip), np.uint8)).frame
+            faults_now = list(watch.update(frame, frame.clouds, ()))
+        assert not faults_now
+        frame = with_image(drive[-1], np.asarray(cv2.flip(pixels(drive[-1]), flip), np.uint8)).frame
+        faults_now = list(watch.update(frame, frame.clouds, ()))
+    assert [(fault.sensor, fault.name) for fault in faults_now] == [(CAMERA, name)]
 
 
 def restamped(results: Results) -> Results:

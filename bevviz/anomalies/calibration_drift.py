@@ -2,7 +2,8 @@
 
 Where the range jumps between neighbouring beams, the image should have an edge (Levinson and Thrun 2013). The
 edges of single frames are scored at the stated mounting and at small rotations around it. A rotation that
-beats the stated mounting clearly, over several frames, is the error of the transform.
+beats the stated mounting clearly, over several frames, is the error of the transform. The image turned by 180
+degrees and its mirror image are scored too: a driver may turn an image where the transform does not.
 """
 
 from __future__ import annotations
@@ -55,6 +56,17 @@ def _rotations() -> tuple[F64, F64]:
 
 
 TURNS, MATRICES = _rotations()
+ROTATIONS = len(TURNS)
+_STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)
+# Rows of the scores by the code of cv2.flip (None: the image as it is). Flipped images have the rotations at the
+# stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside down, about y a mirror image.
+FLIPS = {
+    None: slice(ROTATIONS),
+    -1: slice(ROTATIONS, ROTATIONS + len(_STATED)),
+    1: slice(ROTATIONS + len(_STATED), None),
+}
+TURNS = np.concatenate([TURNS, TURNS[_STATED] + [0, 0, 180], TURNS[_STATED] + [0, 180, 0]])
+MATRICES = np.concatenate([MATRICES, MATRICES[_STATED], MATRICES[_STATED]])
 AT_STATED: Bool = np.linalg.norm(TURNS, axis=1) < 1.5 * STEP
 
 
@@ -120,20 +132,28 @@ class PlacementWatch:
             pair.fault = None
             return
         since = pair.stamps[0] if pair.fault is None else pair.fault.since
-        detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {lidar}"
-        pair.fault = SensorFault(f"camera {camera}", "not where its transform says", since, detail)
+        if best < ROTATIONS:
+            name = "not where its transform says"
+            detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {lidar}"
+        elif TURNS[best, 2] > 90:
+            name = "image upside down"
+            detail = f": turned by 180 degrees it fits LiDAR {lidar}; turn the image, or roll its transform"
+        else:
+            name = "mirrored image"
+            detail = f": flipped left to right it fits LiDAR {lidar}; flip the image, or the y of the points"
+        pair.fault = SensorFault(f"camera {camera}", name, since, detail)
 
 
 def find_error(scores: F64) -> int | None:
     """Return the row of ``TURNS`` that corrects the stated mounting. None: it is right, or nobody can tell.
 
     Args:
-        scores: (C, R) score of each rotation in each check.
+        scores: (C, R) score of each row of ``TURNS`` in each check.
     """
     if len(scores) < LEAST_PAST:
         return None
     total = scores.sum(axis=0)
-    best, spread = int(total.argmax()), float(total.std())
+    best, spread = int(total.argmax()), float(total[:ROTATIONS].std())
     apart = np.linalg.norm(TURNS - TURNS[best], axis=1)
     stated = scores[:, AT_STATED].max(axis=1)
     better = scores[:, apart < STEP + 0.1].max(axis=1) > stated
@@ -163,11 +183,14 @@ def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64
         return None
     every = -(-len(xyz) // EDGES)
     xyz, change = xyz[::every], change[::every]
-    density, row, _ = densities(change, image_edges(image), float(K[0, 0]) * BLUR)
     scores = np.zeros(len(TURNS))
     from_camera = (K @ MATRICES).astype(np.float32)
     xyz = geometry.apply(camera_from_cloud, xyz)
-    add_scores(xyz, row, log_densities(density), from_camera, np.zeros(3, np.float32), scores)
+    for flip, rows in FLIPS.items():
+        edges = image_edges(image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8))
+        density, row, _ = densities(change, edges, float(K[0, 0]) * BLUR)
+        shift = np.zeros(3, np.float32)
+        add_scores(xyz, row, log_densities(density), from_camera[rows], shift, scores[rows])
     return scores
 
 
