@@ -58,8 +58,9 @@ def _rotations() -> tuple[F64, F64]:
 TURNS, MATRICES = _rotations()
 ROTATIONS = len(TURNS)
 _STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)
-# Rows of the scores by the code of cv2.flip (None: the image as it is). Flipped images have the rotations at the
-# stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside down, about y a mirror image.
+# Rows of the scores by the code of cv2.flip (None: the image as it is). Flipped images have the rotations
+# at the stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside down, about y a mirror
+# image.
 FLIPS = {
     None: slice(ROTATIONS),
     -1: slice(ROTATIONS, ROTATIONS + len(_STATED)),
