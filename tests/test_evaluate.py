@@ -165,7 +165,7 @@ def test_counts_classes_and_ranges_are_those_of_the_frames(drive: Path, evaluate
     assert there.total() > 10
     for label, number in there.items():
         assert evaluated.metrics[f"recall.{label}"] == pytest.approx(found[label] / number)
-    ranged = sum(evaluated.counts("", low, low + 10)["true"] for low in (0, 10, 20, 30))
+    ranged = sum(evaluated.score.counts("", low, low + 10)["true"] for low in (0, 10, 20, 30))
     assert ranged == found.total()
     assert evaluated.metrics["missed"] == there.total() - found.total()
     assert 0.9 < evaluated.metrics["ground_iou"] < 1
@@ -378,11 +378,11 @@ def test_false_boxes_count_for_each_class_they_may_be() -> None:
         labelled(("Pedestrian", 10, 0), ("Cyclist", 20, 0), ("Car", 40, 0)),
     )
     assert {name: dict(found) for name, found in score.classes.items()} == {
-        "pedestrian": {"tp": 1, "fp": 2},
-        "cyclist": {"tp": 1, "fp": 1, "fn": 1},
-        "car": {"fn": 1},
+        "pedestrian": {"true": 1, "false": 2},
+        "cyclist": {"true": 1, "false": 1, "missed": 1},
+        "car": {"missed": 1},
     }
-    assert dict(score.total) == {"tp": 2, "fp": 3, "fn": 2}
+    assert dict(score.total) == {"true": 2, "false": 3, "missed": 2}
 
 
 def test_false_boxes_in_any_frame_lower_the_precision() -> None:

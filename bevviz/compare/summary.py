@@ -193,7 +193,7 @@ class ComparisonSummary(Observer[ComparedFrame]):
             return
         for side, objects, matches in (("A", effects.a, effects.before), ("B", effects.b, effects.after)):
             assert matches is not None
-            self._scores[side].count(objects.names, truth, matches)
+            self._scores[side].count(objects, truth, matches)
         for outcome, rows in (("fixed", effects.fixed), ("broke", effects.broken)):
             for row in rows:
                 self._changes[truth.labels[row].lower()][outcome] += 1
@@ -204,12 +204,12 @@ class ComparisonSummary(Observer[ComparedFrame]):
         of_sides = {side: score.classes for side, score in self._scores.items()}
         classes = {}
         for name, counts in of_sides["A"].items():
-            if there := counts["tp"] + counts["fn"]:
-                found = {side: of_side[name]["tp"] for side, of_side in of_sides.items()}
+            if there := counts["true"] + counts["missed"]:
+                found = {side: of_side[name]["true"] for side, of_side in of_sides.items()}
                 classes[name] = Counter(there=there, **found, **self._changes[name])
         if not classes:
             return None
-        wrong = {side: score.total["fp"] for side, score in self._scores.items()}
+        wrong = {side: score.total["false"] for side, score in self._scores.items()}
         return TruthCounts(classes, SideCounts(**wrong))
 
     @property

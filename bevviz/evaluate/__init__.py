@@ -17,6 +17,7 @@ from bevviz.evaluate.matching import (
     match,
     pair_in_order,
     position_text,
+    rates,
 )
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "match",
     "pair_in_order",
     "position_text",
+    "rates",
     "truth_in",
     "truth_of",
     "truth_source",

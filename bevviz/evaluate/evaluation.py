@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -13,7 +13,7 @@ import numpy as np
 from bevviz.errors import printable
 from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, AveragePrecision, scored_objects
 from bevviz.evaluate.ground_truth import Truth, TruthLookup
-from bevviz.evaluate.matching import DetectionScore, Matches, ObjectScore, position_text, share
+from bevviz.evaluate.matching import Matches, ObjectScore, position_text, rates, share
 from bevviz.evaluate.metrics import LimitResult, base_of, ranges
 from bevviz.evaluate.tracking_score import TrackScore
 from bevviz.model.frame import Frame
@@ -79,6 +79,7 @@ class Evaluation(Observer[FrameResult], Tabular):
         causes: returns the causes of the false objects of a frame by row. None: they are not asked for.
 
     Attributes:
+        score: every true, missed and false object.
         last: result, ground truth and matches of the last frame.
         causes: causes of its false objects, by row.
         judged: objects of each frame as text.
@@ -97,13 +98,11 @@ class Evaluation(Observer[FrameResult], Tabular):
         self.without = 0  # frames without ground truth
         self.unusable: list[str] = []  # one sentence for each label that cannot be used
         self.last: tuple[FrameResult, Truth, Matches] | None = None
-        self._score = ObjectScore()
-        self._rows: list[tuple[str, str, float]] = []  # outcome, class, distance in metres
+        self.score = ObjectScore()
         self._precision = AveragePrecision()
         self._tracks = TrackScore()
-        self._detections = DetectionScore()
+        self._detections = ObjectScore(self.score.accepted)
         self._ground: Counter[str] = Counter()
-        self._errors: dict[str, list[float]] = defaultdict(list)
         self._metrics: dict[str, float] | None = None
 
     def observe(self, result: FrameResult) -> None:
@@ -115,30 +114,17 @@ class Evaluation(Observer[FrameResult], Tabular):
             return
         self.unusable += [f"frame {result.frame.index}: {reason}" for reason in truth.unusable]
         objects = result.objects or Objects.empty()
-        matches = self._score.add(objects, truth, result.cameras)
+        matches = self.score.add(objects, truth, result.cameras)
         self.last = result, truth, matches
         self.causes = {} if self._causes is None else self._causes(result, truth, matches)
         self.false_causes.update(cause.kind.value for cause in self.causes.values())
         self.judged.append(_outcome(result.frame, objects, truth, matches, self.causes))
-        self._store_positions(objects, truth, matches)
         if result.objects is not None:
             self._precision.add(scored_objects(result, truth), truth)
-        self._tracks.add(result, truth, self._score.judged)
+        self._tracks.add(result, truth, self.score.accepted)
         for camera in result.cameras:
-            self._detections.add(camera, truth)
+            self._detections.add_detections(camera, truth)
         count_ground(self._ground, result)
-
-    def _store_positions(self, objects: Objects, truth: Truth, matches: Matches) -> None:
-        """Store class and distance of the true, false and missed objects."""
-        for j in np.flatnonzero(matches.true).tolist():
-            k = int(matches.partner[j])
-            label = truth.labels[k].lower()
-            self._rows.append(("true", label, float(truth.boxes.distance[k])))
-            self._errors[label].append(float(matches.distance[j]))
-        for row in np.flatnonzero(matches.missed).tolist():
-            self._rows.append(("missed", truth.labels[row].lower(), float(truth.boxes.distance[row])))
-        for j in np.flatnonzero(matches.false).tolist():
-            self._rows.append(("false", objects.names[j].lower(), float(objects.boxes.distance[j])))
 
     # --- numbers -------------------------------------------------------------------------------
 
@@ -152,19 +138,19 @@ class Evaluation(Observer[FrameResult], Tabular):
     def _all_metrics(self) -> Iterator[tuple[str, float]]:
         frames = max(len(self.judged), 1)
         for cls in ("", *self.classes):
-            counts = self.counts(cls)
+            counts = self.score.counts(cls)
             if not counts.total():
                 continue
             tail = f".{cls}" if cls else ""
             yield from _rates(counts, tail)
-            if errors := self._errors[cls] if cls else self._score.errors:
+            if errors := self.score.errors(cls):
                 yield f"error_m{tail}", float(np.median(errors))
                 yield f"error_90_m{tail}", float(np.quantile(errors, 0.9))
             for low, high in ranges():
-                range_counts = self.counts(cls, low, high)
+                range_counts = self.score.counts(cls, low, high)
                 if range_counts.total():
                     yield from _rates(range_counts, f"{tail}@{low}-{high}")
-        total = self.counts()
+        total = self.score.total
         yield "missed_per_frame", total["missed"] / frames
         yield "false_per_frame", total["false"] / frames
         for (view, overlap, cls, difficulty), value in self._precision.results().items():
@@ -172,42 +158,22 @@ class Evaluation(Observer[FrameResult], Tabular):
         for cls, values in self._tracks.results().items():
             for name, value in values.items():
                 yield (f"{name}.{cls}" if cls else name), value
-        detections = self._detections.classes(self._score.judged)
-        for cls in ("", *sorted(detections)):
-            counts = detections[cls] if cls else sum(detections.values(), Counter())
-            if counts.total():
-                tail = f".{cls}" if cls else ""
-                yield f"detection_recall{tail}", share(counts["true"], counts["missed"])
-                yield f"detection_precision{tail}", share(counts["true"], counts["false"])
+        if (total := self._detections.total).total():
+            for cls, counts in sorted({"": total, **self._detections.classes}.items()):
+                tail, shares = f".{cls}" if cls else "", rates(counts)
+                yield f"detection_recall{tail}", shares["recall"]
+                yield f"detection_precision{tail}", shares["precision"]
         if ground := self._ground:
-            yield "ground_precision", share(ground["true"], ground["false"])
-            yield "ground_recall", share(ground["true"], ground["missed"])
+            shares = rates(ground)
+            yield "ground_precision", shares["precision"]
+            yield "ground_recall", shares["recall"]
             yield "ground_iou", share(ground["true"], ground["false"] + ground["missed"])
             yield "object_points_kept", share(ground["kept"], ground["lost"])
 
     @property
     def classes(self) -> list[str]:
         """Classes of the labels and of the judged false objects."""
-        return sorted({cls for _, cls, _ in self._judged_rows()})
-
-    def counts(self, cls: str = "", low: float = 0.0, high: float = math.inf) -> Counter[str]:
-        """Return the counts ``true``, ``false`` and ``missed`` between two distances in metres.
-
-        Args:
-            cls: class; empty: all classes.
-            low: least distance.
-            high: distances are below this one.
-        """
-        return Counter(
-            outcome
-            for outcome, name, distance in self._judged_rows()
-            if name == (cls or name) and low <= distance < high
-        )
-
-    def _judged_rows(self) -> Iterator[tuple[str, str, float]]:
-        """Yield outcome, class and distance of the true, false and missed objects."""
-        for outcome, name, distance in self._rows:
-            yield outcome, (outcome == "false" and self._score.judged.of(name)) or name, distance
+        return sorted(self.score.classes)
 
     @property
     def labels(self) -> Mapping[str, int]:
@@ -258,9 +224,7 @@ class Evaluation(Observer[FrameResult], Tabular):
 
 
 def _rates(counts: Counter[str], tail: str) -> Iterator[tuple[str, float]]:
-    yield f"recall{tail}", share(counts["true"], counts["missed"])
-    yield f"precision{tail}", share(counts["true"], counts["false"])
-    yield f"f1{tail}", share(2 * counts["true"], counts["missed"] + counts["false"])
+    yield from ((f"{name}{tail}", value) for name, value in rates(counts).items())
     yield f"missed{tail}", float(counts["missed"])
     yield f"false{tail}", float(counts["false"])
 
@@ -316,7 +280,7 @@ def page(evaluation: Evaluation) -> str:
 def _lines(
     evaluation: Evaluation, laid_out: Callable[[list[Row]], Iterable[str]], bullet: str = "  "
 ) -> Iterator[str]:
-    totals = evaluation.counts()
+    totals = evaluation.score.total
     without = f", {evaluation.without} without truth left out" if evaluation.without else ""
     labels = totals["true"] + totals["missed"]
     yield f"{len(evaluation.judged)} frames{without}; {labels} objects had to be found"
@@ -378,7 +342,7 @@ def tables(evaluation: Evaluation) -> Iterator[list[Row]]:
 def _row(evaluation: Evaluation, title: str, tail: str) -> Row:
     cls, _, range_name = tail.removeprefix(".").partition("@")
     low, _, high = range_name.partition("-")
-    counts = evaluation.counts(cls, float(low or 0), float(high or "inf"))
+    counts = evaluation.score.counts(cls, float(low or 0), float(high or "inf"))
     numbers = (counts["true"] + counts["missed"], counts["true"], counts["missed"], counts["false"])
     rates = (
         _number(evaluation.metrics, f"{n}{tail}") for n in ("precision", "recall", "error_m", "error_90_m")

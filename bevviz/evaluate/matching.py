@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from bevviz.model.frame import F32, F64, I32, Bool, Boxes3D, Camera
 from bevviz.model.results import CameraResult, Objects
 
 DETECTION_OVERLAP = 0.5  # least IoU of a detection and its label in the image
+OUTCOMES = ("true", "missed", "false")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,82 +58,85 @@ class AcceptedNames:
             return name
         return min(labels, key=lambda label: (len(self._accepted[label]), label), default=None)
 
-    def with_false(
-        self, labels: Mapping[str, Counter[str]], false: Mapping[str, int], key: str
-    ) -> dict[str, Counter[str]]:
-        """Return the counts by label, with the false ones added.
 
-        Args:
-            labels: counts by label.
-            false: number of false objects by name.
-            key: key of the false ones in the counts.
-        """
-        counts = {label: Counter(label_counts) for label, label_counts in labels.items()}
-        for name, number in false.items():
-            counts.setdefault(self.of(name) or name, Counter())[key] += number
-        return counts
+class JudgedObject(NamedTuple):
+    """A true, missed or false object of a frame, or such a detection in its image."""
+
+    outcome: str  # one of OUTCOMES
+    name: str  # in lower case: its label, or the own name of a false one
+    distance: float = math.nan  # metres from the sensor
+    error: float = math.nan  # metres between the centres of a true object and its label
 
 
 @dataclass
 class ObjectScore:
-    """Counts of objects over frames."""
+    """True, missed and false objects of frames, or detections in their images.
 
-    judged: AcceptedNames = field(default_factory=AcceptedNames)
-    errors: list[float] = field(default_factory=list)  # metres, of the true ones
-    _labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    _frames: list[tuple[int, int, Counter[str]]] = field(default_factory=list)  # true, missed, false by name
+    ``accepted`` says for which class a false one counts.
+    """
+
+    accepted: AcceptedNames = field(default_factory=AcceptedNames)
+    _frames: list[list[JudgedObject]] = field(default_factory=list)
 
     def add(self, objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> Matches:
         """Match one frame's objects with the ground truth, best score first, and count."""
         matches = judge(objects, truth, cameras)
-        self.count(objects.names, truth, matches)
+        self.count(objects, truth, matches)
         return matches
 
-    def count(self, names: Sequence[str], truth: Truth, matches: Matches) -> None:
+    def count(self, objects: Objects, truth: Truth, matches: Matches) -> None:
         """Count the objects of one frame that are matched already."""
-        self.judged.add(truth)
-        false = Counter(names[j].lower() for j in np.flatnonzero(matches.false).tolist())
-        self._frames.append((int(matches.true.sum()), int(matches.missed.sum()), false))
-        for j in np.flatnonzero(matches.true):
-            self._labels[truth.labels[matches.partner[j]].lower()]["tp"] += 1
-            self.errors.append(float(matches.distance[j]))
-        for k in np.flatnonzero(matches.missed):
-            self._labels[truth.labels[k].lower()]["fn"] += 1
+        self.accepted.add(truth)
+        self._frames.append(list(_judged_objects(objects, truth, matches)))
+
+    def add_detections(self, result: CameraResult, truth: Truth) -> None:
+        """Match one camera's detections with the labelled image boxes, best score first, and count."""
+        self._frames.append(list(_judged_detections(result, truth)))
+
+    @property
+    def objects(self) -> Iterator[JudgedObject]:
+        """Every object. A false one has the name of the class for which it counts, if there is one."""
+        for one in itertools.chain.from_iterable(self._frames):
+            name = self.accepted.of(one.name) if one.outcome == "false" else None
+            yield one._replace(name=name) if name else one
+
+    def counts(self, cls: str = "", low: float = 0.0, high: float = math.inf) -> Counter[str]:
+        """Return the counts ``true``, ``missed`` and ``false`` between two distances in metres.
+
+        Args:
+            cls: class; empty: all classes.
+            low: least distance.
+            high: distances are below this one.
+        """
+        return Counter(
+            one.outcome
+            for one in self.objects
+            if one.name == (cls or one.name) and low <= one.distance < high
+        )
+
+    def errors(self, cls: str = "") -> list[float]:
+        """Return the metres between the centres of the true objects of a class; empty: of all classes."""
+        return [one.error for one in self.objects if one.outcome == "true" and one.name == (cls or one.name)]
 
     @property
     def frames(self) -> F64:
         """(F, 3) numbers of true, missed and false objects of each frame."""
-        counts = [(true, missed, false.total()) for true, missed, false in self._frames]
+        frames = [Counter(one.outcome for one in frame) for frame in self._frames]
+        counts = [[frame[outcome] for outcome in OUTCOMES] for frame in frames]
         return np.array(counts, np.float64).reshape(-1, 3)
 
     @property
     def classes(self) -> dict[str, Counter[str]]:
-        """Counts of each class, in lower case: true (tp), false (fp) and missed (fn) objects."""
-        false = sum((names for *_, names in self._frames), Counter[str]())
-        return self.judged.with_false(self._labels, false, "fp")
+        """Counts of each class, in lower case."""
+        counts: dict[str, Counter[str]] = defaultdict(Counter)
+        for one in self.objects:
+            counts[one.name][one.outcome] += 1
+        return dict(counts)
 
     @property
     def total(self) -> Counter[str]:
         """Counts of all classes together."""
-        return sum(self.classes.values(), Counter())
-
-    @property
-    def precision(self) -> float:
-        """Precision of all classes. NaN if there are no objects."""
-        total = self.total
-        return share(total["tp"], total["fp"])
-
-    @property
-    def recall(self) -> float:
-        """Recall of all classes. NaN if there is no object to be found."""
-        total = self.total
-        return share(total["tp"], total["fn"])
-
-    @property
-    def f1(self) -> float:
-        """Harmonic mean of precision and recall."""
-        total = self.total
-        return share(2 * total["tp"], total["fp"] + total["fn"])
+        return Counter(one.outcome for frame in self._frames for one in frame)
 
 
 def position_text(boxes: Boxes3D, row: int) -> str:
@@ -143,6 +149,16 @@ def position_text(boxes: Boxes3D, row: int) -> str:
 def share(right: int, wrong: int) -> float:
     """Return the share of right ones. NaN if there are none at all."""
     return right / (right + wrong) if right + wrong else float("nan")
+
+
+def rates(counts: Mapping[str, int]) -> dict[str, float]:
+    """Return recall, precision and their harmonic mean. NaN if there is nothing to count."""
+    true, missed, false = (counts.get(outcome, 0) for outcome in OUTCOMES)
+    return {
+        "recall": share(true, missed),
+        "precision": share(true, false),
+        "f1": share(2 * true, missed + false),
+    }
 
 
 def judge(objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> Matches:
@@ -233,40 +249,42 @@ def pair_in_order(distance: F32, limit: float) -> tuple[np.ndarray[tuple[int], n
     return partner, free
 
 
-class DetectionScore:
-    """Counts of detections over frames: true and missed ones by label, false ones by name."""
+def _judged_objects(objects: Objects, truth: Truth, matches: Matches) -> Iterator[JudgedObject]:
+    """Yield the true, missed and false objects of a frame."""
+    labels, distance = [label.lower() for label in truth.labels], truth.boxes.distance
+    for j in np.flatnonzero(matches.true).tolist():
+        k = int(matches.partner[j])
+        yield JudgedObject("true", labels[k], float(distance[k]), float(matches.distance[j]))
+    for k in np.flatnonzero(matches.missed).tolist():
+        yield JudgedObject("missed", labels[k], float(distance[k]))
+    distance = objects.boxes.distance
+    for j in np.flatnonzero(matches.false).tolist():
+        yield JudgedObject("false", objects.names[j].lower(), float(distance[j]))
 
-    def __init__(self) -> None:
-        self._labels: dict[str, Counter[str]] = defaultdict(Counter)
-        self._false: Counter[str] = Counter()
 
-    def classes(self, judged: AcceptedNames) -> dict[str, Counter[str]]:
-        """Return the counts ``true``, ``false`` and ``missed`` of each class."""
-        return judged.with_false(self._labels, self._false, "false")
-
-    def add(self, result: CameraResult, truth: Truth) -> None:
-        """Match one camera's detections with the labelled image boxes, best score first, and count."""
-        detections, camera = result.detections, result.camera
-        if detections is None or camera.intrinsics is None or camera.camera_from_points is None:
-            return
-        boxes = image_boxes_of(truth, camera)
-        kept = np.flatnonzero(detections.kept)
-        kept = kept[np.argsort(-detections.score[kept], kind="stable")]
-        names = [detections.names[d].lower() for d in kept]
-        overlap = geometry.iou(detections.xyxy[kept], boxes)
-        cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
-        partner, free = pair_in_order(cost, 1.0)
-        excused, judged = _in_regions(detections.xyxy[kept], truth), truth.judged_names
-        if truth.judged is not None:
-            excused |= (overlap[:, ~truth.judged] >= DETECTION_OVERLAP).any(axis=1)
-        to_find = truth.must & np.isfinite(boxes).all(axis=1)
-        for name, k, is_excused in zip(names, partner.tolist(), excused.tolist(), strict=True):
-            if k >= 0 and to_find[k]:
-                self._labels[truth.labels[k].lower()]["true"] += 1
-            elif k < 0 and not is_excused and name in judged:
-                self._false[name] += 1
-        for row in np.flatnonzero(free & to_find).tolist():
-            self._labels[truth.labels[row].lower()]["missed"] += 1
+def _judged_detections(result: CameraResult, truth: Truth) -> Iterator[JudgedObject]:
+    """Match one camera's detections with the labelled image boxes. Yield true, missed and false ones."""
+    detections, camera = result.detections, result.camera
+    if detections is None or camera.intrinsics is None or camera.camera_from_points is None:
+        return
+    boxes = image_boxes_of(truth, camera)
+    kept = np.flatnonzero(detections.kept)
+    kept = kept[np.argsort(-detections.score[kept], kind="stable")]
+    names = [detections.names[d].lower() for d in kept]
+    overlap = geometry.iou(detections.xyxy[kept], boxes)
+    cost = np.where(accepts(truth, names) & (overlap >= DETECTION_OVERLAP), 1 - overlap, np.inf)
+    partner, free = pair_in_order(cost, 1.0)
+    excused, judged = _in_regions(detections.xyxy[kept], truth), truth.judged_names
+    if truth.judged is not None:
+        excused |= (overlap[:, ~truth.judged] >= DETECTION_OVERLAP).any(axis=1)
+    to_find = truth.must & np.isfinite(boxes).all(axis=1)
+    for name, k, is_excused in zip(names, partner.tolist(), excused.tolist(), strict=True):
+        if k >= 0 and to_find[k]:
+            yield JudgedObject("true", truth.labels[k].lower())
+        elif k < 0 and not is_excused and name in judged:
+            yield JudgedObject("false", name)
+    for row in np.flatnonzero(free & to_find).tolist():
+        yield JudgedObject("missed", truth.labels[row].lower())
 
 
 def image_boxes_of(truth: Truth, camera: Camera) -> F32:

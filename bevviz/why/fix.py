@@ -270,8 +270,8 @@ def _confirmed(
         frames=len(sample.frames),
         units=len(set(units)),
         parts=parts,
-        false_before=old.total["fp"],
-        false_after=new.total["fp"],
+        false_before=old.total["false"],
+        false_after=new.total["false"],
         **totals,
     )
 

@@ -13,7 +13,7 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 
 from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError
-from bevviz.evaluate import ObjectScore, Truth, differences
+from bevviz.evaluate import ObjectScore, Truth, differences, rates
 from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
@@ -161,9 +161,9 @@ class _TrialObserver(Observer[FrameResult]):
         sides = (before, change.before), (after, change.after)
         for score, (objects, matches) in zip(trial.scores, sides, strict=True):
             if objects is not None and matches is not None and change.truth is not None:
-                score.count(objects.names, change.truth, matches)
+                score.count(objects, change.truth, matches)
         if change.truth is not None:
-            f1_before, f1_after = (rounded(score.f1) for score in trial.scores)
+            f1_before, f1_after = (rounded(rates(score.total)["f1"]) for score in trial.scores)
             trial.f1 = {"before": f1_before, "after": f1_after}
         trial.done += 1
         self._show()
@@ -250,11 +250,11 @@ def _opinions(before: FrameResult, after: FrameResult) -> dict[str, BeforeAfter]
 
 
 def _f1(result: FrameResult, truth: Truth) -> float | None:
-    score = ObjectScore()
     if result.objects is None:
         return None
+    score = ObjectScore()
     score.add(result.objects, truth)
-    return rounded(score.f1)
+    return rounded(rates(score.total)["f1"])
 
 
 def rounded(value: float) -> float | None:

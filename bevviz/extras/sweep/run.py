@@ -17,7 +17,7 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.errors import UserError, printable
-from bevviz.evaluate import ObjectScore, Truth, judge
+from bevviz.evaluate import ObjectScore, Truth, rates
 from bevviz.evaluate.f1_change import f1_change
 from bevviz.model import counts
 from bevviz.model.counts import count_results
@@ -148,7 +148,7 @@ class SweepOutcome:
             self.seconds[stage].append(result.timings.get(stage, 0.0))
         if truth is not None and result.objects is not None:
             self.judged += 1
-            self.score.count(result.objects.names, truth, judge(result.objects, truth, result.cameras))
+            self.score.add(result.objects, truth, result.cameras)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -165,9 +165,9 @@ class SweepOutcome:
         times = {f"{stage} ms": float(np.median(self.seconds[stage] or [0.0])) * 1e3 for stage in STAGES}
         metrics |= {"time ms": sum(times.values()), **times}
         if self.judged:
-            errors = self.score.errors
+            shares, errors = rates(self.score.total), self.score.errors()
             error = float(np.median(errors)) if errors else math.nan
-            scores = (self.score.precision, self.score.recall, self.score.f1, error)
+            scores = (shares["precision"], shares["recall"], shares["f1"], error)
             metrics |= dict(zip(SCORES, scores, strict=True))
         return metrics
 
@@ -271,16 +271,12 @@ class Sweep:
     @property
     def _rated(self) -> Sequence[Values]:
         """Values with an F1, the best first."""
-        rated = {
-            values: outcome.score
-            for values, outcome in self.outcomes.items()
-            if outcome.judged and not math.isnan(outcome.score.f1)
-        }
-        errors = {
-            values: float(np.median(score.errors)) if score.errors else math.inf
-            for values, score in rated.items()
-        }
-        return sorted(rated, key=lambda values: (-rated[values].f1, errors[values]))
+        rated: dict[Values, tuple[float, float]] = {}
+        for values, outcome in self.outcomes.items():
+            f1, errors = rates(outcome.score.total)["f1"], outcome.score.errors()
+            if not math.isnan(f1):
+                rated[values] = -f1, float(np.median(errors)) if errors else math.inf
+        return sorted(rated, key=lambda values: rated[values])
 
     @property
     def title(self) -> str:
@@ -303,7 +299,7 @@ class Sweep:
         rated, alike, best = self._rated, self.alike, self.best
         if not rated:
             return None
-        high, low = (self.outcomes[values].score.f1 for values in (rated[0], rated[-1]))
+        high, low = (rates(self.outcomes[values].score.total)["f1"] for values in (rated[0], rated[-1]))
         if best is None:
             return f"no value is best within the noise: F1 {low:.3f} to {high:.3f}"
         where = ", ".join(
@@ -329,7 +325,7 @@ class Sweep:
         runs = []
         for values, outcome in self.outcomes.items():
             classes = {
-                name: ClassCounts(counts["tp"], counts["fp"], counts["fn"])
+                name: ClassCounts(counts["true"], counts["false"], counts["missed"])
                 for name, counts in sorted(outcome.score.classes.items())
             }
             runs.append(SweepRun(values, outcome.frames, outcome.metrics, classes, outcome.failures))
@@ -343,7 +339,7 @@ class Sweep:
         """
         names = self._metrics()
         classes = sorted({name for outcome in self.outcomes.values() for name in outcome.score.classes})
-        kinds = ("tp", "fp", "fn")
+        kinds = {"tp": "true", "fp": "false", "fn": "missed"}
         header = [parameter.key for parameter in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
         file = StringIO()
@@ -352,7 +348,9 @@ class Sweep:
         for values, outcome in self.outcomes.items():
             metrics = outcome.metrics
             class_counts = outcome.score.classes
-            by_class = [class_counts.get(name, Counter())[kind] for name in classes for kind in kinds]
+            by_class = [
+                class_counts.get(name, Counter())[kind] for name in classes for kind in kinds.values()
+            ]
             rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
             writer.writerow([*values, outcome.frames, *rounded, *by_class])
         save_text(path, file.getvalue(), "--csv")

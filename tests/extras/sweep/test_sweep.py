@@ -17,7 +17,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import label_files, read_labels
 from bevviz.errors import UserError
-from bevviz.evaluate import ObjectScore, Truth, pair_in_order, truth_of
+from bevviz.evaluate import ObjectScore, Truth, pair_in_order, rates, truth_of
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.extras.sweep.log import HEIGHT, WIDTH, axis_scale
@@ -131,20 +131,19 @@ def test_planted_errors_are_counted() -> None:
         ),
         there,
     )
-    assert dict(score.classes["car"]) == {"tp": 1, "fp": 1, "fn": 1}
-    assert dict(score.classes["person"]) == {"tp": 1, "fp": 1}
-    assert score.precision == pytest.approx(2 / 4)
-    assert score.recall == pytest.approx(2 / 3)
-    assert score.f1 == pytest.approx(2 * 2 / (2 * 2 + 2 + 1))
-    assert score.errors == pytest.approx([0.5, 0.1])
+    assert dict(score.classes["car"]) == {"true": 1, "false": 1, "missed": 1}
+    assert dict(score.classes["person"]) == {"true": 1, "false": 1}
+    expected = {"precision": 2 / 4, "recall": 2 / 3, "f1": 2 * 2 / (2 * 2 + 2 + 1)}
+    assert rates(score.total) == pytest.approx(expected)
+    assert score.errors() == pytest.approx([0.5, 0.1])
 
 
 def test_empty_results_and_empty_truth_are_counted() -> None:
     score = ObjectScore()
     score.add(objects(), truth())
-    assert np.isnan([score.precision, score.recall, score.f1]).all()
+    assert np.isnan([*rates(score.total).values()]).all()
     score.add(objects(), truth(("car", 5, 0, True)))
-    assert score.recall == 0
+    assert rates(score.total)["recall"] == 0
 
 
 def test_the_nearest_unmatched_object_is_matched() -> None:
