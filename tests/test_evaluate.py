@@ -24,7 +24,7 @@ from bevviz.evaluate.matching import ObjectScore
 from bevviz.evaluate.tracking_score import ClassTracks
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
-from bevviz.model import box_overlap, geometry
+from bevviz.model import box_overlap
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import Boxes3D, Frame, ImageLabels
 from bevviz.model.results import Objects
@@ -57,7 +57,7 @@ def kitti_case() -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def average_precision(kitti_case: dict[str, Any]) -> dict[tuple[str, float, str, str], float]:
     case = kitti_case
-    precision = AveragePrecision(("bev", "3d", "image"))
+    precision = AveragePrecision()
     for index in range(60):
         rows = np.flatnonzero((case["label_frame"] == index) & (case["label_name"] != "DontCare"))
         free = np.flatnonzero((case["label_frame"] == index) & (case["label_name"] == "DontCare"))
@@ -74,25 +74,17 @@ def average_precision(kitti_case: dict[str, Any]) -> dict[tuple[str, float, str,
         truth = Truth(labels, names, (none,) * len(rows), np.ones(len(rows), bool), image=image)
         above, volume = box_overlap.box_iou(kitti_boxes(case, mine, "found"), labels)
         xyxy = case["found_bbox"][mine]
-        overlaps = {"bev": above, "3d": volume, "image": geometry.iou(xyxy, image.xyxy)}
-        low = np.maximum(xyxy[:, None, :2], image.dont_care[None, :, :2])
-        high = np.minimum(xyxy[:, None, 2:], image.dont_care[None, :, 2:])
-        shared = (
-            np.prod(np.clip(high - low, 0, None), axis=2)
-            / np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1)[:, None]
-        )
         found = ScoredObjects(
             tuple(str(name).lower() for name in case["found_name"][mine]),
             case["found_score"][mine],
             xyxy[:, 3] - xyxy[:, 1],
-            overlaps,
-            {"image": shared.max(axis=1, initial=0.0)},
+            {"bev": above, "3d": volume},
         )
         precision.add(found, truth)
     return precision.results()
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [("bev", "ap_bev"), ("3d", "ap_3d"), ("image", "ap_bbox")])
+@pytest.mark.parametrize(("ours", "theirs"), [("bev", "ap_bev"), ("3d", "ap_3d")])
 def test_average_precision_equals_kittis_development_kit(
     kitti_case: dict[str, Any],
     average_precision: dict[tuple[str, float, str, str], float],
@@ -389,7 +381,7 @@ def test_false_boxes_in_any_frame_lower_the_precision() -> None:
     """A detector's persons, where people have labelled pedestrians and cyclists."""
 
     def averages(*more: Objects) -> dict[str, float]:
-        precision = AveragePrecision(("bev",))
+        precision = AveragePrecision()
         places = [(float(x), 0.0) for x in range(0, 150, 3)]
         frames = [(objects, labelled()) for objects in more]
         frames += [
@@ -400,10 +392,11 @@ def test_false_boxes_in_any_frame_lower_the_precision() -> None:
             for x, y in places
         ]
         for objects, truth in frames:
-            above, _ = box_overlap.box_iou(objects.boxes, truth.boxes)
+            above, volume = box_overlap.box_iou(objects.boxes, truth.boxes)
             height = np.full(len(objects), np.inf, np.float32)
-            precision.add(ScoredObjects(objects.names, objects.score, height, {"bev": above}, {}), truth)
-        return {name: value for (_, overlap, name, _), value in precision.results().items() if overlap == 0.5}
+            overlaps = {"bev": above, "3d": volume}
+            precision.add(ScoredObjects(objects.names, objects.score, height, overlaps), truth)
+        return {key[2]: value for key, value in precision.results().items() if key[:2] == ("bev", 0.5)}
 
     assert averages() == {"pedestrian": 1.0, "cyclist": 1.0}
     assert averages(*[named(("person", 0, 0))] * 50) == {"pedestrian": 0.5, "cyclist": 1.0}

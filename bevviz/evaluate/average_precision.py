@@ -1,4 +1,4 @@
-"""Average precision as the KITTI object benchmark defines it: in the image, in the bird's-eye view and in 3D.
+"""Average precision as the KITTI object benchmark defines it: in the bird's-eye view and in 3D.
 
 Geiger, Lenz and Urtasun 2012, with the 40 recall points of Simonelli et al. 2019. The rules are those of
 the benchmark's development kit: which labels and detections count, which are ignored, and at which scores
@@ -8,7 +8,7 @@ the curve is sampled.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -53,13 +53,12 @@ KITTI_CLASSES = {  # label -> labels that count neither as right nor as wrong, n
 
 @dataclass(frozen=True, slots=True)
 class ScoredObjects:
-    """Objects of a frame, or detections in its image, compared with the ground truth."""
+    """Objects of a frame compared with the ground truth."""
 
     names: tuple[str, ...]  # (D,) in lower case
     score: F32  # (D,)
     height: F32  # (D,) pixels; inf without an image box
     overlaps: dict[str, F32]  # (D, K) IoU with each label, by view
-    excused: dict[str, F32]  # (D,) by view, largest share in a region without labels
 
 
 def scored_objects(result: FrameResult, truth: Truth) -> ScoredObjects:
@@ -73,7 +72,7 @@ def scored_objects(result: FrameResult, truth: Truth) -> ScoredObjects:
         if row >= 0 and (camera_detections := detections.get(camera)) is not None:
             height[j] = camera_detections.xyxy[row, 3] - camera_detections.xyxy[row, 1]
     names = tuple(name.lower() for name in objects.names)
-    return ScoredObjects(names, objects.score, height, {"bev": above, "3d": volume}, {})
+    return ScoredObjects(names, objects.score, height, {"bev": above, "3d": volume})
 
 
 @dataclass
@@ -84,7 +83,7 @@ class Curve:
     min_overlap: float
 
     def __post_init__(self) -> None:
-        self._frames: list[tuple[F32, F32, Roles, Roles, Bool]] = []
+        self._frames: list[tuple[F32, F32, Roles, Roles]] = []
 
     def add(self, objects: ScoredObjects, det: Roles, label: Roles) -> None:
         """Add a frame.
@@ -97,14 +96,12 @@ class Curve:
         rows, columns = np.flatnonzero(det != OTHER), np.flatnonzero(label != OTHER)
         if len(rows) == 0 and not (label == COUNTS).any():
             return
-        excused = objects.excused.get(self.view, np.zeros(len(det), np.float32)) > self.min_overlap
         self._frames.append(
             (
                 np.ascontiguousarray(objects.overlaps[self.view][np.ix_(rows, columns)]),
                 np.ascontiguousarray(objects.score[rows]),
                 det[rows],
                 label[columns],
-                excused[rows],
             )
         )
 
@@ -150,7 +147,6 @@ def _match(
     score: F32,
     det: Roles,
     label: Roles,
-    excused: Bool,
     min_overlap: float,
     threshold: float,
     count_false: bool,
@@ -188,7 +184,7 @@ def _match(
     false = 0
     if count_false:
         for d in range(len(score)):
-            false += not (taken[d] or det[d] != 0 or score[d] < threshold or excused[d])
+            false += not (taken[d] or det[d] != 0 or score[d] < threshold)
     return right, false, scores[:right]
 
 
@@ -198,8 +194,7 @@ class AveragePrecision:
     KITTI's labels are split by KITTI's difficulties. Other labels count if they have to be found.
     """
 
-    def __init__(self, views: Sequence[str] = VIEWS) -> None:
-        self._views = views
+    def __init__(self) -> None:
         self._curves: dict[CurveKey, Curve] = {}
         self._frames: list[tuple[ScoredObjects, Truth]] = []  # frames with labels other than KITTI's
         self._judged = AcceptedNames()  # classes of these frames
@@ -252,7 +247,7 @@ class AveragePrecision:
         det: Roles,
         label: Roles,
     ) -> None:
-        for view in self._views:
+        for view in VIEWS:
             for overlap in OVERLAPS:
                 curves.setdefault((view, overlap, *group), Curve(view, overlap)).add(objects, det, label)
 
