@@ -17,7 +17,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64
+from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import Detections, FrameResult
 from tests.support.small_bags import frozen_after
@@ -277,17 +277,45 @@ def test_boxes_that_do_not_fit_the_images_are_named(
     assert any(text in str(finding) for finding in checks.findings if finding.kind == "detector")
 
 
-def test_labels_where_no_points_are_are_named(results: list[FrameResult]) -> None:
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            lambda b: replace(b, center=b.center + np.array([0, 0, 3], np.float32)),
+            "boxes within 20 m hold no point of the LiDAR: check their frame",
+        ),
+        (
+            lambda b: replace(b, center=b.center - b.size * np.array([0, 0, 0.5], np.float32)),
+            "boxes have the upper half of their object above them: their z is the bottom",
+        ),
+        (
+            lambda b: replace(b, size=b.size[:, [1, 0, 2]]),
+            "long boxes hold more points if they are turned by 90 degrees: swap",
+        ),
+    ],
+)
+def test_labels_of_another_convention_are_named(
+    results: list[FrameResult], change: Callable[[Boxes3D], Boxes3D], text: str
+) -> None:
     with bevviz.simulate(1) as drive:
         checks = InputChecks(drive.frames, drive.config)
         for result in results:
             truth = result.frame.truth
             assert truth is not None
-            above = replace(truth.boxes, center=truth.boxes.center + np.array([0, 0, 3], np.float32))
-            frame = replace(result.frame, truth=replace(truth, boxes=above))
+            frame = replace(result.frame, truth=replace(truth, boxes=change(truth.boxes)))
             checks.observe(replace(result, frame=frame))
     (said,) = [str(finding) for finding in checks.findings if finding.kind == "truth"]
-    assert "boxes within 20 m hold no point of the LiDAR: check their frame" in said
+    assert text in said
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["kitti", "kitti_more", "sus"])
+def test_real_labels_are_left_alone(shared: Path, name: str) -> None:
+    with bevviz.open(shared / name) as drive:
+        checks = InputChecks(drive.frames, drive.config)
+        for frame in checks.watched(drive.frames):
+            assert frame.truth is not None
+    assert not [finding for finding in checks.findings if finding.kind == "truth"]
 
 
 def test_a_right_drive_has_no_finding(results: list[FrameResult]) -> None:

@@ -10,7 +10,7 @@ from bevviz.anomalies.sensors import SensorWatch
 from bevviz.checks.camera_views import CameraView, view_of
 from bevviz.checks.detector import count_boxes, misplaced_boxes, silent_detector
 from bevviz.checks.extrinsics import wrong_extrinsics
-from bevviz.checks.labels import count_labels, empty_labels
+from bevviz.checks.labels import count_labels, wrong_labels
 from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.config import Config
 from bevviz.model.frame import Frame
@@ -43,7 +43,7 @@ CHECKS: tuple[Check, ...] = (
     wrong_extrinsics,
     silent_detector,
     misplaced_boxes,
-    empty_labels,
+    wrong_labels,
     sensor_faults,
 )
 

@@ -1,4 +1,4 @@
-"""Checks of the ground truth: boxes where the LiDAR has no points."""
+"""Checks of the ground truth: boxes without points, and boxes that their points do not fit."""
 
 from __future__ import annotations
 
@@ -10,32 +10,74 @@ import numpy as np
 
 from bevviz.checks.read_input import ReadInput
 from bevviz.model.box_points import inside_each
-from bevviz.model.frame import Frame
+from bevviz.model.frame import F64, Boxes3D, Frame
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.stages.robot_results import in_points_frame
 
 NEAR = 20.0  # metres; a LiDAR has points on most labelled objects that are nearer
 FOOT = 0.25  # lowest share of a box, which holds points of the ground wherever it is
 ENOUGH, MOST = 10, 300  # fewest and most boxes that are judged
-EMPTY = 2 / 3  # share of boxes without a point; of sound labels those of hidden objects have none
+SHARE = 2 / 3  # share of odd boxes; of sound labels those of hidden objects have no points
+POINTS = 10  # fewest points that tell how a box fits
+ABOVE = 0.3  # share of the points of an object that are above a box with z at its bottom; 0.4 are usual
+LONG = 1.5  # ratio of length and width from which a turn by 90 degrees matters
+BETTER = 1.1  # ratio of the points that a turned box holds
+
+# Number of judged boxes, number of odd ones, what is odd, and the remedy.
+_ODD = (
+    (
+        "near",
+        "empty",
+        f"boxes within {NEAR:.0f} m hold no point of the LiDAR",
+        "check their frame, the signs of their axes, and whether z is the centre of the box",
+    ),
+    (
+        "filled",
+        "low",
+        "boxes have the upper half of their object above them",
+        "their z is the bottom of the box: write z of the centre, half the height more",
+    ),
+    (
+        "long",
+        "turned",
+        "long boxes hold more points if they are turned by 90 degrees",
+        "swap their length and width, or check the axis from which their yaw counts",
+    ),
+)
 
 
-def empty_labels(read: ReadInput) -> Iterator[InputFinding]:
-    """Yield ground truth most of whose near boxes hold no point, as in another frame or on another side."""
-    near, empty = read.labels["near"], read.labels["empty"]
-    if near >= ENOUGH and empty > EMPTY * near:
-        text = f"ground truth: {empty} of {near} boxes within {NEAR:.0f} m hold no point of the LiDAR"
-        remedy = "check their frame, the signs of their axes, and whether z is the centre of the box"
-        yield InputFinding("truth", "ground truth", text, Remedy(remedy))
+def wrong_labels(read: ReadInput) -> Iterator[InputFinding]:
+    """Yield ground truth most of whose near boxes do not fit the points, as in another convention."""
+    for of, odd, what, remedy in _ODD:
+        total, count = read.labels[of], read.labels[odd]
+        if total >= ENOUGH and count > SHARE * total:
+            text = f"ground truth: {count} of {total} {what}"
+            yield InputFinding("truth", "ground truth", text, Remedy(remedy))
 
 
 def count_labels(labels: Counter[str], frame: Frame) -> None:
-    """Count the near boxes of the ground truth of a frame, and those without points."""
+    """Count the near boxes of the ground truth of a frame, and those that are odd."""
     if frame.truth is None or not len(frame.points) or labels["near"] >= MOST:
         return
     boxes = in_points_frame(frame.pose, frame.truth)
     boxes = boxes.chosen(boxes.distance < NEAR)
-    foot = boxes.size[:, 2:] * FOOT * np.array([0, 0, 1], np.float32)  # (K, 3)
-    boxes = replace(boxes, center=boxes.center + foot / 2, size=boxes.size - foot)
+    inside = _count(frame, boxes, FOOT, 1)
+    above = _count(frame, boxes, 1, 1.5)
+    across = _count(frame, replace(boxes, size=boxes.size[:, [1, 0, 2]]), FOOT, 1)
+    filled = inside + above >= POINTS
+    is_long = boxes.size[:, :2].max(axis=1, initial=0) > LONG * boxes.size[:, :2].min(axis=1, initial=np.inf)
+    is_long &= inside + across >= POINTS
     labels["near"] += len(boxes)
-    labels["empty"] += sum(not len(rows) for _, rows in inside_each(frame.points, boxes))
+    labels["empty"] += int((inside == 0).sum())
+    labels["filled"] += int(filled.sum())
+    labels["low"] += int((filled & (above > ABOVE * (inside + above))).sum())
+    labels["long"] += int(is_long.sum())
+    labels["turned"] += int((is_long & (across > BETTER * inside)).sum())
+
+
+def _count(frame: Frame, boxes: Boxes3D, low: float, high: float) -> F64:
+    """Return the number of points in each box between two shares of its height above its bottom."""
+    height = boxes.size[:, 2:] * np.array([0, 0, 1], np.float32)  # (K, 3)
+    center, size = boxes.center + height * ((low + high - 1) / 2), boxes.size + height * (high - low - 1)
+    layers = replace(boxes, center=center, size=size)
+    return np.array([len(rows) for _, rows in inside_each(frame.points, layers)], np.float64)

@@ -52,7 +52,7 @@ class ReadInput:
         images: images that the detector judged.
         answered: those for which it had a candidate, however weak.
         boxes: its kept boxes, and those that are odd, see ``bevviz.checks.detector``.
-        labels: boxes of the ground truth near the LiDAR, and those without points.
+        labels: boxes of the ground truth near the LiDAR, and those that are odd.
     """
 
     source: Items[object]
