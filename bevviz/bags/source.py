@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import chain
@@ -29,7 +29,7 @@ from bevviz.support.contexts import Closable
 from bevviz.support.limits import MAX_LATCHED
 from bevviz.sync.clocks import LATENCY
 from bevviz.sync.feed import Handler, make_handlers
-from bevviz.sync.report import LARGE_LOSS, UnusableMessages, why_no_images
+from bevviz.sync.report import LARGE_LOSS, why_no_images
 from bevviz.sync.synchronizer import Synchronizer
 
 if TYPE_CHECKING:
@@ -55,21 +55,6 @@ class FrameSelection:
     def source(self, paths: Sequence[Path], config: Config) -> BagSource:
         """Open the bag with this selection."""
         return BagSource(paths, config, start=self.start, end=self.end, every=self.every, frames=self.frames)
-
-
-@dataclass(slots=True)
-class ReadingState:
-    """State that the messages of a recording built up so far.
-
-    Attributes:
-        sync: synchroniser with its queues.
-        numbers: number of each message of the driver that has been queued, in this order.
-        damage: unusable messages.
-    """
-
-    sync: Synchronizer
-    numbers: list[int] = field(default_factory=list)
-    damage: UnusableMessages = field(default_factory=UnusableMessages)
 
 
 class BagSource(Closable):
@@ -113,7 +98,7 @@ class BagSource(Closable):
         except BaseException:
             self.close()
             raise
-        self._state: ReadingState | None = None  # state of the latest read
+        self._sync: Synchronizer | None = None  # that of the latest read
         self._checked: set[str] = set()  # see VerticalEstimate; for single frames
 
     def close(self) -> None:
@@ -136,7 +121,7 @@ class BagSource(Closable):
     @property
     def warnings(self) -> Sequence[str]:
         """All warnings about the recording and the frames read so far."""
-        report = self._state.sync.report if self._state else None
+        report = self._sync.report if self._sync else None
         synced = report.warnings() if report else ()
         blind = why_no_images(self.config, self.roles, report)
         alone = [f"{self.roles.no_lidar}: the frames are {self._driver}'s"] if self.roles.no_lidar else []
@@ -146,7 +131,7 @@ class BagSource(Closable):
     @property
     def _damage(self) -> Sequence[str]:
         """Unusable messages, one sentence for each topic."""
-        return self._state.damage.sentences if self._state else ()
+        return self._sync.report.unusable.sentences if self._sync else ()
 
     @property
     def noun(self) -> str:
@@ -155,9 +140,9 @@ class BagSource(Closable):
 
     def large_losses(self) -> Iterator[str]:
         """Yield a sentence for each large loss among the messages read so far that should make frames."""
-        if self._state is None:
+        if self._sync is None:
             return
-        report, damaged = self._state.sync.report, self._state.damage.counts[self._driver]
+        report, damaged = self._sync.report, self._sync.report.unusable.counts[self._driver]
         read = report.queued + damaged
         heard = f"of the first {read} {self.noun}s"
         if report.stale > LARGE_LOSS * read:
@@ -169,9 +154,9 @@ class BagSource(Closable):
     @property
     def doubts(self) -> Sequence[str]:
         """Unusable data of the frames read so far, and problems that may affect all frames."""
-        if self._state is None:
+        if self._sync is None:
             return []
-        report = self._state.sync.report
+        report = self._sync.report
         robots = [self.roles.robots] if self.roles.robots else []
         return [*robots, *self._damage, *map(str, [*report.losses(), *report.doubts()])]
 
@@ -183,14 +168,14 @@ class BagSource(Closable):
     @property
     def tree(self) -> Mapping[str, str]:
         """Transforms met so far: parent by child."""
-        return self._state.sync.tf.tree() if self._state else {}
+        return self._sync.tf.tree() if self._sync else {}
 
     def pose(self, frame: Frame, stamp: int) -> F64 | None:
         """Return (4, 4) fixed_from_points at a stamp close to that of a recent frame.
 
         None: there is no fixed frame above the points, or the transforms read so far do not reach the stamp.
         """
-        return self._state.sync.placing.pose(frame, stamp) if self._state else None
+        return self._sync.placing.pose(frame, stamp) if self._sync else None
 
     @cached_property
     def scans(self) -> I64:
@@ -251,11 +236,10 @@ class BagSource(Closable):
         reach, alone = self._near if len(chosen) == 1 else self._reach, False
         late = 0
         while True:
-            sync = Synchronizer(self.roles, self.config)
+            sync = self._sync = Synchronizer(self.roles, self.config)
             sync.upright.checked = checked
             sync.absent = frozenset(file.topic for file in self.results)  # No message comes on these topics.
-            state = self._state = ReadingState(sync)
-            frames = self._read(state, chosen, reach, late, alone)
+            frames = self._read(sync, chosen, reach, late, alone)
             if len(chosen) > 1 or alone:
                 break
             single = next(frames, None)
@@ -270,24 +254,22 @@ class BagSource(Closable):
         # Result files number the scans of the whole recording.
         yield from map(self._with_results, frames) if self.results else frames
 
-    def _read(
-        self, state: ReadingState, chosen: range, reach: int, late: int, alone: bool
-    ) -> Iterator[Frame]:
-        """Yield the frames of some scans and update ``state``.
+    def _read(self, sync: Synchronizer, chosen: range, reach: int, late: int, alone: bool) -> Iterator[Frame]:
+        """Yield the frames of some scans.
 
         Args:
-            state: state of a new synchroniser.
+            sync: new synchroniser.
             chosen: numbers of the scans.
             reach: nanoseconds before the first scan from which on images and clouds are read.
             late: nanoseconds by which clouds are received later than transforms.
             alone: whether a single scan is read as if there were no others.
         """
-        sync, stop = state.sync, int(self.scans[chosen[-1]]) + self._after + 1
+        stop = int(self.scans[chosen[-1]]) + self._after + 1
         handlers = make_handlers(sync, self.roles, self.recording.decode, self.recording.packets)
         low = int(self.scans[chosen[0]])
         if len(chosen) > 1 and chosen[0] == 0:
             reach = max(reach, low - self.recording.start)
-        self._feed_latched(state, handlers, low)
+        self._feed_latched(sync, handlers, low)
         light = handlers.keys() - self._heavy
         before = self.recording.messages(light, low - max(MARGIN, reach) - late, low - reach, few=True)
         buffered = self._buffered(low, reach) if reach >= self._reach else ()
@@ -297,21 +279,18 @@ class BagSource(Closable):
                 # Scans may have equal log times: they count on from the first of them.
                 again = message.received == received
                 number = number + 1 if again else int(np.searchsorted(self.scans, message.received))
+                sync.number = number
                 received = message.received
                 if number not in chosen:
                     if len(chosen) == 1 and not alone:
-                        self._feed_neighbour(message, number, state)
-                        yield from self._numbered(sync.ready(message.received), state)
+                        self._feed_neighbour(message, sync)
+                        yield from sync.ready(message.received)
                     continue
-                state.numbers.append(number)
             elif message.topic in self.roles.lidars and not (number in chosen or number + 1 in chosen):
                 continue
-            queued = sync.report.queued
-            self._handle(handlers[message.topic], message, state)
-            if message.topic == self._driver and sync.report.queued == queued:
-                state.numbers.pop()  # The message cannot be used.
-            yield from self._numbered(sync.ready(message.received), state)
-        yield from self._numbered(sync.flush(), state)
+            self._handle(handlers[message.topic], message, sync)
+            yield from sync.ready(message.received)
+        yield from sync.flush()
 
     def _lateness(self, sync: Synchronizer, frame: Frame) -> int:
         """Return how much later than transforms a scan was received, nanoseconds; 0 if that is usual."""
@@ -331,12 +310,11 @@ class BagSource(Closable):
                 first = max(0, int(np.searchsorted(times, times[-1] - reach)) - 1)
                 yield from self.recording.scans([topic], int(times[first]), low - reach)
 
-    def _feed_neighbour(self, message: RawMessage, number: int, state: ReadingState) -> None:
+    def _feed_neighbour(self, message: RawMessage, sync: Synchronizer) -> None:
         """Feed the stamp of a scan next to a single one. So the single frame takes what it takes in a run."""
         with suppress(MessageError):  # A data set and single packets have no header: their stamps agree.
             stamp, frame_id = message.header()
-            state.sync.add_neighbour(message.topic, stamp, frame_id, message.received)
-            state.numbers.append(number)
+            sync.add_neighbour(message.topic, stamp, frame_id, message.received)
 
     @cached_property
     def _heavy(self) -> set[str]:
@@ -371,20 +349,16 @@ class BagSource(Closable):
         """Nanoseconds after a cloud in which all messages are that its frame may take."""
         return max(MARGIN, round(self.config.sync.max_wait * SECOND))
 
-    def _numbered(self, frames: Iterator[Frame], state: ReadingState) -> Iterator[Frame]:
-        """Yield the frames with the numbers of their scans."""
-        return (replace(frame, index=state.numbers[frame.clouds[0].number]) for frame in frames)
-
-    def _handle(self, handler: Handler[RawMessage], message: RawMessage, state: ReadingState) -> None:
+    def _handle(self, handler: Handler[RawMessage], message: RawMessage, sync: Synchronizer) -> None:
         try:
             handler(message)
         except MessageError as error:
             # An empty message of a data set has a warning already.
             if message.data or not self.recording.is_dataset:
-                state.damage.add(message.topic, str(error))
+                sync.report.unusable.add(message.topic, str(error))
 
     def _feed_latched(
-        self, state: ReadingState, handlers: Mapping[str, Handler[RawMessage]], low: int
+        self, sync: Synchronizer, handlers: Mapping[str, Handler[RawMessage]], low: int
     ) -> None:
         """Feed data that is published once, such as static transforms, before the first frame.
 
@@ -395,12 +369,12 @@ class BagSource(Closable):
             stop = low - MARGIN if few else min(low - MARGIN, self.recording.start + SECOND)
             for message in messages:
                 if message.received < stop:
-                    self._handle(handlers[name], message, state)
+                    self._handle(handlers[name], message, sync)
         known = set[str]()
         for received, topic, transform in self._static:
             if received <= low or transform.child not in known:
                 known.add(transform.child)
-                state.sync.add_transform(transform, static=True, topic=topic)
+                sync.add_transform(transform, static=True, topic=topic)
         for info in self._infos:
             with suppress(MessageError):  # The error is counted when the message itself is handled.
                 handlers[info.topic](info)

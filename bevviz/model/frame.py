@@ -50,7 +50,7 @@ class Cloud:
     received: int = 0
     dropped: int = 0  # points of the message that are NaN, infinite, beyond any sensor's range or (0, 0, 0)
     name: str = ""  # entity name of the LiDAR
-    number: int = 0  # place among the queued messages of the driver, from 0
+    number: int | None = None  # number in the recording, if it makes a frame; None: not known
     doubt: str = ""  # what of the message does not fit together, as a sentence without the topic
 
 

@@ -79,6 +79,7 @@ class SyncReport:
         images: decoded images of all cameras.
         undecodable: images that cannot be decoded, by camera.
         untold: gaps in video whose packets do not tell if one is lost, by topic and codec.
+        unusable: messages of a bag that cannot be decoded when they come.
         damage: ground truth that cannot be decoded.
         boxes: boxes of ground truth and robot that cannot be used.
         problems: frames with a missing transform or CameraInfo, by sentence.
@@ -110,6 +111,7 @@ class SyncReport:
     images: int = 0
     undecodable: UnusableMessages = field(default_factory=UnusableMessages)
     untold: Counter[tuple[str, str]] = field(default_factory=Counter)
+    unusable: UnusableMessages = field(default_factory=UnusableMessages)
     damage: UnusableMessages = field(default_factory=UnusableMessages)
     boxes: UnusableMessages = field(default_factory=partial(UnusableMessages, "box(es)"))
     problems: Counter[str] = field(default_factory=Counter)

@@ -62,6 +62,7 @@ class Synchronizer:
 
     Attributes:
         report: counts and oddities.
+        number: number in the recording of the message of the driver that is added; None: frames are counted.
         followed: child frame of the odometry; empty: not known yet.
         absent: topics that do not deliver. No frame waits for them, and the first LiDAR that is not among
             them drives.
@@ -74,6 +75,7 @@ class Synchronizer:
         self, roles: Roles, config: Config, beside: Collection[str] = (), lapse: float | None = None
     ) -> None:
         self.report = SyncReport()
+        self.number: int | None = None
         self.followed = ""
         self._absent: frozenset[str] = frozenset()
         self._lapse = math.inf if lapse is None else lapse * 1e9
@@ -195,7 +197,7 @@ class Synchronizer:
 
     def _queue(self, cloud: Cloud) -> None:
         """Queue a cloud of the driving LiDAR for a frame."""
-        cloud = replace(cloud, number=self.report.queued)
+        cloud = replace(cloud, number=self.number)
         self.report.queued += 1
         self._watch_clock(cloud.stamp)
         stamps = [waiting.stamp for waiting in self._clouds]
@@ -521,7 +523,7 @@ class Synchronizer:
             self.report.note_boxes(robot_boxes)
         truth = self._taken_truth(cloud.stamp)
         frame = Frame(
-            index=self._index,
+            index=self._index if cloud.number is None else cloud.number,
             stamp=cloud.stamp,
             received=cloud.received,
             lidar="lidars" if self._partners else cloud.name,
