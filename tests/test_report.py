@@ -195,7 +195,7 @@ def test_pictures_mark_the_subject_of_a_report() -> None:
     result = planted_faults.run("flat_car", "reference")
     (row,) = planted_faults.planted("flat_car", "car", 10.0)
     answer = FrameExplainer(result).about(Selection(truth=row))
-    image, above = (one.picture for one in marked_pictures(result, answer, 640))
+    image, above = (picture for picture, _ in marked_pictures(result, answer, 640))
     assert answer.subject.box is not None
     wanted = projected_box(answer.subject.box, result.cameras[0].camera)
     assert wanted is not None

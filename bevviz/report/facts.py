@@ -18,17 +18,11 @@ from bevviz.recording.provenance import Dependency, Provenance, model_path
 from bevviz.report.bag_window import ReportWindow
 from bevviz.support.text import fenced, markdown
 from bevviz.support.version import install_command
+from bevviz.why import Answer
+from bevviz.why.steps import Step
 
 TRACEBACKS = 5  # tracebacks that are listed
 _FOLDERS = re.compile(r'(?<=File ").*?([^/\\"]+[/\\][^/\\"]+)(?=")')
-
-
-@dataclass(frozen=True, slots=True)
-class AnswerText:
-    """Answer to a question of the user: the verdict, and the decision of each stage."""
-
-    verdict: str
-    chain: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +54,7 @@ class Cause:
     what: str
     where: str
     why: str
-    chain: Sequence[tuple[str, str]]
+    chain: Sequence[Step]
     tried: Sequence[TriedText]
     remark: str = ""
 
@@ -73,7 +67,7 @@ class Cause:
             lines.append(f"- `{tried.settings}`: {markdown(tried.result + effects)}")
         lines += [markdown(self.remark)] if self.remark else []
         lines += ["", "## What became of it at each stage", ""]
-        return [*lines, *(f"- *{stage}*: {markdown(text)}" for stage, text in self.chain)]
+        return [*lines, *_chain(self.chain)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +78,7 @@ class Facts:
     note: str
     notes: Mapping[str, str]  # notes of the drive within the window, by time
     cause: Cause | None  # None: there is no frame, or nothing in it went wrong
-    asked: Sequence[AnswerText]  # further answers
+    asked: Sequence[Answer]  # further answers
     where: str  # the bag, its window and the frame
     start: int  # log time of the recording's start, from which seconds are counted
     config: str  # one sentence about preset and changes
@@ -104,14 +98,18 @@ class Facts:
         lines += ["", *self.cause.markdown()] if self.cause is not None else []
         lines += ["", "## Also missed, or asked about"] if self.asked else []
         for answer in self.asked:
-            lines += ["", f"**{markdown(answer.verdict)}**", ""]
-            lines += [f"- *{stage}*: {markdown(text)}" for stage, text in answer.chain]
+            lines += ["", f"**{markdown(answer.text)}**", "", *_chain(answer.steps)]
         for title, items in (("Files", self.files), ("Warnings", self.warnings), ("Hardware", self.hardware)):
             lines += ["", f"## {title}", "", *(f"- {markdown(item)}" for item in items)] if items else []
         for title, traceback in self.tracebacks.items():
             lines += ["", f"## {markdown(title)}", "", fenced(traceback)]
         commands = fenced("\n".join(self.commands))
         return "\n".join([*lines, "", "## How to run it again", "", commands])
+
+
+def _chain(steps: Sequence[Step]) -> list[str]:
+    """Return the decision of each stage as a list in Markdown."""
+    return [f"- *{step.stage}*: {markdown(step.text)}" for step in steps]
 
 
 def window_text(name: str, window: ReportWindow) -> str:

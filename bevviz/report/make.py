@@ -57,7 +57,7 @@ from bevviz.report.facts import (
 from bevviz.report.fingerprints import digest, pack
 from bevviz.report.page import page
 from bevviz.report.redact import Redactor
-from bevviz.report.report_subject import LISTED, TriedValues, answer_text, cause_of, explain_subject
+from bevviz.report.report_subject import LISTED, TriedValues, cause_of, explain_subject
 from bevviz.report.result_topics import result_messages, without_result_files
 from bevviz.report.summary import WindowSummary
 from bevviz.stages.detector import Detector
@@ -486,7 +486,7 @@ def _facts(
         cause=None
         if frame is None or not answers
         else cause_of(frame.result, (window.at - window.start) / SECOND, answers[0], request.tried),
-        asked=[answer_text(answer) for answer in (*answers[1 : 1 + LISTED], *request.asked)],
+        asked=[*answers[1 : 1 + LISTED], *request.asked],
         where=where,
         start=window.start,
         config=f"Preset {public.preset}, {differs}.",

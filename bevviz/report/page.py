@@ -79,10 +79,10 @@ def page(facts: Facts, summary: WindowSummary, seal: str, answers: Sequence[Answ
         facts=facts,
         seal=seal,
         marked=[
-            Picture(jpeg(one.picture, 88), one.caption)
+            Picture(jpeg(picture, 88), caption)
             for answer in answers
             if summary.result is not None
-            for one in marked_pictures(summary.result, answer, SUBJECT_WIDTH)
+            for picture, caption in marked_pictures(summary.result, answer, SUBJECT_WIDTH)
         ],
         frame=None if summary.result is None else _frame(summary.result, facts),
         frames=len(summary.frames),

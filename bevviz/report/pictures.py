@@ -99,16 +99,8 @@ def jpeg(bgr: U8, quality: int = 80) -> bytes:
 # --- the object that a report is about -----------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class MarkedPicture:
-    """A picture with the subject of an answer marked, and its caption."""
-
-    picture: U8  # (h, w, 3) BGR
-    caption: str
-
-
-def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[MarkedPicture]:
-    """Return pictures that mark the subject: each camera image that shows it, and one from above.
+def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[tuple[U8, str]]:
+    """Return BGR pictures that mark the subject, with captions: of each camera that shows it, and from above.
 
     Args:
         result: result of the frame.
@@ -123,13 +115,13 @@ def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[Mar
             continue
         scale = picture.shape[1] / camera.image.bgr.shape[1]
         _mark(picture, (outline + 0.5) * scale - 0.5, answer.subject.name)
-        marked.append(MarkedPicture(picture, f"{camera.name}: white is {answer.subject.name}"))
+        marked.append((picture, f"{camera.name}: white is {answer.subject.name}"))
     box = answer.subject.box or _box_around_points(result, answer)
     if box is not None and result.frame.lidar:
         picture, outline = _view_from_above(result, box, width)
         _mark(picture, outline, answer.subject.name)
         caption = f"from above, the sensor's front is up: white is {answer.subject.name}"
-        marked.append(MarkedPicture(picture, caption))
+        marked.append((picture, caption))
     return marked
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from bevviz.evaluate.differences import BeforeAfter
 from bevviz.model.reasons import ReasonKind
 from bevviz.model.results import FrameResult
-from bevviz.report.facts import AnswerText, Cause, TriedText
+from bevviz.report.facts import Cause, TriedText
 from bevviz.why import Answer, FrameExplainer, Selection
 from bevviz.why.answer import Hint
 from bevviz.why.log import focus_point
@@ -71,15 +71,10 @@ def cause_of(result: FrameResult, seconds: float, answer: Answer, tried: TriedVa
         what=f"{kind}: {answer.subject.name}",
         where=f"{_place(result, answer)}in frame {result.frame.index} of the drive, at {seconds:.3f} s.",
         why=answer.verdict.cause,
-        chain=[(step.stage, step.text) for step in answer.steps],
+        chain=answer.steps,
         tried=list(_tried(answer, tried)),
         remark="" if answer.hints or answer.tried or tried is not None else answer.remark,
     )
-
-
-def answer_text(answer: Answer) -> AnswerText:
-    """Return a further answer as text."""
-    return AnswerText(answer.text, [(step.stage, step.text) for step in answer.steps])
 
 
 def _place(result: FrameResult, answer: Answer) -> str:

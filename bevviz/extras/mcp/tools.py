@@ -292,7 +292,7 @@ class AgentTools:
         if about:
             answer = asked.session.ask(frame, (), _selection(about))[0]
             pictures = marked_pictures(result, answer, 960)
-            images = {str(part): jpeg(marked.picture) for part, marked in enumerate(pictures)}
+            images = {str(part): jpeg(picture) for part, (picture, _) in enumerate(pictures)}
         else:
             drawn = {
                 camera.camera.name: camera_picture(camera, 960, labels=True) for camera in result.cameras
