@@ -233,6 +233,15 @@ def test_a_cloud_of_nothing_but_nan_is_empty_and_counted() -> None:
     assert cloud.xyz.shape == (0, 3) and cloud.fields["intensity"].shape == (0,) and cloud.dropped == 64
 
 
+def test_beams_that_end_at_one_range_are_named() -> None:
+    points = random_points(1000)
+    assert not clouds.decode_cloud(cloud_message(points), "/p", 0).doubt
+    for axis, value in zip("xyz", (0.0, -120.0, 0.0), strict=True):
+        points[axis][:250] = value
+    cloud = clouds.decode_cloud(cloud_message(points), "/p", 0)
+    assert cloud.doubt.startswith("25 % of the points of a cloud have the range 120 m") and not cloud.dropped
+
+
 def test_a_cloud_without_points_is_empty() -> None:
     cloud = clouds.decode_cloud(cloud_message(random_points(0)), "/p", 0)
     assert cloud.xyz.shape == (0, 3) and cloud.dropped == 0
