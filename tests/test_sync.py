@@ -734,6 +734,22 @@ def test_a_clock_that_is_off_is_named_and_can_be_set_right(offset: float) -> Non
     assert len(errors) >= len(frames) - 1 and max(errors) < 0.11
 
 
+def test_late_images_are_waited_for_by_setting_although_roles_came_later() -> None:
+    """Beside a robot, the first synchroniser knows no sensor yet."""
+    empty, feed = Synchronizer(Roles(), load(), lapse=1.5), Feed(ONE)
+    feed.sync = Synchronizer(ONE, load(), lapse=1.5)
+    feed.sync.take_over(empty)
+    feed.calibration()
+    feed.info()
+    for i in range(40):
+        feed.sync.add_cloud(cloud(0.1 * i, late=0.01))
+        feed.image(0.1 * i, late=0.9)
+        list(feed.sync.ready())
+    (doubt,) = feed.sync.clocks.doubts(["/rslidar_points", "/zed/image"])
+    assert "come 0.89 s later" in doubt
+    assert "--set sync.max_wait=1 --set sync.queue=11 waits for them" in doubt
+
+
 def test_times_of_receipt_can_replace_stamps() -> None:
     frames, sync = of_clocks(1.5, "sync.by=received")
     assert not [text for text in sync.report.warnings() if "clock" in text]

@@ -135,6 +135,7 @@ class Synchronizer:
         driver, noun = self.report.driver, self.report.noun
         self.report = former.report
         self.report.clocked, self.report.driver, self.report.noun = clocked, driver, noun
+        former.clocks.driver = driver
         self.tf, self.upright, self.clocks = former.tf, former.upright, former.clocks
         self.around, self.videos = former.around, former.videos
         self.placing.take_over(former.placing)
