@@ -14,11 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import bevviz
 from bevviz.cli import main
-from bevviz.compare.sides import published_result, robot_topic
+from bevviz.compare.sides import ComparedFrame, published_result, robot_topic
 from bevviz.compare.views import side_space
 from bevviz.config import load
 from bevviz.errors import UserError
+from bevviz.evaluate import truth_of
 from bevviz.evaluate.differences import (
     Change,
     ImageBoxes,
@@ -27,6 +29,7 @@ from bevviz.evaluate.differences import (
     differences,
     seen,
 )
+from bevviz.evaluate.matching import judge
 from bevviz.extras.demo.bag import write_bag
 from bevviz.extras.demo.drive import SyntheticSource
 from bevviz.model.frame import Boxes3D, Frame, LabelledBoxes3D
@@ -452,3 +455,18 @@ def test_both_views_follow_the_robot(demo: str) -> None:
     ways = [recording.column(origin, "Transform3D:translation") for origin in origins]
     assert len(ways[0]) == 3 and len({tuple(np.ravel(place)) for place in ways[0]}) == 3
     assert ways[0] == ways[1]
+
+
+@pytest.mark.long
+def test_what_is_false_in_evaluate_is_false_in_compare(shared: Path) -> None:
+    """Most of the image box of an object of this frame is in a region that nobody labelled."""
+    model = shared / "models/yolox_nano.onnx"
+    with bevviz.open(shared / "kitti", model=model, frames=(3, 4)) as drive:
+        (result,) = drive
+    assert result.objects is not None and result.frame.truth is not None
+    truth = truth_of(result.frame, result.frame.truth)
+    assert judge(result.objects, truth).false.any()
+    assert not judge(result.objects, truth, result.cameras).false.any()
+    found = ComparedFrame(result, result, truth).found
+    assert found is not None and found.effects.before is not None
+    assert not found.effects.before.false.any()

@@ -37,7 +37,10 @@ class ComparedFrame:
     @cached_property
     def found(self) -> FrameDifferences | None:
         """Differences of the sides. None: a side has no result."""
-        return None if self.b is None else differences(seen(self.a), seen(self.b), self.truth)
+        if self.b is None:
+            return None
+        cameras = self.a.cameras, self.b.cameras
+        return differences(seen(self.a), seen(self.b), self.truth, cameras=cameras)
 
 
 class FirstSide(Observer[ComparedFrame]):

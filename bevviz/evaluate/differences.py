@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,6 +35,8 @@ class Change(StrEnum):
 
 WORST_FIRST = (Change.ONLY_A, Change.ONLY_B, Change.CLASS, Change.MOVED, Change.SAME)
 DIFFERENT = WORST_FIRST[:-1]
+
+Cameras: TypeAlias = tuple[Sequence[CameraResult], Sequence[CameraResult]]  # of both sides, see ``judge``
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,11 +131,14 @@ def seen(result: FrameResult) -> SideResult:
     return SideResult(frame.index, frame.stamp, frame.received, frame.pose, objects, images, clusters)
 
 
-def differences(a: SideResult, b: SideResult, truth: Truth | None = None) -> FrameDifferences:
-    """Return the differences of two sides in a frame. Without ``truth``, the ground truth is unknown."""
+def differences(
+    a: SideResult, b: SideResult, truth: Truth | None = None, *, cameras: Cameras = ((), ())
+) -> FrameDifferences:
+    """Return the differences of two sides in a frame, as ``before_after`` does."""
     both = [camera for camera in a.images if camera in b.images]
     images = {camera: compare_images(a.images[camera], b.images[camera]) for camera in both}
-    return FrameDifferences(a, b, before_after(a.objects, b.objects, truth), images)
+    effects = before_after(a.objects, b.objects, truth, cameras=cameras)
+    return FrameDifferences(a, b, effects, images)
 
 
 def compare_objects(a: Objects, b: Objects) -> tuple[Difference, ...]:
@@ -371,7 +377,7 @@ def before_after(
     after: Objects | None,
     truth: Truth | None,
     *,
-    cameras: tuple[Sequence[CameraResult], Sequence[CameraResult]] = ((), ()),
+    cameras: Cameras = ((), ()),
     asked: int = -1,
     own: int = -1,
     doubtful: int = 0,

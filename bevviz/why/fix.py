@@ -81,7 +81,7 @@ class Sample:
         scores = [ObjectScore() for _ in configs]
         for sampled, results in self.results(configs):
             for score, result in zip(scores, results, strict=True):
-                score.add(result.objects or Objects.empty(), sampled.truth)
+                score.add(result.objects or Objects.empty(), sampled.truth, result.cameras)
         return [float(f1(self.counts(score).sum(axis=0))) for score in scores]
 
     def reasons(self, config: Config) -> Counter[str]:
@@ -247,11 +247,12 @@ def _confirmed(
     assert after is not None
     old, new = ObjectScore(), ObjectScore()
     totals: Counter[str] = Counter(cause_fixed=0, cause_missed=0)
-    for sampled, results in sample.results([config, after]):
-        objects, new_objects = (result.objects or Objects.empty() for result in results)
-        old.add(objects, sampled.truth)
-        new.add(new_objects, sampled.truth)
-        change = before_after(objects, new_objects, sampled.truth)
+    for sampled, (before, then) in sample.results([config, after]):
+        truth, cameras = sampled.truth, (before.cameras, then.cameras)
+        change = before_after(before.objects, then.objects, truth, cameras=cameras)
+        assert change.before is not None and change.after is not None
+        old.count(change.a, truth, change.before)
+        new.count(change.b, truth, change.after)
         there, found, _ = change.found
         fixed = len(change.fixed)
         totals.update(fixed=fixed, missed=there - found, found=found, broken=len(change.broken))

@@ -253,7 +253,7 @@ def _f1(result: FrameResult, truth: Truth) -> float | None:
     if result.objects is None:
         return None
     score = ObjectScore()
-    score.add(result.objects, truth)
+    score.add(result.objects, truth, result.cameras)
     return rounded(rates(score.total)["f1"])
 
 
