@@ -734,7 +734,7 @@ def test_a_clock_that_is_off_is_named_and_can_be_set_right(offset: float) -> Non
     assert len(errors) >= len(frames) - 1 and max(errors) < 0.11
 
 
-def test_late_images_are_waited_for_by_setting_although_roles_came_later() -> None:
+def test_late_images_have_a_remedy_if_roles_came_later() -> None:
     """Beside a robot, the first synchroniser knows no sensor yet."""
     empty, feed = Synchronizer(Roles(), load(), lapse=1.5), Feed(ONE)
     feed.sync = Synchronizer(ONE, load(), lapse=1.5)
