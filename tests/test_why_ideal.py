@@ -202,6 +202,6 @@ def test_a_height_of_the_sensor_is_tried_against_a_roof() -> None:
     """It is that of the lowest points, so that no ceiling or roof is the ground."""
     asked = explained("ground.distance_threshold=2.5")
     answer = next(a for a in asked.missed() if a.verdict.kind is ReasonKind.GROUND)
-    changes = list(changes_for(answer.evidence, answer.verdict.reason, asked.traces))
+    changes = list(changes_for(answer.evidence, answer.verdict.kind, asked.traces))
     heights = [change["ground.sensor_height"] for change in changes if "ground.sensor_height" in change]
     assert len(heights) == 1 and heights[0] == pytest.approx(1.8, abs=0.4)
