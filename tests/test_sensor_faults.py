@@ -209,6 +209,7 @@ def test_transform_that_was_always_wrong_is_told(drive: Results, axis: int, degr
     assert anomaly.text == f"{MISPLACED} since 0.0 s, by about 3 degrees against {LIDAR}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("flip", "name"), [(-1, "image upside down"), (1, "mirrored image")])
 def test_flipped_image_is_told(drive: Results, flip: int, name: str) -> None:
     faults_now = []
