@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 WORST = 10
 MINUTE = 60.0  # seconds between two looks at memory
 JUMPS = 20  # once the list is complete
+NAMES = 70  # pixels of the timeline that hold the names of its lanes
 
 Entries = dict[int, dict[str, Any]]
 
@@ -152,7 +153,7 @@ def _jump(page: Page, share: float) -> float:
     assert box is not None
     before = page.inner_text("#shown")
     start = time.monotonic()
-    page.mouse.click(box["x"] + 2 + share * (box["width"] - 4), box["y"] + box["height"] - 2)
+    page.mouse.click(box["x"] + NAMES + share * (box["width"] - NAMES - 2), box["y"] + box["height"] - 2)
     while time.monotonic() - start < MINUTE:
         shown = page.inner_text("#shown")
         if shown != before and "..." not in shown:

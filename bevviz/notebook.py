@@ -17,6 +17,7 @@ from bevviz.recording import blueprints, entities
 from bevviz.recording.addresses import RowCache
 from bevviz.recording.frame_logger import FrameLogger, logged_rows
 from bevviz.recording.recorder import Recorder
+from bevviz.recording.stream import RecordingStream
 from bevviz.why.click import select_click
 from bevviz.why.log import mark_answers
 from bevviz.why.selection import Selection
@@ -96,7 +97,7 @@ class NotebookViewer(Recorder):
 
     def __init__(self, scene: Scene, config: Config, blueprint: str | Blueprint) -> None:
         layout = blueprints.load(blueprint, scene, config) if isinstance(blueprint, str) else blueprint
-        recording = rr.RecordingStream(blueprints.application_id(blueprint, scene, config))
+        recording = RecordingStream(blueprints.application_id(blueprint, scene, config))
         recording.set_log_time_enabled(False)
         super().__init__(recording, config)
         self.config = config

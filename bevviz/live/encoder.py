@@ -27,6 +27,7 @@ from bevviz.recording import blueprints
 from bevviz.recording.addresses import RowCache
 from bevviz.recording.components import Component, Components
 from bevviz.recording.frame_logger import FrameLogger, RecordingContext
+from bevviz.recording.stream import RecordingStream
 from bevviz.support.contexts import Closable
 
 WHOLE = 1.0  # seconds from one whole packet to the next
@@ -61,7 +62,7 @@ class _Stream(Closable):
         self._file = os.memfd_create("recording")
         self._end = 0
         batches = rr.ChunkBatcherConfig(flush_num_bytes=BATCH)
-        self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batches)
+        self.recording = RecordingStream(application, recording_id=recording_id, batcher_config=batches)
         self.recording.set_log_time_enabled(False)
         # A footer would keep a list of every logged chunk in memory.
         sink = rr.FileSink(f"/proc/self/fd/{self._file}", write_footer=False)

@@ -24,6 +24,7 @@ from rerun.chunk import RrdReader
 from bevviz.recording.blueprints import SavedBlueprint
 from bevviz.recording.ports import is_listening
 from bevviz.recording.sinks import check_viewer
+from bevviz.recording.stream import RecordingStream
 
 PROBE = 2.0  # seconds between two checks of the viewer
 MAGIC = 4  # bytes at the start that identify a recording
@@ -33,7 +34,7 @@ def main(url: str, application: str, recording_id: str) -> NoReturn:
     """Relay standard input to a viewer until it ends."""
     host, port = check_viewer(url)
     threading.Thread(target=_watch, args=(host, port), daemon=True).start()
-    recording = rr.RecordingStream(application, recording_id=recording_id)
+    recording = RecordingStream(application, recording_id=recording_id)
     recording.set_log_time_enabled(False)
     recording.set_sinks(rr.GrpcSink(url))
     pieces = _pieces(sys.stdin.buffer)

@@ -66,6 +66,7 @@ from bevviz.recording.retention import (
     rounding_scale,
 )
 from bevviz.recording.states import COLORS, StateLanes, states_of, track_states
+from bevviz.recording.stream import RecordingStream
 from bevviz.recording.surroundings import (
     DiagnosticsLog,
     StaticData,
@@ -422,7 +423,7 @@ def logged_rows(result: FrameResult, log_more: Callable[[Writer], object] | None
         result: the frame and its results.
         log_more: as in ``FrameLogger.log``; it gets the writer.
     """
-    logger = FrameLogger(rr.RecordingStream("bevviz"), result.config, Scene("", result.frame.lidar))
+    logger = FrameLogger(RecordingStream("bevviz"), result.config, Scene("", result.frame.lidar))
     logger.log(result, log_more=None if log_more is None else partial(log_more, logger))
     return logger.rows
 

@@ -33,6 +33,7 @@ from bevviz.recording.ports import (
 )
 from bevviz.recording.retention import keeps_everything
 from bevviz.recording.source_lookup import Origin
+from bevviz.recording.stream import RecordingStream
 from bevviz.support.contexts import Closable
 from bevviz.support.files import UnfinishedFile, atomic_write, write_all
 
@@ -165,7 +166,7 @@ def open_recording(
 def _new_stream(
     application: str, recording_id: str | None, batcher: rr.ChunkBatcherConfig | None
 ) -> rr.RecordingStream:
-    recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=batcher)
+    recording = RecordingStream(application, recording_id=recording_id, batcher_config=batcher)
     recording.set_log_time_enabled(False)  # frames have their own clocks
     return recording
 

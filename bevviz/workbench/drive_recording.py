@@ -20,6 +20,7 @@ from bevviz.recording import blueprints, entities
 from bevviz.recording.addresses import EntityRows, RowCache
 from bevviz.recording.focus import Focus, log_focus, log_robot_from_above
 from bevviz.recording.frame_logger import FrameLogger
+from bevviz.recording.stream import RecordingStream
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
@@ -84,7 +85,7 @@ class DriveRecording(Closable):
     ) -> tuple[rr.RecordingStream, rr.BinaryStream]:
         """Return a new stream into the recording, for a further thread that writes to it."""
         application = blueprints.application_id("workbench", self.scene, self._config)
-        recording = rr.RecordingStream(application, recording_id=self.recording_id, batcher_config=batches)
+        recording = RecordingStream(application, recording_id=self.recording_id, batcher_config=batches)
         recording.set_log_time_enabled(False)
         return recording, rr.binary_stream(recording)
 

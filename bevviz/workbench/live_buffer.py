@@ -15,6 +15,7 @@ from bevviz.live.outputs import Output
 from bevviz.live.runtime import Live
 from bevviz.recording import blueprints
 from bevviz.recording.frame_logger import RecordingContext
+from bevviz.recording.stream import RecordingStream
 from bevviz.workbench.buffers import News, PageState
 
 AHEAD = 10  # pieces that may be sent before the page's viewer has drawn the first of them
@@ -170,7 +171,7 @@ class LiveBuffer(Output):
 
     def _layout(self, context: RecordingContext) -> bytes:
         encoder = self._encoder
-        recording = rr.RecordingStream(encoder.application, recording_id=encoder.recording_id)
+        recording = RecordingStream(encoder.application, recording_id=encoder.recording_id)
         stream = rr.binary_stream(recording)
         layout = blueprints.load("workbench_live", context.scene, context.config)
         recording.send_blueprint(layout, make_active=True)

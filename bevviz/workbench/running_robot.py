@@ -28,6 +28,7 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import FrameLogger, logged_rows
+from bevviz.recording.stream import RecordingStream
 from bevviz.why import Answer, Selection
 from bevviz.why.log import dim_others, mark_answers
 from bevviz.why.robot_questions import RobotQuestions
@@ -83,7 +84,7 @@ class RunningRobot(GrowingDrive):
         self._stop = threading.Event()  # ends the listing
         self._settings: Settings = ()  # settings that pages have changed
         encoder = live.encoder
-        recording = rr.RecordingStream(encoder.application, recording_id=encoder.recording_id)
+        recording = RecordingStream(encoder.application, recording_id=encoder.recording_id)
         recording.set_log_time_enabled(False)
         self._marks = rr.binary_stream(recording)
         self._marker = FrameLogger(recording, live.config, live.scene)
