@@ -16,7 +16,6 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
-from bevviz.recording.stream import RecordingStream
 from bevviz.support import cleanup
 
 NOT_OURS = 66
@@ -73,6 +72,7 @@ def _end_with_viewer() -> None:
 
 
 def _import(path: Path, application_id: str, recording_id: str | None) -> None:
+    import rerun as rr
 
     from bevviz.bags.source import BagSource
     from bevviz.cli.outputs import print_hints, warn
@@ -93,7 +93,7 @@ def _import(path: Path, application_id: str, recording_id: str | None) -> None:
         drive = Drive(source, config)
         print_hints(drive.scene, config)
         application_id = application_id or blueprints.application_id("debug", drive.scene, config)
-        recording = RecordingStream(application_id, recording_id=recording_id)
+        recording = rr.RecordingStream(application_id, recording_id=recording_id)
         recording.set_log_time_enabled(False)
         recording.stdout(default_blueprint=blueprints.load("debug", drive.scene, config))
         origin = Origin.of(drive.scene, config, None)
