@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -72,10 +72,13 @@ class JudgedObject(NamedTuple):
 class ObjectScore:
     """True, missed and false objects of frames, or detections in their images.
 
-    ``accepted`` says for which class a false one counts.
+    Attributes:
+        accepted: names of each class; they say for which class a false one counts.
+        total: counts of all classes together.
     """
 
     accepted: AcceptedNames = field(default_factory=AcceptedNames)
+    total: Counter[str] = field(default_factory=Counter)
     _frames: list[list[JudgedObject]] = field(default_factory=list)
 
     def add(self, objects: Objects, truth: Truth, cameras: Sequence[CameraResult] = ()) -> Matches:
@@ -87,11 +90,17 @@ class ObjectScore:
     def count(self, objects: Objects, truth: Truth, matches: Matches) -> None:
         """Count the objects of one frame that are matched already."""
         self.accepted.add(truth)
-        self._frames.append(list(_judged_objects(objects, truth, matches)))
+        self._keep(_judged_objects(objects, truth, matches))
 
     def add_detections(self, result: CameraResult, truth: Truth) -> None:
         """Match one camera's detections with the labelled image boxes, best score first, and count."""
-        self._frames.append(list(_judged_detections(result, truth)))
+        self._keep(_judged_detections(result, truth))
+
+    def _keep(self, judged: Iterable[JudgedObject]) -> None:
+        """Keep the objects of one frame, and count them: a trial shows the total after each frame."""
+        frame = list(judged)
+        self._frames.append(frame)
+        self.total.update(one.outcome for one in frame)
 
     @property
     def objects(self) -> Iterator[JudgedObject]:
@@ -132,11 +141,6 @@ class ObjectScore:
         for one in self.objects:
             counts[one.name][one.outcome] += 1
         return dict(counts)
-
-    @property
-    def total(self) -> Counter[str]:
-        """Counts of all classes together."""
-        return Counter(one.outcome for frame in self._frames for one in frame)
 
 
 def position_text(boxes: Boxes3D, row: int) -> str:
