@@ -40,7 +40,7 @@ class Hint:
 
     @property
     def is_good(self) -> bool:
-        """Whether it fixes more than it breaks, and breaks no more in the frames before and after."""
+        """Return whether it fixes more than it breaks here, and no less in the frames before and after."""
         return self.balance > 0 and (self.beside or 0) >= 0
 
     @property

@@ -45,7 +45,7 @@ class Span(TypedDict):
 
 
 class Problem(TypedDict):
-    """What is wrong with the robot's data, and for how long."""
+    """Problem of the robot's data, and the seconds for which it has lasted."""
 
     text: str
     seconds: int

@@ -64,7 +64,7 @@ $("past").onchange = () => {
   command({ type: "hold", time: wanted });
 };
 
-// What is wrong with the robot's data now, and for how long.
+// Show the problems of the robot's data now, and how long they have lasted.
 /** @param {Problem[]} problems */
 function showProblems(problems) {
   $("problems").hidden = !problems.length;
