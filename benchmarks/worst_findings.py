@@ -32,7 +32,7 @@ from websockets.typing import Origin
 
 from benchmarks.measure import peak_memory
 from bevviz.findings.finding_list import CELL
-from tests.support.workbench_pages import chromium, serving, watched_page
+from tests.support.workbench_pages import browser_processes, chromium, serving, watched_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -63,7 +63,7 @@ def main() -> None:
         start = time.monotonic()
         bag = str(options.bag.resolve())
         address, server = stack.enter_context(serving("open", bag, model=options.model))
-        page = LookedAt(address, server.pid, Path(temporary)) if options.browser else None
+        page = PageMonitor(address, server.pid, Path(temporary)) if options.browser else None
         early, whole = watch(address, start, options.after)
         seconds, memory = time.monotonic() - start, peak_memory(server.pid)
         if page is not None:
@@ -102,8 +102,8 @@ def watch(address: str, start: float, times: list[float]) -> tuple[dict[float, E
                 return early, entries
 
 
-class LookedAt:
-    """Page in a browser, in a thread of its own.
+class PageMonitor:
+    """Monitor of a page in a browser, in a thread of its own.
 
     Args:
         address: address of the page.
@@ -132,7 +132,7 @@ class LookedAt:
             print("| ---: | ---------: | ----------: | ------------: | ------: | --- |")
             while not self._over.is_set():
                 jump = _jump(page, places.random())
-                server, browser_memory = _memory(self._server), sum(map(_memory, _browsers()))
+                server, browser_memory = _memory(self._server), sum(map(_memory, browser_processes()))
                 files = sum(file.stat().st_size for file in self._temporary.rglob("*") if file.is_file())
                 print(
                     f"| {(time.monotonic() - start) / 60:4.0f} | {server:10.0f} | {browser_memory:11.0f} "
@@ -160,11 +160,6 @@ def _jump(page: Page, share: float) -> float:
             break
         page.wait_for_timeout(10)
     return time.monotonic() - start
-
-
-def _browsers() -> list[psutil.Process]:
-    """Return the processes of the browser."""
-    return [one for one in psutil.Process().children(recursive=True) if one.name().startswith("chrom")]
 
 
 def _memory(process: psutil.Process) -> float:

@@ -48,11 +48,7 @@ def misplaced_boxes(read: ReadInput) -> Iterator[InputFinding]:
             "reach far out of the image",
             "publish pixels of the image that source.camera_topics names",
         ),
-        (
-            "number",
-            "have a number for a class, so no size is known",
-            names,
-        ),
+        ("number", "have a number for a class, so no size is known", names),
     ):
         if count[kind] > total / 2:
             text = f"detector.model {model}: {count[kind]} of {total} boxes {what}"

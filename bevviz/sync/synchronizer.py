@@ -460,8 +460,9 @@ class Synchronizer:
         waited = [buffer for topic, buffer in self._buffers() if topic not in beside]
         if any(buffer.newest is None or buffer.newest < stamp for buffer in waited):
             return False
-        groups = self._results
-        results = [buffer for group in groups for topic, buffer in group.items() if topic not in self._beside]
+        results = [
+            buffer for group in self._results for topic, buffer in group.items() if topic not in self._beside
+        ]
         if len(self._clouds) == 1 and any(self._may_be_of_next(buffer, stamp) for buffer in results):
             return False
         infos = {camera.info_topic for camera in self._roles.cameras} - {""}

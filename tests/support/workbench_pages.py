@@ -135,10 +135,17 @@ def chromium() -> Iterator[Browser]:
 
 def kill_browsers() -> None:
     """Kill the browsers that this process started."""
+    for process in browser_processes():
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+
+
+def browser_processes() -> Iterator[psutil.Process]:
+    """Yield the processes of the browsers that this process started."""
     for process in psutil.Process().children(recursive=True):
         with suppress(psutil.NoSuchProcess):
             if process.name().startswith(("chrom", "google-chrome")):
-                process.kill()
+                yield process
 
 
 def watched_page(browser: Browser, width: int, height: int) -> Page:
