@@ -123,8 +123,6 @@ def _run(
     """
     from bevviz.anomalies import FailureSummary
     from bevviz.checks import InputChecks
-    from bevviz.evaluate.log import EvaluationRecorder
-    from bevviz.findings.marks import MarkRecorder
     from bevviz.findings.run_table import list_keeper
 
     config, failures, outputs = session.config, FailureSummary(), options.output
@@ -140,6 +138,8 @@ def _run(
         end = run_with_progress(frames, session, judges)
         warn([*checks.warnings, *failures.warnings])
         return table_status(end)
+    from bevviz.evaluate.log import EvaluationRecorder
+    from bevviz.findings.marks import MarkRecorder
     from bevviz.recording.recorder import Recorder
 
     def observers(recording: RecordingStream) -> list[Observer[FrameResult]]:
