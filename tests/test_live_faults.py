@@ -68,6 +68,12 @@ def running(*settings: str) -> Iterator[Session]:
             thread.join()
 
 
+def is_published(session: Session, topic: str, node: str) -> bool:
+    """Return whether the graph shows a topic and its node, which is at times discovered later."""
+    info = session.source.topics.get(topic)
+    return info is not None and info.publishers[0].node_name == node
+
+
 @pytest.fixture
 def robot() -> Iterator[FaultyRobot]:
     with own_graph(), faulty_robot() as robot:
@@ -97,7 +103,7 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
     robot.set("/a", kind="String", node="stranger")
     robot.set(FUSED, kind="String")
     with running() as session:
-        until(lambda: {"/a", FUSED} <= session.source.topics.keys(), "the strings")
+        until(lambda: is_published(session, FUSED, "robot") and "/a" in session.source.topics, "the strings")
         refused: list[str] = []
         publisher = RosTopics(session.source.node, refused.append)
         assert len(refused) == 1 and f"/robot publishes {FUSED} as std_msgs/msg/String" in refused[0]
@@ -120,12 +126,7 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
 def test_no_result_goes_to_a_topic_of_the_robot(robot: FaultyRobot) -> None:
     robot.set(OBSTACLES, kind="PointCloud2", node="detector")
     with running() as session:
-
-        def is_named() -> bool:  # A node is at times discovered after its publisher.
-            topic = session.source.topics.get(OBSTACLES)
-            return topic is not None and topic.publishers[0].node_name == "detector"
-
-        until(is_named, "the robot's topic")
+        until(lambda: is_published(session, OBSTACLES, "detector"), "the robot's topic")
         told: list[str] = []
         publisher = RosTopics(session.source.node, told.append)
         assert told == [
