@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -283,6 +285,36 @@ def test_an_encoding_that_is_not_read_is_named(
     path = channel(tmp_path / "drive.mcap", msgtype, schema, encoding, "/points")
     with pytest.raises(UserError, match=what):
         BagSource([path], load())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE message_definitions SET encoding = 'unknown', encoded_message_definition = ''",
+        "UPDATE topics SET offered_qos_profiles = '- history: 1'",
+        "ALTER TABLE topics DROP COLUMN type_description_hash",
+        "DROP TABLE message_definitions",
+    ],
+)
+def test_tables_of_other_recorders_are_no_damage(tmp_path: Path, change: str) -> None:
+    """A recorder that lacks a definition writes ``unknown``; older ones lack columns and tables."""
+    folder = bags.write(tmp_path / "drive", bags.small_items(scans=3), form="sqlite3")
+    with closing(sqlite3.connect(folder / "drive.db3")) as database:
+        database.execute(change)
+        database.commit()
+    folder = folder.rename(tmp_path / "drive #1?")  # These characters have a meaning in a URI.
+    with BagSource([folder], load()) as source:
+        assert [frame.points[0, 0] for frame in source] == [0, 1, 2]
+        assert not source.warnings
+
+
+def test_definitions_with_the_line_ends_of_windows_are_read(tmp_path: Path) -> None:
+    text, _ = bags.Messages().store.generate_msgdef("sensor_msgs/msg/PointCloud2", ros_version=2)
+    schema = "ros2msg", text.replace("\n", "\r\n").encode()
+    path = channel(tmp_path / "drive.mcap", "sensor_msgs/msg/PointCloud2", schema, "cdr", "/points")
+    with BagSource([path], load()) as source:
+        assert len(list(source)) == 5
+        assert not source.recording.warnings
 
 
 # --- frames and transforms ---------------------------------------------------------------------

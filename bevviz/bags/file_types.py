@@ -44,20 +44,20 @@ class FileFormat:
     Attributes:
         name: name for messages to the user.
         magic: first bytes of a file.
-        suffix: usual file suffix, by which rosbags knows the format.
-        sound: opens a sound file. Its second argument is the same file under a name with that suffix.
+        suffix: usual file suffix.
+        sound: opens a sound file.
     """
 
     name: str
     magic: bytes
     suffix: str
-    sound: Callable[[Path, Path], Reader]
+    sound: Callable[[Path], Reader]
 
 
 SQLITE = FileFormat("sqlite3", sqlite.MAGIC, ".db3", SqliteReader)
 FORMATS = (
-    FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path, _: ChunkReader(path, mcap.FORM)),
-    FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path, _: ChunkReader(path, ros1.FORM)),
+    FileFormat("MCAP", mcap.MAGIC, ".mcap", lambda path: ChunkReader(path, mcap.FORM)),
+    FileFormat("ROS 1 bag", ros1.MAGIC, ".bag", lambda path: ChunkReader(path, ros1.FORM)),
     SQLITE,
 )
 HEAD_SIZE = 16  # bytes read to recognise a format
@@ -256,14 +256,14 @@ def open_file(path: Path, scratch: ScratchFolder, warn: Callable[[str], object])
             head = file.read(HEAD_SIZE)
     known = FORMATS if any(head.startswith(kind.magic) for kind in FORMATS) else _all_formats()
     if kind := next((kind for kind in known if head.startswith(kind.magic)), None):
-        return _open_as(kind, path, scratch)
+        return _open_as(kind, path)
     problem = next((text for magic, text in OTHER_FORMATS.items() if head.startswith(magic)), None)
     # The first bytes may be damaged. All messages of a database may still lie in its log.
     kind = next((kind for kind in known if path.suffix == kind.suffix), None)
     if not head and not (kind is SQLITE and sqlite.log_path(path).exists()):
         raise UserError(f"{path}: the file is empty")
     if kind and not problem:
-        opened = _open_as(kind, path, scratch)
+        opened = _open_as(kind, path)
         if any(c.msgcount for c in opened.connections):
             return opened
         opened.close()
@@ -285,15 +285,10 @@ def _open_remote(path: Path) -> BagFile:
     if kind is None:
         known = " and ".join(kind.name for kind in FORMATS[:2])
         raise UserError(f"{name}: only {known} are read from an address: download it")
-    return BagFile(name, kind.name, lambda: kind.sound(path, path))
+    return BagFile(name, kind.name, lambda: kind.sound(path))
 
 
-def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
-    public = path
-    if path.suffix != kind.suffix or set("?#%") & set(str(path)):  # These characters have a meaning in a URI.
-        public = scratch.new() / f"bag{kind.suffix}"
-        public.symlink_to(path.resolve())
-
+def _open_as(kind: FileFormat, path: Path) -> BagFile:
     def damaged() -> DamagedReader:
         rescuer = registered("rescuers").get(kind.suffix.removeprefix("."))
         if rescuer is None:
@@ -301,7 +296,7 @@ def _open_as(kind: FileFormat, path: Path, scratch: ScratchFolder) -> BagFile:
         reader: DamagedReader = load(rescuer)(path)
         return reader
 
-    return BagFile(path, kind.name, lambda: kind.sound(path, public), damaged)
+    return BagFile(path, kind.name, lambda: kind.sound(path), damaged)
 
 
 def _unpack(path: Path, scratch: ScratchFolder, warn: Callable[[str], object]) -> Path:

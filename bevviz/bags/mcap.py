@@ -6,8 +6,9 @@ import re
 import struct
 from binascii import crc32
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable, Mapping
 from contextlib import suppress
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ _FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, start of the summary and 
 _STATISTICS = struct.Struct("<QHIIIIQQ")  # messages, schemas, channels, ..., chunks, first and last log time
 _COUNT = struct.Struct("<HQ")
 
+PROFILES = "offered_qos_profiles"  # key of a channel's metadata
 PUBLISHERS = "bevviz_publishers"  # key of a channel's metadata: names of the nodes that publish the topic
 # Type of a ROS message as DDS names it: sensor_msgs::msg::dds_::PointCloud2_. The topic is rt/NAME.
 DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_$")
@@ -103,28 +105,33 @@ class Channels:
 
     def connections(self, counts: Mapping[int, int]) -> list[Connection]:
         """Return the connections with their message counts."""
-        connections = []
-        profiles_by_text: dict[str, list[Qos]] = {"": []}
-        for number, (schema, topic, encoding, metadata) in self._channels.items():
+        connections, stated = [], dict[int, dict[str, str]]()
+        for number, (*_, metadata) in self._channels.items():
+            with suppress(DamageError), as_damage():
+                stated[number] = read_metadata(metadata)
+        profiles = parse_profiles(about.get(PROFILES, "") for about in stated.values())
+        for number, (schema, topic, encoding, _) in self._channels.items():
             msgtype, definition = self.schemas.get(schema, ("", NO_DEFINITION))
             if schema in self._dds_schemas:
                 topic = topic.removeprefix("rt") if topic.startswith("rt/") else topic
-            digest, profiles, publishers = "", list[Qos](), None
-            with suppress(DamageError), as_damage():
-                stated = read_metadata(metadata)
-                digest = stated.get("topic_type_hash", "")
-                publishers = stated.get(PUBLISHERS)
-                text = stated.get("offered_qos_profiles", "")
-                is_new = text not in profiles_by_text and len(profiles_by_text) <= MAX_PROFILES
-                if is_new and len(text) <= MAX_PROFILE:
-                    profiles_by_text[text] = parse_qos(text)
-                profiles = profiles_by_text.get(text, [])
-            extra = ConnectionExtRosbag2(encoding, profiles)
+            about = stated.get(number, {})
+            digest, publishers = about.get("topic_type_hash", ""), about.get(PUBLISHERS)
+            extra = ConnectionExtRosbag2(encoding, profiles.get(about.get(PROFILES, ""), []))
             count = counts.get(number, 0)
             connections.append(
                 Connection(number, topic, msgtype, definition, digest, count, extra, publishers)
             )
         return connections
+
+
+def parse_profiles(texts: Iterable[str]) -> Mapping[str, list[Qos]]:
+    """Return the QoS profiles by their text. Texts that cannot be parsed, or are too many, are left out."""
+    profiles = dict[str, list[Qos]]()
+    for text in islice(dict.fromkeys(texts), MAX_PROFILES):
+        with suppress(DamageError), as_damage():
+            if len(text) <= MAX_PROFILE:
+                profiles[text] = parse_qos(text)
+    return profiles
 
 
 def read_index(path: Path) -> FileIndex:

@@ -179,7 +179,7 @@ class MessageTypes:
 
 def _defined(connection: Connection) -> Typestore:
     """Build a store of the types in the definition of a connection."""
-    text, msgtype = connection.msgdef.data, normalized(connection.msgtype)
+    text, msgtype = connection.msgdef.data.replace("\r\n", "\n"), normalized(connection.msgtype)
     if len(text) > MAX_DEFINITION:
         raise ValueError(f"it has {len(text):,} characters: {MAX_DEFINITION:,} at most are read")
     if connection.msgdef.format == MessageDefinitionFormat.MSG:

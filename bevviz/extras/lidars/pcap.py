@@ -350,6 +350,5 @@ def _time_unit(options: bytes, order: str) -> tuple[int, int]:
 
 
 FORMATS = tuple(
-    FileFormat("network capture", magic, ".pcap", lambda path, _: PcapReader(path))
-    for magic in (*MAGICS, NEXT_GENERATION)
+    FileFormat("network capture", magic, ".pcap", PcapReader) for magic in (*MAGICS, NEXT_GENERATION)
 )
