@@ -16,9 +16,10 @@ import bevviz
 from bevviz.config import changed_config
 from bevviz.errors import UserError
 from bevviz.evaluate import match, truth_of
+from bevviz.evaluate.matching import judge
 from bevviz.findings.frame_findings import find_findings
 from bevviz.model import geometry
-from bevviz.model.frame import Frame
+from bevviz.model.frame import Frame, ImageLabels
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.notes import HandledFinding, Note, Notes
 from bevviz.pipeline.session import Session
@@ -31,6 +32,7 @@ from bevviz.why.kept_labels import box_of
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.page_messages import controls
 from bevviz.workbench.recorded_drive import RecordedDrive
+from bevviz.workbench.run_results import RunResults
 from bevviz.workbench.session import WorkbenchSession, recorded_session
 from bevviz.workbench.thumbnails import MOST, WIDTH, Thumbnails
 from tests.support.logged_frames import frame_with_image
@@ -349,6 +351,28 @@ def test_pieces_of_a_recording_are_read_back_unchanged() -> None:
         assert told == [1, 2]
         with pytest.raises(IndexError):
             recording[3]
+
+
+def test_kept_results_of_a_run_are_judged_as_its_frames(result: FrameResult) -> None:
+    """An object is not false if most of its image box, but not its centre, is in a region without labels."""
+    objects, camera, labels = result.objects, result.cameras[0], result.frame.truth
+    assert objects is not None and camera.detections is not None and labels is not None
+    label = int(match(objects, truth_of(result.frame, labels))[0][0])
+    others = [row for row in range(len(labels.labels)) if row != label]
+    names, none = tuple(labels.labels[row] for row in others), np.zeros((0, 4), np.float32)
+    left, top, _, bottom = camera.detections.xyxy[objects.detection[0]].tolist()
+    region = np.array([[left, top, 335, bottom]], np.float32)  # 53 % of the box; the centre is at 336
+    truth = replace(
+        truth_of(result.frame, replace(labels, boxes=labels.boxes.chosen(others), labels=names, ids=())),
+        image=ImageLabels(none, none[:, 0], none[:, 0].astype(np.int32), region),
+    )
+    with RunResults() as results:
+        results.add(result)
+        kept = results.get(1)
+        assert results.get(0) is None and 0 not in results and 1 in results
+    assert kept is not None and kept.objects is not None
+    assert judge(kept.objects, truth).false.tolist() == [True] + [False] * 7
+    assert not judge(kept.objects, truth, kept.cameras).false.any()
 
 
 def test_controls_are_made_of_the_fields() -> None:

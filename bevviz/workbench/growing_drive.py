@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import bisect
 import threading
-import time
 from abc import abstractmethod
-from collections import OrderedDict, defaultdict, deque
+from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any, Literal, NotRequired
 
@@ -22,7 +20,7 @@ from bevviz.evaluate import Truth, truth_of
 from bevviz.evaluate.ground_truth import TruthLookup
 from bevviz.findings.finding_list import FindingList
 from bevviz.model.frame import F32, F64, Frame
-from bevviz.model.results import FrameResult, Objects, Tracks
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.perceive import add_explanations
 from bevviz.pipeline.session import Session, Variants, check_same_frames
 from bevviz.recording import entities
@@ -68,56 +66,6 @@ RESULTS = 6  # results of frames that were asked about
 READ = 4  # frames that are kept as they were read
 
 
-@dataclass(frozen=True, slots=True)
-class FrameFacts:
-    """Facts about a frame of the run, which stay when its result is gone.
-
-    Attributes:
-        number: number of the frame.
-        stamp: its stamp, in nanoseconds.
-        received: time of receipt of its scan, in nanoseconds.
-        logged: time when it was shown, in monotonic seconds.
-        topic: topic of its scan. Empty: the frame has none.
-        images: stamp of the image of each camera. None: the camera had none.
-        config: configuration of its result.
-        objects: its objects.
-        tracks: its tracks, without their trails.
-    """
-
-    number: int
-    stamp: int
-    received: int
-    logged: float
-    topic: str
-    images: tuple[int | None, ...]
-    config: Config
-    objects: Objects | None
-    tracks: Tracks | None
-
-    @classmethod
-    def of(cls, result: FrameResult) -> FrameFacts:
-        """Return the facts about the frame of a result that was just shown."""
-        frame, tracks = result.frame, result.tracks
-        if tracks is not None:  # The trail of the last seconds is much larger than the tracks.
-            tracks = replace(tracks, trail=np.zeros((len(tracks), 0, 3), np.float32))
-        return cls(
-            frame.index,
-            frame.stamp,
-            frame.received,
-            time.monotonic(),
-            frame.clouds[0].topic if frame.clouds else "",
-            image_stamps(frame),
-            result.config,
-            result.objects,
-            tracks,
-        )
-
-
-def image_stamps(frame: Frame) -> tuple[int | None, ...]:
-    """Return the stamp of the image of each camera. None: the camera has none."""
-    return tuple(None if camera.image is None else camera.image.stamp for camera in frame.cameras)
-
-
 class GrowingDrive(Closable):
     """Drive that pages ask about, with the frames that exist now.
 
@@ -126,7 +74,6 @@ class GrowingDrive(Closable):
     Args:
         title: name of the drive or the robot.
         pipeline: pipeline session with the configuration in force and the loaded networks.
-        newest: number of newest results that stay in memory.
 
     Attributes:
         has_truth: whether frames carry ground truth.
@@ -140,7 +87,7 @@ class GrowingDrive(Closable):
         commands: further messages of the page by type, each with the function that returns the reply.
     """
 
-    def __init__(self, title: str, pipeline: Session, newest: int = 0) -> None:
+    def __init__(self, title: str, pipeline: Session) -> None:
         self.title, self.pipeline, self.has_truth = title, pipeline, False
         self.scans, self.single_frames = 0, False
         self.findings, self.news = FindingList(), News()
@@ -152,13 +99,10 @@ class GrowingDrive(Closable):
         self._aside: FrameExplainer | None = None
         self.first = 0
         self.commands: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {}
-        self._newest: deque[FrameResult] = deque(maxlen=newest)
-        self._held: OrderedDict[int, FrameResult] = OrderedDict()  # results that stay, by number
         self._results: OrderedDict[tuple[int, Settings], FrameResult] = OrderedDict()
-        self._facts: dict[int, FrameFacts] = {}  # of the frames that the run has made, by number
         self._stamps: dict[int, int] = {}  # of each known frame, by number, the newest known last
         self._times: list[tuple[int, int]] = []  # stamp and number of each known frame, sorted
-        self._lock = threading.Lock()  # guards the results and facts. Nobody computes with it
+        self._lock = threading.Lock()  # guards the results and stamps. Nobody computes with it
         self._frames: OrderedDict[int, Frame] = OrderedDict()  # frames as read, by number
         self._reading = threading.RLock()  # guards the reading of frames
         self._making: defaultdict[tuple[int, Settings], threading.Lock] = defaultdict(threading.Lock)
@@ -172,26 +116,6 @@ class GrowingDrive(Closable):
             if frame.index not in self._stamps:
                 self._stamps[frame.index] = frame.stamp
                 bisect.insort(self._times, (frame.stamp, frame.index))
-
-    def add(self, result: FrameResult) -> None:
-        """Keep a frame that the run has made."""
-        frame, facts = result.frame, FrameFacts.of(result)
-        number = frame.index
-        self.know(frame)
-        with self._lock:
-            self._newest.append(result)
-            self._facts[number] = facts
-            # What was looked at before its pose was known is computed again.
-            if (read := self._frames.get(number)) is not None and read.world_frame != frame.world_frame:
-                del self._frames[number]
-            for key, known in list(self._results.items()):
-                if key[0] == number and known.frame.world_frame != frame.world_frame:
-                    del self._results[key]
-
-    def forget(self, number: int) -> None:
-        """Forget a frame that can no longer be asked about. Call it with ``_lock``."""
-        del self._facts[number]
-        self._times.remove((self._stamps.pop(number), number))
 
     def frame_times(self) -> list[tuple[int, int]]:
         """Return stamp and number of each frame that a page can show."""
@@ -213,10 +137,9 @@ class GrowingDrive(Closable):
         row = bisect.bisect_right(times, (stamp + entities.TIME_TOLERANCE, 2**62))
         return times[row - 1] if row else None
 
+    @abstractmethod
     def tracks(self, number: int) -> Tracks | None:
-        """Return the tracks of the run in a frame. None: the run has not reached it."""
-        facts = self._facts.get(number)
-        return None if facts is None else facts.tracks
+        """Return the tracks of the run in a frame, without their trails. None: the run has not reached it."""
 
     def look(self, number: int, settings: Settings = ()) -> FrameResult:
         """Return the result of a frame, with other values if ``settings`` names some.
@@ -254,9 +177,9 @@ class GrowingDrive(Closable):
                 return self._results[number, settings]
             return None if settings else self._shown_results().get(number)
 
-    def _shown_results(self) -> dict[int, FrameResult]:
-        """Return the results as shown that are in memory, by number."""
-        return {result.frame.index: result for result in (*self._held.values(), *self._newest)}
+    def _shown_results(self) -> Mapping[int, FrameResult]:
+        """Return further results as shown that are in memory, by number."""
+        return {}
 
     def configured(self, settings: Settings) -> Config:
         """Return the configuration that ``try_values`` puts in force.
@@ -276,8 +199,7 @@ class GrowingDrive(Closable):
             config = changed_config(self.pipeline.config, settings)
             check_same_frames({"the drive": self.pipeline.config, "what is tried": config})
             return config
-        facts = self._facts.get(number)
-        return self.pipeline.config if facts is None else facts.config
+        return self.pipeline.config
 
     def _perceived(self, frame: Frame, config: Config) -> FrameResult:
         """Return the result of a frame."""

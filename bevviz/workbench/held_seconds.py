@@ -5,24 +5,71 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bevviz.bags.source import BagSource
+from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.files import write_bag
 from bevviz.live.raw_recorder import RawMessage
 from bevviz.live.source_wrappers import thin
 from bevviz.model.frame import Camera, Frame
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.support.contexts import Closable
 from bevviz.support.scratch_folder import ScratchFolder
 from bevviz.why.robot_questions import RobotQuestions, robot_questions
-from bevviz.workbench.growing_drive import FrameFacts, image_stamps
+from bevviz.workbench.run_results import without_trails
 
 NEIGHBOURS = (0, -1, 1)  # scans that are tried where the time of receipt is that of one of many packets
 
 SAME = 1_000_000  # nanoseconds, difference of one stamp that was corrected by two estimates of a clock
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFacts:
+    """Facts about a frame of the live run, which stay when its result is gone.
+
+    Attributes:
+        number: number of the frame.
+        stamp: its stamp, in nanoseconds.
+        received: time of receipt of its scan, in nanoseconds.
+        logged: time when it was shown, in monotonic seconds.
+        topic: topic of its scan. Empty: the frame has none.
+        images: stamp of the image of each camera. None: the camera had none.
+        config: configuration of its result.
+        tracks: its tracks, without their trails.
+    """
+
+    number: int
+    stamp: int
+    received: int
+    logged: float
+    topic: str
+    images: tuple[int | None, ...]
+    config: Config
+    tracks: Tracks | None
+
+    @classmethod
+    def of(cls, result: FrameResult) -> FrameFacts:
+        """Return the facts about the frame of a result that was just shown."""
+        frame = result.frame
+        return cls(
+            frame.index,
+            frame.stamp,
+            frame.received,
+            time.monotonic(),
+            frame.clouds[0].topic if frame.clouds else "",
+            image_stamps(frame),
+            result.config,
+            without_trails(result.tracks),
+        )
+
+
+def image_stamps(frame: Frame) -> tuple[int | None, ...]:
+    """Return the stamp of the image of each camera. None: the camera has none."""
+    return tuple(None if camera.image is None else camera.image.stamp for camera in frame.cameras)
 
 
 class HeldSeconds(Closable):

@@ -17,7 +17,7 @@ from bevviz.findings.marks import log_findings
 from bevviz.findings.run_table import RunTable, StoredRun
 from bevviz.model.frame import F32, Frame
 from bevviz.model.protocols import FrameSource, Observer
-from bevviz.model.results import FrameResult, Objects, Tracks
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.pipeline.run import run
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
@@ -30,6 +30,7 @@ from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
 from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
+from bevviz.workbench.run_results import RunResults
 from bevviz.workbench.thumbnails import Thumbnails
 
 PATIENCE = 10.0  # seconds that close() waits for the run to end
@@ -54,6 +55,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     Attributes:
         recording: recording of the drive.
         lanes: buffers by name: ``recording``, the overlay of each page, and the runs with other values.
+        results: results of the run, for the frames that it has reached.
         over: whether the run over the drive has ended.
         robot_bag: the bag a third time, for the robot's own chain. None: nobody has asked.
     """
@@ -78,7 +80,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
         self._overlays = 0  # number of overlays until now
         self._open_overlays: list[PageOverlay] = []
-        self.over = False
+        self.results, self.over = RunResults(), False
         self._overview: NumberedFrames | None = None  # while it is made
         self._done, self._error = 0, ""
         self._reached = 0  # newest stamp that the run has reached
@@ -103,6 +105,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         for buffer in self.lanes.values():
             buffer.close()
         self.recording.close()
+        self.results.close()
         self.drive.close()
         self.again.close()
         with self.following:
@@ -114,10 +117,10 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """Whether a page gets a frame of the recording only when it looks at it."""
         return self.recording.on_demand
 
-    def objects(self, number: int) -> Objects | None:
-        """Return the objects that the run found in a frame."""
-        facts = self._facts.get(number)
-        return None if facts is None else facts.objects
+    def tracks(self, number: int) -> Tracks | None:
+        """Return the tracks of the run in a frame, without their trails. None: the run has not reached it."""
+        results = self.results.get(number)
+        return None if results is None else results.tracks
 
     # --- run -----------------------------------------------------------------------------------
 
@@ -215,7 +218,9 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             self._picture(frame)
         else:
             self.show(result, findings)
-        self.add(result)
+        self.know(frame)
+        self.results.add(result)
+        self._forget_unplaced(frame)
         self._reached = max(self._reached, frame.stamp)
         if not self._is_listed:
             self.findings.end_overview(frame.index)
@@ -223,6 +228,16 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self._done += 1
         self.news.tell()
         self.wait_for_quiet()
+
+    def _forget_unplaced(self, frame: Frame) -> None:
+        """Forget what was computed of a frame before the run knew its pose."""
+        number, with_pose = frame.index, frame.world_frame
+        with self._lock:
+            if (read := self._frames.get(number)) is not None and read.world_frame != with_pose:
+                del self._frames[number]
+            for key, known in list(self._results.items()):
+                if key[0] == number and known.frame.world_frame != with_pose:
+                    del self._results[key]
 
     def end(self) -> None:
         """Record the last scalars of the run."""
@@ -301,7 +316,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     def version(self, number: int) -> int:
         """Return 1 once the run has reached a frame, so that it has tracks and its pose."""
-        return int(number in self._facts)
+        return int(number in self.results)
 
     def piece(self, number: int, *, wanted: bool) -> bytes | None:
         """Return the recording of a frame on demand.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
@@ -24,7 +24,7 @@ from bevviz.live.encoder import sample_rows
 from bevviz.live.runtime import Live, ObservingSession
 from bevviz.live.status import give_way
 from bevviz.model.frame import Frame
-from bevviz.model.results import FrameResult
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import FrameLogger, logged_rows
@@ -33,8 +33,8 @@ from bevviz.why import Answer, Selection
 from bevviz.why.log import dim_others, mark_answers
 from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
-from bevviz.workbench.growing_drive import FrameFacts, GrowingDrive, RunProgress, Settings
-from bevviz.workbench.held_seconds import HeldSeconds
+from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
+from bevviz.workbench.held_seconds import FrameFacts, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.reports import ReportedBag, ReportMaker
@@ -73,8 +73,11 @@ class RunningRobot(GrowingDrive):
     """
 
     def __init__(self, live: Live) -> None:
-        super().__init__(live.scene.name, live.session, newest=live.config.live.held)
+        super().__init__(live.scene.name, live.session)
         self.live = live
+        self._newest: deque[FrameResult] = deque(maxlen=live.config.live.held)
+        self._held: OrderedDict[int, FrameResult] = OrderedDict()  # results that stay, by number
+        self._facts: dict[int, FrameFacts] = {}  # of the frames that can be asked about, by number
         self.recording = LiveBuffer(live, live.config.live.output_queue)
         self.commands = {"hold": self._hold, "list": self._list, "snap": self._snap, "mark": self._mark}
         self._start = 0  # first stamp of the held seconds; frames that are kept from earlier do not count
@@ -119,7 +122,10 @@ class RunningRobot(GrowingDrive):
 
     def observe(self, result: FrameResult) -> None:
         """Keep a new frame."""
-        self.add(result)
+        self.know(result.frame)
+        with self._lock:
+            self._newest.append(result)
+            self._facts[result.frame.index] = FrameFacts.of(result)
         self._forget_gone()
         self.has_truth |= result.frame.truth is not None
         self.news.tell()
@@ -129,6 +135,20 @@ class RunningRobot(GrowingDrive):
         return self.recording.shown(state)
 
     # --- frames --------------------------------------------------------------------------------
+
+    def tracks(self, number: int) -> Tracks | None:
+        """Return the tracks of the live run in a frame. None: the frame is gone."""
+        facts = self._facts.get(number)
+        return None if facts is None else facts.tracks
+
+    def _shown_results(self) -> dict[int, FrameResult]:
+        """Return the results of the held frames and of the newest ones."""
+        return {result.frame.index: result for result in (*self._held.values(), *self._newest)}
+
+    def _config_of(self, number: int, settings: Settings) -> Config:
+        """Return the configuration of a frame as shown: parameters may have changed since."""
+        facts = self._facts.get(number)
+        return super()._config_of(number, settings) if settings or facts is None else facts.config
 
     def _forget_gone(self) -> None:
         """Forget the frames whose messages and results are gone, and find the first of the others."""
@@ -141,7 +161,8 @@ class RunningRobot(GrowingDrive):
                 if facts.received >= oldest or number in newest:
                     stamps.append(facts.stamp)
                 elif number not in self._held:
-                    self.forget(number)
+                    del self._facts[number]
+                    self._times.remove((self._stamps.pop(number), number))
                     self._whole.discard(number)
             self._start = min(stamps, default=0)
 

@@ -147,11 +147,14 @@ class _TrialObserver(Observer[FrameResult]):
     def observe(self, result: FrameResult) -> None:
         """Log a frame, list its differences and count them."""
         drive, trial, frame = self._drive, self._trial, result.frame
-        before, after = drive.objects(frame.index), result.objects
+        opened = drive.results.get(frame.index)
+        before, after = None if opened is None else opened.objects, result.objects
+        cameras = () if opened is None else opened.cameras
         explainer = drive.explainer(result)
         if not drive.recording.on_demand:  # Else a page tries the values on the frames that it shows.
             drive.recording.draw_tried(self._logger, explainer, trial.settings)
-        change = differences.before_after(before, after, drive.truth(frame))
+        truth = drive.truth(frame)
+        change = differences.before_after(before, after, truth, cameras=(cameras, result.cameras))
         findings = list(difference_findings(explainer, change, before, self._reasons))
         trial.counts.update(finding.what for finding, _ in findings)
         if change.changed:
