@@ -31,7 +31,7 @@ from bevviz.recording import entities
 from bevviz.why import Selection
 from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
 from bevviz.workbench.running_robot import KEPT, RunningRobot, robot_session
-from bevviz.workbench.server import LivePage
+from bevviz.workbench.server import PageServer
 from bevviz.workbench.session import WorkbenchSession
 from tests.support import kept_drives
 from tests.support.live_sessions import live_bench, run_beside
@@ -319,10 +319,10 @@ def test_a_browser_shows_begin_and_end_of_a_problem(
     monkeypatch.chdir(tmp_path)
     source = Replay([result.frame for result in results], kept_drives.scene())
     live = Live(source, ReloadableConfig(None, ["detector.model=demo"]), Outputs(), Notes(lambda line: None))
-    server = LivePage(robot_session(live), None)
+    session, addresses = robot_session(live), list[str]()
 
     def look() -> None:
-        with chromium() as browser, opened(browser, server.address) as page:
+        with chromium() as browser, opened(browser, addresses[0]) as page:
             rows = page.locator("#problems li", has_text="/camera")  # replayed frames may have others
             assert not rows.count()
             live.problems.set("silent", "/camera", "no message on /camera for 1.5 s", "/camera is back")
@@ -332,7 +332,7 @@ def test_a_browser_shows_begin_and_end_of_a_problem(
             live.problems.set("silent", "/camera", "")
             until(lambda: not rows.count(), "its end")
 
-    with server:
+    with PageServer(lambda: session, "live", None, addresses.append):
         run_beside(live, look)
 
 

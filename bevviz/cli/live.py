@@ -312,14 +312,17 @@ def _page(workbench: int | None, live: Live) -> AbstractContextManager[object]:
         return nullcontext()
     try:
         from bevviz.workbench.running_robot import robot_session
-        from bevviz.workbench.server import LivePage
+        from bevviz.workbench.server import PageServer
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
-    page = LivePage(robot_session(live), workbench or None)
-    say(f"workbench at {page.address}", always=True)
-    return page
+    session = robot_session(live)
+
+    def ready(address: str) -> None:
+        say(f"workbench at {address}", always=True)
+
+    return PageServer(lambda: session, "live", workbench or None, ready)
 
 
 def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:

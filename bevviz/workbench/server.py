@@ -7,6 +7,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ from bevviz.errors import UserError
 from bevviz.support.contexts import Closable
 from bevviz.support.freed_memory import return_freed_memory
 from bevviz.workbench.access import HOSTS, persistent_token
-from bevviz.workbench.routes import VIEWER, Site
+from bevviz.workbench.routes import VIEWER, Kind, Site
 from bevviz.workbench.startup import SessionStartup
 
 if TYPE_CHECKING:
@@ -26,81 +27,89 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import WorkbenchSession
 
 PORT = 9880  # The default is fixed, because browsers cache the compiled viewer by its address.
-PATIENCE = 3.0  # seconds that the page of a robot waits for its thread
+PATIENCE = 3.0  # seconds to wait for the thread of the server
 
 
 def serve(
     make: Callable[[], WorkbenchSession], drive: str, port: int | None, ready: Callable[[str], None]
 ) -> None:
-    """Serve the page of a drive until an interrupt. The drive is opened and run in the background.
+    """Serve the page of a drive until an interrupt, see ``PageServer``.
 
     Args:
-        make: makes the workbench session, while the page loads its viewer.
+        make: makes the workbench session.
         drive: paths of the drive. A page reconnects after a crash if the server of the same drive starts
             again.
-        port: port of the page. None: 9880, or a free one if that is in use.
-        ready: called with the address once it can be opened.
+        port: port of the page.
+        ready: called with the address.
 
     Raises:
-        UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
+        UserError: as ``PageServer``, or ``make`` raises one.
     """
-    viewer = viewer_folder()
     return_freed_memory()
-    with bound_socket(port) as listening:
-        port = listening.getsockname()[1]
-        with persistent_token(port, drive) as token, SessionStartup(make, lambda: server.end()) as startup:
-            site = Site(startup, viewer, version("rerun-sdk"), token, port, "page")
-
-            def begin() -> None:
-                ready(_address(port, token))
-                startup.start()
-
-            server = Server(site.application(), begin)
-            server.run(sockets=[listening])
-        if startup.error is not None:
-            raise startup.error
+    with PageServer(make, "page", port, ready, drive) as server:
+        server.wait()
 
 
-class LivePage(Closable):
-    """Server of the page of a robot, in a thread of its own, until it is closed.
+class PageServer(Closable):
+    """Server of a page, in a thread of its own, until it is closed.
 
     Args:
-        workbench: the workbench session of the robot.
+        make: makes the workbench session in a further thread, while the page loads its viewer.
+        kind: kind of page.
         port: port of the page. None: 9880, or a free one if that is in use.
+        ready: called with the address of the page once it can be opened, before the session is made.
+        drive: paths of the drive, whose token survives a crash. None: each server has a new token.
 
     Raises:
         UserError: the port is in use, or the viewer is not installed.
-
-    Attributes:
-        address: address of the page, with its token.
     """
 
-    def __init__(self, workbench: WorkbenchSession, port: int | None) -> None:
-        viewer, token = viewer_folder(), secrets.token_urlsafe(16)
-        self._listening = bound_socket(port)
-        port = self._listening.getsockname()[1]
-        self.address = _address(port, token)
-        self._startup = SessionStartup(lambda: workbench, lambda: None)
-        self._startup.start()
-        ready = threading.Event()
-        site = Site(self._startup, viewer, version("rerun-sdk"), token, port, "live")
-        self._server = Server(site.application(), ready.set)
-        self._thread = threading.Thread(
-            target=lambda: self._server.run(sockets=[self._listening]), name="page", daemon=True
-        )
-        self._thread.start()
-        ready.wait(PATIENCE)
+    def __init__(
+        self,
+        make: Callable[[], WorkbenchSession],
+        kind: Kind,
+        port: int | None,
+        ready: Callable[[str], None],
+        drive: str | None = None,
+    ) -> None:
+        viewer, reachable = viewer_folder(), threading.Event()
+        with ExitStack() as stack:
+            listening = stack.enter_context(bound_socket(port))
+            port = listening.getsockname()[1]
+            token = secrets.token_urlsafe(16)
+            if drive is not None:
+                token = stack.enter_context(persistent_token(port, drive))
+            self._startup = stack.enter_context(SessionStartup(make, lambda: self._server.end()))
+            site = Site(self._startup, viewer, version("rerun-sdk"), token, port, kind)
+            self._server = Server(site.application(), reachable.set)
+            self._thread = threading.Thread(
+                target=self._server.run, kwargs={"sockets": [listening]}, name="page", daemon=True
+            )
+            self._thread.start()
+            stack.callback(self._end)
+            reachable.wait(PATIENCE)
+            ready(f"http://{HOSTS[0]}:{port}/?token={token}")
+            self._startup.start()
+            self._stack = stack.pop_all()
+
+    def wait(self) -> None:
+        """Wait until the server ends.
+
+        Raises:
+            BaseException: that of ``make``, which ends the server.
+        """
+        self._thread.join()
+        if self._startup.error is not None:
+            raise self._startup.error
 
     def close(self) -> None:
         """Stop the server, then close the workbench session."""
+        self._stack.close()
+
+    def _end(self) -> None:
+        """Stop the server."""
         self._server.end()
         self._thread.join(PATIENCE)
-        self._listening.close()
-        self._startup.close()
-
-
-def _address(port: int, token: str) -> str:
-    return f"http://{HOSTS[0]}:{port}/?token={token}"
 
 
 def bound_socket(port: int | None) -> socket.socket:

@@ -9,10 +9,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
@@ -80,11 +78,9 @@ def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subproc
 def served(bag: Path, *settings: str) -> Iterator[str]:
     """Serve the workbench of a bag from a thread of this process. Yield its address."""
     pytest.importorskip("starlette", reason="needs pip install 'bevviz[workbench]'")
-    from bevviz.workbench.access import persistent_token
-    from bevviz.workbench.routes import Site
-    from bevviz.workbench.server import Server, bound_socket, viewer_folder
+    from bevviz.workbench.server import PageServer
     from bevviz.workbench.session import recorded_session
-    from bevviz.workbench.startup import LabelledSource, SessionStartup
+    from bevviz.workbench.startup import LabelledSource
 
     config = load(None, ["detector.model=demo", *settings])
     with LabelledSource([bag], config) as source, LabelledSource([bag], config) as again:
@@ -92,23 +88,9 @@ def served(bag: Path, *settings: str) -> Iterator[str]:
         def make() -> WorkbenchSession:
             return recorded_session(Drive(source, config), again, [bag])
 
-        with (
-            bound_socket(0) as listening,
-            persistent_token(port := listening.getsockname()[1], str(bag)) as token,
-            SessionStartup(make, lambda: None) as startup,
-        ):
-            ready = threading.Event()
-            site = Site(startup, viewer_folder(), version("rerun-sdk"), token, port, "page")
-            server = Server(site.application(), ready.set)
-            thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-            thread.start()
-            startup.start()
-            try:
-                assert ready.wait(PATIENCE)
-                yield f"http://127.0.0.1:{port}/?token={token}"
-            finally:
-                server.end()
-                thread.join(PATIENCE)
+        addresses = list[str]()
+        with PageServer(make, "page", 0, addresses.append, str(bag)):
+            yield addresses[0]
 
 
 # --- a browser ----------------------------------------------------------------------------------
