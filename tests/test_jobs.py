@@ -24,7 +24,7 @@ def test_a_job_tells_how_it_ended() -> None:
 
     jobs.start(Job(0, ("voxel.size=0.2",), total=3), count)
     until(lambda: not jobs.jobs[-1].going)
-    head = {"number": 0, "settings": ["voxel.size=0.2"], "cancelled_by": ""}
+    head = {"number": 0, "settings": ["voxel.size=0.2"]}
     assert json_tree(jobs.jobs[0]) == {**head, "state": "over", "error": "", "done": 3, "total": 3}
     jobs.start(Job(1), fail)
     until(lambda: not jobs.jobs[-1].going)
@@ -47,7 +47,7 @@ def test_a_cancelled_job_ends_at_its_next_step() -> None:
     assert stepped.wait(10)
     with pytest.raises(UserError, match="it is counted: wait for it, or cancel it"):
         jobs.check_idle("it is counted")
-    jobs.cancel("overlay-2")
+    jobs.cancel()
     jobs.end()
-    assert (jobs.jobs[0].state, jobs.jobs[0].cancelled_by) == ("cancelled", "overlay-2")
+    assert jobs.jobs[0].state == "cancelled"
     jobs.check_idle("it is counted")

@@ -35,6 +35,11 @@ class Matches:
     false: Bool  # (J,)
     missed: Bool  # (K,) had to be found, but was not
 
+    @property
+    def counts(self) -> Counter[str]:
+        """Numbers of true, missed and false objects."""
+        return Counter({outcome: int(getattr(self, outcome).sum()) for outcome in OUTCOMES})
+
 
 class AcceptedNames:
     """Labels of the frames so far, with the names that they accept."""

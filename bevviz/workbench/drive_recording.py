@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import rerun as rr
 import rerun_bindings
@@ -19,13 +20,12 @@ from bevviz.model.results import FrameResult
 from bevviz.recording import blueprints, entities
 from bevviz.recording.addresses import EntityRows, RowCache
 from bevviz.recording.focus import Focus, log_focus, log_robot_from_above
-from bevviz.recording.frame_logger import FrameLogger
-from bevviz.recording.stream import RecordingStream
 from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import RecordingBuffer
 from bevviz.workbench.growing_drive import Settings
+from bevviz.workbench.piece_logger import PieceLogger
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
 TOGETHER = 50, 800  # frames whose numbers are sent together: the first ones, and most
@@ -47,7 +47,7 @@ class DriveRecording(Closable):
         scene: names of the sensors, and whether the views move.
         rows: pieces that every page gets. The first has the layout, the static data and a frame.
         on_demand: whether pages get further frames only on demand, because they hold no whole recording.
-        recording_id: recording id of all pieces.
+        logger: makes a logger of results of a configuration, for a further thread that writes to it.
         usual_focus: where the views look without a subject. None: no frame was shown yet.
     """
 
@@ -63,48 +63,28 @@ class DriveRecording(Closable):
         self._drawing = threading.Lock()  # guards the frames on demand, and the logger that draws them
         self._waiting_numbers = 0  # frames whose numbers are logged and not sent
         self._together = TOGETHER[0]  # Few large pieces take a quarter of the bytes of many small ones.
-        self.recording_id = f"bench-{time.time_ns()}"
-        recording, self._stream = self.stream()
-        recording.send_blueprint(blueprints.load("workbench", self.scene, config), make_active=True)
-        self._logger = FrameLogger(recording, config, self.scene, wait=SCALAR_WAIT, stamps=BOTH)
+        ids = blueprints.application_id("workbench", self.scene, config), f"bench-{time.time_ns()}"
+        self.logger = partial(PieceLogger, *ids, scene=self.scene, stamps=BOTH)
+        self._logger = self.logger(config, wait=SCALAR_WAIT)
+        layout = blueprints.load("workbench", self.scene, config)
+        self._logger.recording.send_blueprint(layout, make_active=True)
         self._logger.apart = True  # Pages receive frames in any order, so each is complete.
         self._logger.log_static()
         if self.scene.moving:
             log_robot_from_above(self._logger, scene.lidar)
-        self._numbers: FrameLogger | None = None  # logger of the numbers of a long drive
+        self._numbers: PieceLogger | None = None  # logger of the numbers of a long drive
 
     def close(self) -> None:
         """Delete all pieces."""
-        self._stream.read()  # Rerun warns about a binary stream with unread data.
+        self._logger.close()
         if self._numbers is not None:
-            self._numbers_stream.read()
+            self._numbers.close()
         self.rows.close()
 
-    def stream(
-        self, batches: rr.ChunkBatcherConfig | None = None
-    ) -> tuple[rr.RecordingStream, rr.BinaryStream]:
-        """Return a new stream into the recording, for a further thread that writes to it."""
-        application = blueprints.application_id("workbench", self.scene, self._config)
-        recording = RecordingStream(application, recording_id=self.recording_id, batcher_config=batches)
-        recording.set_log_time_enabled(False)
-        return recording, rr.binary_stream(recording)
-
-    def mark_logger(self) -> tuple[FrameLogger, rr.BinaryStream]:
-        """Return a logger of marks, and its stream."""
-        recording, stream = self.stream()
-        return FrameLogger(recording, self._config, self.scene, stamps=BOTH), stream
-
-    def tried_logger(self, config: Config | None = None) -> tuple[FrameLogger, rr.BinaryStream]:
-        """Return a logger that writes tried results on a timeline of their own, and its stream.
-
-        Args:
-            config: configuration of the results. None: that of the drive.
-        """
-        recording, stream = self.stream()
-        config, stamps = config or self._config, (entities.TRIED,)
-        return FrameLogger(
-            recording, config, self.scene, wait=SCALAR_WAIT, stamps=stamps, inputs=False
-        ), stream
+    def tried_logger(self, config: Config | None = None) -> PieceLogger:
+        """Return a logger that writes tried results on a timeline of their own."""
+        stamps = (entities.TRIED,)
+        return self.logger(config or self._config, wait=SCALAR_WAIT, stamps=stamps, inputs=False)
 
     # --- frames as opened ----------------------------------------------------------------------
 
@@ -161,15 +141,13 @@ class DriveRecording(Closable):
             logger.clear_at(number, stamp, received, frozenset(new))
         if self.on_demand:
             logger.flush()
-        return self._stream.read() or b""
+        return logger.piece() or b""
 
     def add_numbers(self, result: FrameResult) -> None:
         """Record the numbers and states of the next frame of the run, of which pages get no frame."""
         if self._numbers is None:
-            recording, self._numbers_stream = self.stream(rr.ChunkBatcherConfig.NEVER())
-            self._numbers = FrameLogger(
-                recording, self._config, self.scene, wait=float("inf"), stamps=BOTH, inputs=False
-            )
+            never = rr.ChunkBatcherConfig.NEVER()
+            self._numbers = self.logger(self._config, wait=float("inf"), inputs=False, batches=never)
         self._numbers.log_numbers(result)
         self._waiting_numbers += 1
         if self._waiting_numbers >= self._together:
@@ -181,16 +159,16 @@ class DriveRecording(Closable):
         self._waiting_numbers = 0
         with self._drawing:
             self._logger.flush()
-            self.rows.add(self._stream.read())
+            self.rows.add(self._logger.piece())
         if self._numbers is not None:
             self._numbers.flush()
-            self.rows.add(self._numbers_stream.read())
+            self.rows.add(self._numbers.piece())
 
     # --- frames with other values --------------------------------------------------------------
 
     def draw_tried(
         self,
-        logger: FrameLogger,
+        logger: PieceLogger,
         explainer: FrameExplainer,
         settings: Settings,
         known: frozenset[str] = frozenset(),
@@ -218,7 +196,7 @@ class DriveRecording(Closable):
 
     def _log(
         self,
-        logger: FrameLogger,
+        logger: PieceLogger,
         result: FrameResult,
         findings: Sequence[Finding],
         settings: Settings,

@@ -363,19 +363,6 @@ class GrowingDrive(Closable):
         """Return a new overlay for a page. None: all pages share one recording."""
         return None
 
-    def position(
-        self, overlay: PageOverlay, stamp: int, view: str, position: Sequence[float]
-    ) -> Sequence[float]:
-        """Return what a position in a view of a page is in the frame of the points or in pixels of the image.
-
-        Args:
-            overlay: overlay of the page.
-            stamp: stamp that the page shows.
-            view: title of the view.
-            position: 2 or 3 numbers in the view.
-        """
-        return position
-
     def close_overlay(self, overlay: PageOverlay) -> None:
         """Remove an overlay whose page is closed."""
 

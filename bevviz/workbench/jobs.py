@@ -23,7 +23,6 @@ class Job:
         state: waiting, running, over, cancelled or failed.
         error: reason of the failure.
         done: number of finished steps.
-        cancelled_by: name of the overlay of the page that cancelled it. Empty: none did.
         stop: cancels the job when it is set.
     """
 
@@ -33,7 +32,6 @@ class Job:
     state: str = "running"
     error: str = ""
     done: int = 0
-    cancelled_by: str = ""
     stop: Annotated[threading.Event, LEFT_OUT] = field(default_factory=threading.Event)
 
     @property
@@ -90,11 +88,9 @@ class Jobs(Generic[J]):
         self._thread.start()
         self._tell()
 
-    def cancel(self, by: str = "") -> None:
-        """Cancel the newest job for a page. It ends after its present step."""
+    def cancel(self) -> None:
+        """Cancel the newest job. It ends after its present step."""
         if self.jobs:
-            if by and self.jobs[-1].going:
-                self.jobs[-1].cancelled_by = by
             self.jobs[-1].stop.set()
 
     def end(self) -> None:

@@ -58,7 +58,6 @@ class PageConnection:
         self._rows: list[types.Row] = []  # those that need a remark
         self._remarking = False
         self._overlay = self._source.open_overlay()
-        self._name = "" if self._overlay is None else self._overlay.lane
         self._tries = ThreadPoolExecutor(1, "tries")  # A slow try keeps no other question waiting.
         self._trying = 0  # number of the try in progress
         self._handlers: Mapping[str, Callable[[Any], Coroutine[Any, Any, None]]] = {
@@ -109,7 +108,7 @@ class PageConnection:
         return {
             "type": "welcome",
             "run": self._run,
-            "overlay": self._name,
+            "overlay": "" if self._overlay is None else self._overlay.lane,
             "bag": source.title,
             "truth": source.has_truth,
             "single": source.single_frames,
@@ -317,8 +316,7 @@ class PageConnection:
             return Selection.parse(message["pick"])
         position: Sequence[float] = [one for one in message.get("position") or () if one is not None]
         if self._overlay is not None and position:
-            stamp, view = round(message["time"]), message.get("view", "")
-            position = self._source.position(self._overlay, stamp, view, position)
+            position = self._overlay.position(round(message["time"]), message.get("view", ""), position)
         return self._source.select(frame, settings, message["entity"], message.get("instance"), position)
 
     async def _try(self, message: types.Try) -> None:
@@ -400,10 +398,10 @@ class PageConnection:
             return
         workbench = self._workbench
         if message["what"] == "report":
-            workbench.reports.cancel(self._name)
+            workbench.reports.cancel()
         else:
             tools = workbench.tools
-            (tools.fix if message["what"] == "fix" else tools.trials).cancel(self._name)
+            (tools.fix if message["what"] == "fix" else tools.trials).cancel()
 
     async def _report(self, message: types.MakeReport) -> None:
         workbench, settings = self._workbench, message.get("set", ())

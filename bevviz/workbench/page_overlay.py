@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import bisect
 import threading
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from bevviz.errors import UserError
 from bevviz.recording import entities
 from bevviz.recording.focus import Focus
-from bevviz.recording.frame_logger import FrameLogger
 from bevviz.support.contexts import Closable
+from bevviz.why.log import focus_answer, mark_answers
 from bevviz.workbench.buffers import RecordingBuffer
 
 if TYPE_CHECKING:
-    import rerun as rr
-
+    from bevviz.config import Config
     from bevviz.model.results import FrameResult
     from bevviz.why import Answer
-
-NewLogger = Callable[[], tuple[FrameLogger, "rr.BinaryStream"]]  # a logger into the recording, and its stream
+    from bevviz.workbench.drive_recording import DriveRecording
+    from bevviz.workbench.piece_logger import PieceLogger
 
 
 class Attempt:
@@ -29,11 +28,10 @@ class Attempt:
     Args:
         overlay: overlay of the page.
         logger: logger of the tried results.
-        stream: stream of the logger.
     """
 
-    def __init__(self, overlay: PageOverlay, logger: FrameLogger, stream: rr.BinaryStream) -> None:
-        self.overlay, self.logger, self.stream = overlay, logger, stream
+    def __init__(self, overlay: PageOverlay, logger: PieceLogger) -> None:
+        self.overlay, self.logger = overlay, logger
         self.stop = threading.Event()
 
     def check(self) -> None:
@@ -51,25 +49,22 @@ class PageOverlay(Closable):
 
     Args:
         lane: name by which the page requests the buffer.
-        marker: returns the logger of the marks of answers.
-        tried: returns a logger of tried results.
+        recording: recording of the drive.
+        config: configuration of the drive.
 
     Attributes:
         buffer: pieces of the recording for this page.
         known: entities that tried results of this page had.
         marked: result and answer that were marked last. None: none yet.
-        marks: number of marks until now.
-        marking: guards the marker, ``marked`` and ``marks``.
     """
 
-    def __init__(self, lane: str, marker: NewLogger, tried: NewLogger) -> None:
-        self.lane, self.buffer, self._tried = lane, RecordingBuffer(), tried
-        self.marker, self._marks = marker()
-        self._attempt = Attempt(self, *tried())
+    def __init__(self, lane: str, recording: DriveRecording, config: Config) -> None:
+        self.lane, self.buffer, self._recording = lane, RecordingBuffer(), recording
+        self._marker, self._attempt = recording.logger(config), Attempt(self, recording.tried_logger())
         self.known: frozenset[str] = frozenset()
         self.marked: tuple[FrameResult, Answer] | None = None
-        self.marks = 0
-        self.marking = threading.Lock()
+        self._marks = 0  # number of marks until now
+        self._marking = threading.Lock()  # guards the marker and the marks
         self._focuses: list[tuple[int, Focus]] = []  # by stamp, sorted
         self._lock = threading.Lock()
 
@@ -77,29 +72,36 @@ class PageOverlay(Closable):
         """Stop the try in progress and delete the buffer."""
         with self._lock:
             self._attempt.stop.set()
-            for stream in (self._marks, self._attempt.stream):
-                stream.read()  # Rerun warns about a binary stream with unread data.
+            self._marker.close()
+            self._attempt.logger.close()
             self.buffer.close()
             # Rerun keeps the threads of a stream as long as a reference to it exists.
-            del self.marker, self._marks, self._attempt
+            del self._marker, self._attempt
 
-    def keep_focus(self, stamp: int, focus: Focus) -> None:
-        """Keep where the views of the page look from a stamp on."""
-        with self._lock:
-            self._focuses = [one for one in self._focuses if one[0] != stamp]
-            bisect.insort(self._focuses, (stamp, focus), key=lambda one: one[0])
+    def mark(self, result: FrameResult, answer: Answer) -> None:
+        """Mark the object of an answer in every view of the page, which goes to the object."""
+        with self._marking:
+            self.marked, self._marks = (result, answer), self._marks + 1
+            mark_answers(self._marker, result.frame, [answer], result.config.bev)
+            if self._recording.scene.moving:
+                stamp, focus = result.frame.stamp, focus_answer(self._marker, result, answer, self._marks)
+                with self._lock:
+                    self._focuses = [one for one in self._focuses if one[0] != stamp]
+                    bisect.insort(self._focuses, (stamp, focus), key=lambda one: one[0])
+            self.buffer.add(self._marker.piece())
 
-    def focus_at(self, stamp: int) -> Focus | None:
-        """Return where the views of the page look at a stamp. None: nothing was marked until then."""
+    def position(self, stamp: int, view: str, position: Sequence[float]) -> Sequence[float]:
+        """Return a position in a view at a stamp among the points or in the image, see ``Focus.position``."""
         with self._lock:
             row = bisect.bisect_right(self._focuses, stamp + entities.TIME_TOLERANCE, key=lambda one: one[0])
-            return self._focuses[row - 1][1] if row else None
+            focus = self._focuses[row - 1][1] if row else self._recording.usual_focus
+        return position if focus is None else focus.position(view, position)
 
     def attempt(self) -> Attempt:
         """Return the attempt of the next try. It has a new logger if the last try was stopped."""
         with self._lock:
             if self._attempt.stop.is_set():
-                self._attempt = Attempt(self, *self._tried())
+                self._attempt = Attempt(self, self._recording.tried_logger())
             return self._attempt
 
     def stop(self) -> None:
@@ -107,17 +109,13 @@ class PageOverlay(Closable):
         with self._lock:
             self._attempt.stop.set()
 
-    def add_marks(self) -> None:
-        """Hand the marks that were logged to the page."""
-        self.buffer.add(self._marks.read())
-
     def add_tried(self, attempt: Attempt) -> None:
         """Hand the tried results that were logged to the page.
 
         Raises:
             UserError: the try was stopped.
         """
-        piece = attempt.stream.read()
+        piece = attempt.logger.piece()
         with self._lock:
             attempt.check()
             self.known |= attempt.logger.known

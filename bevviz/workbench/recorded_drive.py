@@ -23,7 +23,6 @@ from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
 from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import Answer, FrameExplainer
-from bevviz.why.log import focus_answer, mark_answers
 from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_questions
 from bevviz.workbench.buffers import AHEAD, BufferReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
@@ -267,9 +266,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """Return a new overlay. A page shows what is on its own overlay alone."""
         with self._lock:
             self._overlays += 1
-            overlay = PageOverlay(
-                f"overlay-{self._overlays}", self.recording.mark_logger, self.recording.tried_logger
-            )
+            overlay = PageOverlay(f"overlay-{self._overlays}", self.recording, self.drive.config)
             self.lanes[overlay.lane] = overlay.buffer
             self._open_overlays.append(overlay)
         return overlay
@@ -424,13 +421,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
     def mark(self, result: FrameResult, answer: Answer, overlay: PageOverlay | None) -> None:
         """Mark the object of an answer in every view of a page."""
         if overlay is not None:
-            with overlay.marking:
-                overlay.marked, overlay.marks = (result, answer), overlay.marks + 1
-                mark_answers(overlay.marker, result.frame, [answer], result.config.bev)
-                if self.recording.scene.moving:
-                    focus = focus_answer(overlay.marker, result, answer, overlay.marks)
-                    overlay.keep_focus(result.frame.stamp, focus)
-                overlay.add_marks()
+            overlay.mark(result, answer)
 
     def _dim_again(self, number: int) -> None:
         """Dim a frame that was drawn again in the pages that have marked an object of it."""
@@ -438,14 +429,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             overlays = [*self._open_overlays]
         for overlay in overlays:
             if overlay.marked is not None and overlay.marked[0].frame.index == number:
-                self.mark(*overlay.marked, overlay)
-
-    def position(
-        self, overlay: PageOverlay, stamp: int, view: str, position: Sequence[float]
-    ) -> Sequence[float]:
-        """Return a position in a view among the points or in the image, see ``Focus.position``."""
-        focus = overlay.focus_at(stamp) or self.recording.usual_focus
-        return position if focus is None else focus.position(view, position)
+                overlay.mark(*overlay.marked)
 
     def try_values(
         self, number: int, settings: Settings, attempt: Attempt | None = None

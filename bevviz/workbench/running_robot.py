@@ -15,8 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import rerun as rr
-
 from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.findings.frame_findings import KINDS, find_findings
@@ -27,8 +25,7 @@ from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.recording import entities
 from bevviz.recording.addresses import EntityRows
-from bevviz.recording.frame_logger import FrameLogger, logged_rows
-from bevviz.recording.stream import RecordingStream
+from bevviz.recording.frame_logger import logged_rows
 from bevviz.why import Answer, Selection
 from bevviz.why.log import dim_others, mark_answers
 from bevviz.why.robot_questions import RobotQuestions
@@ -37,6 +34,7 @@ from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
 from bevviz.workbench.held_seconds import FrameFacts, HeldSeconds
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
+from bevviz.workbench.piece_logger import PieceLogger
 from bevviz.workbench.reports import ReportedBag, ReportMaker
 from bevviz.workbench.session import WorkbenchSession
 
@@ -87,10 +85,7 @@ class RunningRobot(GrowingDrive):
         self._stop = threading.Event()  # ends the listing
         self._settings: Settings = ()  # settings that pages have changed
         encoder = live.encoder
-        recording = RecordingStream(encoder.application, recording_id=encoder.recording_id)
-        recording.set_log_time_enabled(False)
-        self._marks = rr.binary_stream(recording)
-        self._marker = FrameLogger(recording, live.config, live.scene)
+        self._marker = PieceLogger(encoder.application, encoder.recording_id, live.config, live.scene)
         live.attach(self.recording, self.observe)
         self.recording.news.listen(self.news.tell)  # There is news while no frame comes, too.
 
@@ -330,7 +325,7 @@ class RunningRobot(GrowingDrive):
         """Mark the object of an answer in every view of all pages."""
         mark_answers(self._marker, result.frame, [answer], result.config.bev)
         dim_others(self._marker, result, answer)
-        self.recording.add(self._marks.read())
+        self.recording.add(self._marker.piece())
 
     def try_values(
         self, number: int, settings: Settings, attempt: Attempt | None = None

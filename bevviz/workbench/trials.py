@@ -13,7 +13,7 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 
 from bevviz.config import Config, changed_config, changes
 from bevviz.errors import UserError
-from bevviz.evaluate import ObjectScore, Truth, differences, rates
+from bevviz.evaluate import Matches, Truth, differences, rates
 from bevviz.findings.finding_list import DIFFERENCES
 from bevviz.findings.frame_findings import Finding, finding_of
 from bevviz.model import geometry
@@ -62,7 +62,7 @@ class Trial(Job):
         f1: F1 before and after. None: there is no ground truth, or no frame yet.
         lane: name by which a page requests its recording.
         span: first and last stamp of the frames that it runs over. None: the whole drive.
-        scores: score before and after.
+        scores: numbers of true, missed and false objects before and after.
         buffer: recording of its results, for the pages that show its settings.
     """
 
@@ -71,8 +71,8 @@ class Trial(Job):
     f1: BeforeAfter | None = None
     lane: str = ""
     span: Span | None = None
-    scores: Annotated[tuple[ObjectScore, ObjectScore], LEFT_OUT] = field(
-        default_factory=lambda: (ObjectScore(), ObjectScore())
+    scores: Annotated[tuple[Counter[str], Counter[str]], LEFT_OUT] = field(
+        default_factory=lambda: (Counter(), Counter())
     )
     buffer: Annotated[RecordingBuffer, LEFT_OUT] = field(default_factory=RecordingBuffer)
 
@@ -141,7 +141,7 @@ class _TrialObserver(Observer[FrameResult]):
 
     def __init__(self, drive: RecordedDrive, trial: Trial, config: Config) -> None:
         self._drive, self._trial = drive, trial
-        self._logger, self._stream = drive.recording.tried_logger(config)
+        self._logger = drive.recording.tried_logger(config)
         self._reasons = drive.findings.reasons()
 
     def observe(self, result: FrameResult) -> None:
@@ -163,10 +163,10 @@ class _TrialObserver(Observer[FrameResult]):
             drive.findings.add((finding for finding, side in findings if side == tried), tried=tried)
         sides = (before, change.before), (after, change.after)
         for score, (objects, matches) in zip(trial.scores, sides, strict=True):
-            if objects is not None and matches is not None and change.truth is not None:
-                score.count(objects, change.truth, matches)
+            if objects is not None and matches is not None:
+                score.update(matches.counts)
         if change.truth is not None:
-            f1_before, f1_after = (rounded(rates(score.total)["f1"]) for score in trial.scores)
+            f1_before, f1_after = (rounded(rates(score)["f1"]) for score in trial.scores)
             trial.f1 = {"before": f1_before, "after": f1_after}
         trial.done += 1
         self._show()
@@ -179,7 +179,7 @@ class _TrialObserver(Observer[FrameResult]):
 
     def _show(self) -> None:
         """Pass what was logged to the pages."""
-        self._trial.buffer.add(self._stream.read())
+        self._trial.buffer.add(self._logger.piece())
         self._drive.news.tell()
 
 
@@ -231,14 +231,15 @@ def trial_effects(
         truth: ground truth of the frame.
         truth_row: row of the ground truth object that was asked about. Its effect comes first. -1: none.
     """
+    effects = frame_effects(before, after, truth, truth_row)
     message: TriedEffects = {
         "changes": {key: str(change) for key, change in changes(before.config, after.config).items()},
-        "effects": frame_effects(before, after, truth, truth_row).names,
+        "effects": effects.names,
         "opinions": _opinions(before, after),
         "failures": [f"{failure.stage}: {failure.reason}" for failure in after.failures],
     }
     if truth is not None:
-        message["f1"] = {"before": _f1(before, truth), "after": _f1(after, truth)}
+        message["f1"] = {"before": _f1(before, effects.before), "after": _f1(after, effects.after)}
     return message
 
 
@@ -252,12 +253,10 @@ def _opinions(before: FrameResult, after: FrameResult) -> dict[str, BeforeAfter]
     }
 
 
-def _f1(result: FrameResult, truth: Truth) -> float | None:
-    if result.objects is None:
+def _f1(result: FrameResult, matches: Matches | None) -> float | None:
+    if result.objects is None or matches is None:
         return None
-    score = ObjectScore()
-    score.add(result.objects, truth, result.cameras)
-    return rounded(rates(score.total)["f1"])
+    return rounded(rates(matches.counts)["f1"])
 
 
 def rounded(value: float) -> float | None:

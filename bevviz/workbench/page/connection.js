@@ -134,9 +134,3 @@ export function send(message, failed) {
 }
 
 export const isConnected = () => questions?.readyState === WebSocket.OPEN;
-
-/**
- * Who cancelled a job, in words.
- * @param {{ cancelled_by: string }} job
- */
-export const cancelled = ({ cancelled_by: by }) => (by && by !== overlay ? "cancelled on another page" : "cancelled");

@@ -2,7 +2,7 @@
 
 import { $, beforeAfter, element, inSpan, spanText, state } from "./page_state.js";
 import { isTried } from "./viewer.js";
-import { cancelled, follow, send } from "./connection.js";
+import { follow, send } from "./connection.js";
 
 /** @import { FixJob, Progress, ReportJob, Trial } from "./types" */
 
@@ -129,7 +129,7 @@ function summary(message) {
   const frames = message.state === "running" ? `${message.done} of ${message.total} frames` : `${message.done} frames`;
   parts.push(frames);
   for (const [what, number] of Object.entries(message.counts)) parts.push(`${number} ${what}`);
-  if (message.state === "cancelled") parts.push(cancelled(message));
+  if (message.state === "cancelled") parts.push("cancelled");
   return parts.join("; ");
 }
 
@@ -144,7 +144,7 @@ function showFix(fix) {
   for (const id of /** @type {const} */ (["fix-bar", "fix-cancel"])) $(id).hidden = !going;
   $("fix-bar").max = fix.total || 1;
   $("fix-bar").value = fix.done;
-  $("fix-text").textContent = { running: steps, failed: fix.error, cancelled: `${cancelled(fix).replace("c", "C")}.` }[fix.state] ?? fix.text;
+  $("fix-text").textContent = { running: steps, failed: fix.error, cancelled: "Cancelled." }[fix.state] ?? fix.text;
   $("fix-text").className = fix.state === "failed" ? "alarm" : "faint";
   $("fix-use").hidden = going || !fix.settings.length;
   $("fix-use").textContent = `try ${fix.settings.join(", ")}`;
@@ -170,7 +170,7 @@ function report(one) {
     });
     item.append(element("b", "", one.name), ...links.flatMap((link) => [" ", link]),
       element("span", "faint", [` in ${one.folder}`, one.settings.join(", "),
-        one.state === "cancelled" ? cancelled(one) : ""].filter(Boolean).join("; ")));
+        one.state === "cancelled" ? "cancelled" : ""].filter(Boolean).join("; ")));
   }
   return item;
 }
